@@ -31,9 +31,10 @@ RUN NUMBA_CACHE_DIR=/opt/simrun/numba /opt/simrun/bin/simrun doctor
 
 FROM ${BASE}
 SHELL ["/bin/sh", "-euc"]
+# Triton compiles the part that starts its kernels with gcc.
 RUN if ! command -v python3 >/dev/null; then \
         apt-get update; \
-        apt-get install -y --no-install-recommends python3; \
+        apt-get install -y --no-install-recommends python3 python3-dev gcc libc6-dev; \
         rm -rf /var/lib/apt/lists/*; \
     fi
 RUN useradd --create-home --uid 10001 simrun && mkdir /work && chown simrun /work

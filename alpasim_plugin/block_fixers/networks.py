@@ -26,12 +26,12 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, read_bundle, weights_to_give
 from alpasim_plugin.fixers.network import checkpoints
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.fixers.pixel_network import require_device
 from alpasim_plugin.fixers.settings import FixerSettings
 
 Precision = Literal["fp32", "bf16", "fp16"]
@@ -85,9 +85,9 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
 
     Raises:
         InputError: Weights that are missing or do not fit.
-        FixerError: The device does not work.
+        InfrastructureError: The device is not here.
     """
-    require_device(device)
+    device = require_device(device)
     loop = FixerSettings(name="")  # settings of the loop do not change the networks
     usual = {key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}
     return _load(settings.model_copy(update=usual), device)

@@ -45,7 +45,7 @@ def doctor(
     raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
 
 
-def _raster(backend: Literal["cpu", "gsplat"]) -> str:
+def _raster(backend: Literal["cpu", "triton"]) -> str:
     from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 
     cloud = GaussianCloud(
@@ -117,7 +117,7 @@ def _kernels() -> str:
 
 CHECKS: dict[str, Callable[[], str]] = {
     "rasteriser (cpu)": lambda: _raster("cpu"),
-    "rasteriser (gsplat)": lambda: _raster("gsplat"),
+    "rasteriser (cuda)": lambda: _raster("triton"),
     "fixer": _fixer,
     "video": _video,
     "log messages": _wire,
@@ -125,4 +125,4 @@ CHECKS: dict[str, Callable[[], str]] = {
     "cache": lambda: _writable(places.cache()),
     "kernels": _kernels,
 }
-NEEDED = CHECKS.keys() - {"rasteriser (gsplat)", "cache"}
+NEEDED = CHECKS.keys() - {"rasteriser (cuda)", "cache"}

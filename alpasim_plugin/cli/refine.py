@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
 from alpasim_plugin.cli.output import Progress, show, warn
@@ -47,7 +47,7 @@ def refine(
         tuple[str, ...], Flag("Override a setting: fixer.key=value. Repeatable.", "--set")
     ] = (),
     seed: Annotated[int, Flag("Seed of the fixer's noise.", min=0)] = 0,
-    device: Annotated[Literal["cpu", "cuda"], Flag("Where the fixer computes.")] = "cpu",
+    device: Annotated[str, Flag("Where the fixer computes: cpu, cuda or cuda:N.")] = "cpu",
     compare: Annotated[Path | None, Flag("Also write input and result side by side.")] = None,
     anyway: Annotated[
         bool, Flag("Take whatever the fixer makes, however much it changes.")

@@ -70,7 +70,7 @@ def serve(
     set_: Annotated[
         tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")
     ] = (),
-    device: Annotated[Literal["cpu", "cuda"], Flag("Where to compute.")] = "cpu",
+    device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu",
     history_mb: Annotated[int, Flag("Most memory of the histories, MiB.", min=16)] = 2048,
     mask: Annotated[
         tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")

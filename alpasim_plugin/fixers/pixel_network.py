@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from alpasim_plugin.core.errors import FixerError, InputError
+from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.gather import CPU
@@ -40,10 +41,10 @@ def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedG
 
     Raises:
         InputError: Weights that are missing or do not fit.
-        FixerError: The device does not work.
+        InfrastructureError: The device is not here.
     """
-    require_device(device)
-    return _load(settings.model_copy(update={"keep_render": True}), device)
+    name = require_device(device)
+    return _load(settings.model_copy(update={"keep_render": True}), name)
 
 
 @lru_cache(maxsize=4)
@@ -73,16 +74,6 @@ def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
     if settings.untrained == "identity":
         torch.nn.init.zeros_(net.write.weight)
     return net
-
-
-def require_device(device: str) -> None:
-    """Refuse a CUDA device on a machine without one.
-
-    Raises:
-        FixerError: torch sees no such device.
-    """
-    if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
-        raise FixerError(f"device {device!r}: torch sees no CUDA device", "use --device cpu")
 
 
 def draw_and_warp() -> None:

@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeVar
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.rasterize import Backend
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.background import read_background
@@ -48,7 +48,7 @@ class CleanRenderer(Renderer):
                 "use 3dgs; photographs are the truth of a recorded drive (simrun bench real)",
             )
         self.scenario, self.seed, self.threads = scenario, seed, threads
-        self.backend = backend_of(device)
+        self.device = require_device(device)
         self.scene = scene_of(scenario)
         self.stats: Mapping[str, int] = {}
 
@@ -58,25 +58,14 @@ class CleanRenderer(Renderer):
 
         def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
             return self.scene.render(
-                camera, actors, self.threads, self.backend, sky_in_alpha=complete
+                camera, actors, self.threads, self.device, sky_in_alpha=complete
             )
 
-        out = draw_request(request, draw, self.backend)
+        out = draw_request(request, draw)
         self.stats = out.stats
         return Frame(
             request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth()
         )
-
-
-def backend_of(device: str) -> Backend:
-    """Return the rasteriser that serves a device.
-
-    Raises:
-        InputError: Neither ``cpu`` nor ``cuda``.
-    """
-    if device not in ("cpu", "cuda"):
-        raise InputError(f"device {device!r}: no such device", "use cpu or cuda")
-    return "cpu" if device == "cpu" else "gsplat"
 
 
 def scene_of(scenario: Scenario) -> SceneGraph:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.cache import cached
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
@@ -48,7 +49,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
 )
 from alpasim_plugin.renderers.gaussian import (
     CleanRenderer,
-    backend_of,
     in_memory,
     scene_key,
     scene_of,
@@ -85,7 +85,7 @@ class ReconstructionRenderer(Renderer):
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
-        self.backend = backend_of(device)
+        self.device = require_device(device)
         self.model = model_of(scenario, threads)
         self.stats: Mapping[str, int] = {}
 
@@ -93,14 +93,14 @@ class ReconstructionRenderer(Renderer):
         """Render one frame."""
 
         def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-            out = self.model.graph.render(camera, actors, self.threads, self.backend)
+            out = self.model.graph.render(camera, actors, self.threads, self.device)
             return replace(
                 out,
                 alpha=np.maximum(out.alpha, self.model.sky.share(camera)),
                 depth=out.surface_depth(),
             )
 
-        out = draw_request(request, draw, self.backend)
+        out = draw_request(request, draw)
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
@@ -202,14 +202,14 @@ class ImportedRenderer(Renderer):
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
-        self.backend = backend_of(device)
+        self.device = require_device(device)
         self.graph = graph_of(scenario)
         self.fitted = [one for one in scenario.recording if one.use == "fitted"]
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
-        out = draw_request(request, self._drawn, self.backend)
+        out = draw_request(request, self._drawn)
         place = camera_at(request, request.T_world_camera[1]).centre_world
         rgb = np.clip(out.rgb * exposure_near(self.fitted, request.camera.name, place), 0.0, 1.0)
         shown = replace(out, rgb=np.asarray(rgb, np.float32))
@@ -227,7 +227,7 @@ class ImportedRenderer(Renderer):
     def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
         """Render with the sky as an opaque layer without depth."""
         known = {name: T for name, T in actors.items() if name in self.graph.actors}
-        out = self.graph.render(camera, known, self.threads, self.backend)
+        out = self.graph.render(camera, known, self.threads, self.device)
         sky = (out.alpha < OPAQUE) & camera.above_horizon()
         return replace(
             out,

@@ -12,20 +12,16 @@ from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import F64, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.rasterize import Backend
 
 Draw = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
 
 
-def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> RasterOutput:
+def draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
     """Draw a request's frame; with an exposure in `bands`, otherwise at the shutter's end.
 
     Args:
         request: What to draw.
-        draw: Draws a camera's picture with the road users at their boxes.
-        backend: Of ``draw``. It is given the window of each band, but gsplat the whole picture: its
-            limits of slopes (`PinholeCamera.slope_limits`) are its own, and would follow the
-            window.
+        draw: Draws a camera's image with the road users at their boxes.
 
     Returns:
         The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of
@@ -39,13 +35,11 @@ def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> Raster
         np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
     )
     stats: dict[str, int] = {}
-    windows = backend != "gsplat"
     for band in bands(request):
         camera = camera_at(request, band.T_world_camera)
-        part = draw(camera.window(band.rows, band.columns) if windows else camera, band.actors)
-        at = (slice(None), slice(None)) if windows else (band.rows, band.columns)
+        part = draw(camera.window(band.rows, band.columns), band.actors)
         for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
-            band.put(whole, drawn[at])
+            band.put(whole, drawn)
         stats = {name: max(count, stats.get(name, 0)) for name, count in part.stats.items()}
     return RasterOutput(out.rgb, out.alpha, out.depth, stats)
 

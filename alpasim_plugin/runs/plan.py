@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
@@ -33,7 +34,7 @@ class RunOptions:
         "jpeg"
     )
     video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
-    device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"
+    device: Annotated[str, Flag("Where renderers compute: cpu, cuda or cuda:N.")] = "cpu"
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")
     ] = None
@@ -179,7 +180,9 @@ def make_plan(
     Raises:
         InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given
             twice.
+        InfrastructureError: The device is not here.
     """
+    options = replace(options, device=require_device(options.device))
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
         _check_named_once(what, values)
     rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)

@@ -92,8 +92,8 @@ def test_bands_are_the_rows_to_rounding_where_the_end_pose_is_far_off(
     scenario: Scenario, draw: Draw, name: str
 ) -> None:
     request = case(scenario, **HARD[name])
-    truth, in_bands = plain_draw_request(request, draw), draw_request(request, draw, "cpu")
-    at_end = draw_request(replace(request, exposure=None), draw, "cpu")
+    truth, in_bands = plain_draw_request(request, draw), draw_request(request, draw)
+    at_end = draw_request(replace(request, exposure=None), draw)
     assert psnr(in_bands, truth) > 37
     assert psnr(in_bands, truth) > psnr(at_end, truth) + 15
     assert np.quantile(np.abs(in_bands.rgb - truth.rgb), 0.999) < 0.12
@@ -111,7 +111,7 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
             "alpasim_plugin.renderers.rolling.bands",
             partial(lambda r, n: list(bands_of(r, n)), n=count),
         )
-        errors.append(psnr(draw_request(request, draw, "cpu"), truth))
+        errors.append(psnr(draw_request(request, draw), truth))
     assert all(later > earlier + 6 for earlier, later in pairwise(errors)), errors
     assert (
         errors[-1] > 90
@@ -121,14 +121,9 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
 def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario: Scenario, draw: Draw) -> None:
     request = case(scenario)
     np.testing.assert_array_equal(
-        draw_request(request, draw, "cpu").rgb,
-        draw_request(replace(request, exposure=None), draw, "cpu").rgb,
+        draw_request(request, draw).rgb,
+        draw_request(replace(request, exposure=None), draw).rgb,
     )
-
-
-def test_a_backend_without_windows_gives_the_same_picture(scenario: Scenario, draw: Draw) -> None:
-    request = case(scenario, **HARD["turning"])
-    assert psnr(draw_request(request, draw, "gsplat"), draw_request(request, draw, "cpu")) > 90
 
 
 def test_a_window_shows_what_the_whole_picture_does(scenario: Scenario, draw: Draw) -> None:

@@ -1,1 +1,1 @@
-"""The rasterisers: reference, CPU, torch, gsplat, and the CPU gradient."""
+"""The rasterisers: reference, CPU, torch, Triton, and the CPU gradient."""

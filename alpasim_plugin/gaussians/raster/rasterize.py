@@ -10,7 +10,7 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import NEAR_M
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput
 
-Backend = Literal["cpu", "reference", "torch", "gsplat"]
+Backend = Literal["cpu", "reference", "torch", "triton"]
 
 
 def rasterize(
@@ -28,7 +28,7 @@ def rasterize(
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything, 0..1.
         backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
-            (that of the differentiable `rasterize_gradient`) or ``gsplat`` (GPU).
+            (that of the differentiable `rasterize_gradient`) or ``triton`` (GPU).
         near_m: Gaussians whose centre is nearer are left out.
 
     Returns:
@@ -36,8 +36,8 @@ def rasterize(
 
     Raises:
         InputError: Unknown backend, or a cloud or background that cannot be drawn.
-        RendererError: ``gsplat`` is missing or does not work on this machine; there is no silent
-            fallback.
+        RendererError: Triton is not installed.
+        InfrastructureError: There is no GPU; nothing falls back to another backend.
 
     Example:
         >>> import numpy as np
@@ -59,10 +59,10 @@ def rasterize(
         from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_torch
 
         return rasterize_torch(cloud, camera, background, near_m=near_m)
-    if backend == "gsplat":
-        from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gsplat
+    if backend == "triton":
+        from alpasim_plugin.gaussians.raster.rasterize_triton import rasterize_triton
 
-        return rasterize_gsplat(cloud, camera, background, near_m=near_m)
+        return rasterize_triton(cloud, camera, background, near_m=near_m)
     raise InputError(
         f"backend {backend!r}: no such backend",
         f"choose one of {', '.join(get_args(Backend))}",

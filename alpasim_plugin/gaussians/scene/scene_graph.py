@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +29,11 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
-from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
+
+if TYPE_CHECKING:
+    from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +140,7 @@ class SceneGraph:
         self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
         self._actor_index = {name: i for i, name in enumerate(self.actors)}
         self._prepared: dict[tuple[str, int], PreparedCloud] = {}
+        self._uploaded: dict[str, tuple[UploadedClouds, dict[tuple[str, int], int]]] = {}
 
     def __len__(self) -> int:
         """Return the number of Gaussians at the finest level."""
@@ -147,7 +151,7 @@ class SceneGraph:
         camera: PinholeCamera,
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
-        backend: Backend = "cpu",
+        device: str = "cpu",
         sky_in_alpha: bool = False,
     ) -> RasterOutput:
         """Render one view.
@@ -155,9 +159,8 @@ class SceneGraph:
         Args:
             camera: From where.
             actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
-            threads: Thread count of the CPU backend; None leaves it as it is.
-            backend: ``cpu`` uses nodes prepared once; any other backend gets all chosen Gaussians
-                as one cloud.
+            threads: Thread count on the CPU; None leaves it as it is.
+            device: Where to draw. The first frame on a GPU uploads all nodes.
             sky_in_alpha: Count the sky as opaque.
 
         Returns:
@@ -169,11 +172,12 @@ class SceneGraph:
         """
         chosen = self._choose(camera, actor_poses)
         behind = self.sky.image(camera)
-        if backend == "cpu":
+        if device == "cpu":
             nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
             out = rasterize_prepared(nodes, camera, behind, threads=threads)
         else:
-            out = rasterize(self._joined(chosen), camera, behind, backend)
+            clouds, place = self._upload(device)
+            out = clouds.draw([(place[n.name, i], T) for n, i, T in chosen], camera, behind)
         stats = {
             **out.stats,
             "nodes": len(chosen),
@@ -182,13 +186,6 @@ class SceneGraph:
         return replace(
             out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats
         )
-
-    def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
-        clouds = []
-        for node, level, T in chosen:
-            cloud = node.levels[level].cloud
-            clouds.append(cloud if T is None else cloud.transformed(T))
-        return GaussianCloud.concatenate(clouds)
 
     def _choose(
         self, camera: PinholeCamera, actor_poses: Mapping[str, F64]
@@ -231,6 +228,20 @@ class SceneGraph:
         if key not in self._prepared:
             self._prepared[key] = prepare(node.levels[level].cloud)
         return self._prepared[key]
+
+    def _upload(self, device: str) -> tuple[UploadedClouds, dict[tuple[str, int], int]]:
+        """Return all levels of all nodes on a device, and the place of each by name and level."""
+        if device not in self._uploaded:
+            from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
+
+            clouds = {
+                (node.name, i): level.cloud
+                for node in (*self.background, *self.actors.values())
+                for i, level in enumerate(node.levels)
+            }
+            place = {key: number for number, key in enumerate(clouds)}
+            self._uploaded[device] = UploadedClouds(list(clouds.values()), device), place
+        return self._uploaded[device]
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:

@@ -1,0 +1,232 @@
+"""Render on a GPU: clouds are uploaded once, a frame sends poses and brings back one image.
+
+State of testing: the kernels are interpreted on the CPU against the reference implementation, and
+compiled for GPUs of compute capability 8.0 and 9.0; they have not been run on a GPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.constants import ALPHA_MIN, EXTENT_MAX_SIGMA, NEAR_M, TILE
+from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.rasterize_cpu import node_poses
+
+BLOCK = 128  # Gaussians that one program projects
+CHUNK = 32  # splats after which a tile is tested for being full
+FIRST_CAPACITY = 1 << 16  # pairs of splat and tile for which the first frame has room
+HINT = "Install torch's CUDA build, which brings Triton, or choose --device cpu"
+
+
+def triton_kernels() -> Any:
+    """Return the module of kernels.
+
+    Raises:
+        RendererError: Triton is not installed.
+    """
+    try:
+        from alpasim_plugin.gaussians.raster import triton_kernels as kernels
+    except ImportError as error:
+        raise RendererError(f"the package triton does not import ({error})", HINT) from error
+    return kernels
+
+
+class UploadedClouds:
+    """Clouds in a device's memory, drawn from there in any poses.
+
+    Args:
+        clouds: Gaussians, each in its own frame.
+        device: A torch device, ``cuda:0``.
+
+    Raises:
+        InputError: A cloud cannot be drawn.
+        RendererError: Triton is not installed.
+        InfrastructureError: There is no such device.
+    """
+
+    def __init__(self, clouds: Sequence[GaussianCloud], device: str) -> None:
+        self.kernels = triton_kernels()
+        self.device = torch.device(require_device(device))
+        for cloud in clouds:
+            cloud.require_drawable()
+        self.sizes = [len(cloud) for cloud in clouds]
+        self.first = [0, *np.cumsum(self.sizes).tolist()]
+        self.sh_size = max((cloud.sh.shape[1] for cloud in clouds), default=1)
+        opacity = _joined([cloud.opacities.astype(np.float64) for cloud in clouds], ())
+        extent = np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0)))
+        self.extents = self._upload(np.minimum(EXTENT_MAX_SIGMA, extent), np.float32)
+        self.opacities = self._upload(opacity, np.float32)
+        self.means = self._upload(_joined([cloud.means for cloud in clouds], (3,)), np.float64)
+        factors = [cloud.rotations() * cloud.scales.astype(np.float64)[:, None] for cloud in clouds]
+        self.factors = self._upload(_joined(factors, (3, 3)), np.float32)
+        self.sh = self._upload(
+            _joined([_padded(cloud.sh, self.sh_size) for cloud in clouds], (self.sh_size, 3)),
+            np.float32,
+        )
+        self.capacity = FIRST_CAPACITY
+
+    def draw(
+        self,
+        nodes: Sequence[tuple[int, npt.NDArray[np.floating] | None]],
+        camera: PinholeCamera,
+        background: Background = (0.0, 0.0, 0.0),
+        near_m: float = NEAR_M,
+    ) -> RasterOutput:
+        """Render clouds at rigid poses in one image.
+
+        Args:
+            nodes: Position of the cloud among those uploaded, and ``T_world_node`` or None for the
+                identity. Equal depths are drawn in the order of the nodes.
+            camera: From where.
+            background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
+            near_m: Gaussians whose centre is nearer are left out.
+
+        Raises:
+            InputError: A transform is not rigid or the background does not fit.
+        """
+        behind = background_image(background, camera)
+        spans = self._spans([cloud for cloud, _ in nodes])
+        poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
+        while True:
+            image, pairs, visible = self._image(spans, poses, camera, near_m)
+            if pairs <= self.capacity:
+                break
+            self.capacity = pairs + pairs // 4  # the lists were cut short: draw again with room
+        alpha = image[..., 4]
+        rgb = np.clip(image[..., :3] + (1 - alpha[..., None]) * behind, 0, 1)
+        depth = np.divide(image[..., 3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        gaussians = sum(self.sizes[cloud] for cloud, _ in nodes)
+        stats = {"gaussians": gaussians, "visible": visible, "pairs": pairs}
+        return RasterOutput(rgb.astype(np.float32), alpha.copy(), depth, stats)
+
+    def _image(
+        self, spans: npt.NDArray[np.int32], poses: F64, camera: PinholeCamera, near_m: float
+    ) -> tuple[npt.NDArray[np.float32], int, int]:
+        """Return colour, weighted depth and opacity ``(H, W, 5)``, the number of pairs of splat
+        and tile, and of splats seen; the image is whole if the pairs are at most `capacity`.
+        """
+        kernels, width, height = self.kernels, camera.width, camera.height
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        total = len(spans) * BLOCK
+        records = self._empty((total, kernels.RECORD), torch.float32)
+        depths = self._empty((total,), torch.float32)
+        boxes = self._empty((total, kernels.BOX), torch.int32)
+        counts = self._empty((total,), torch.int32)
+        numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
+        if total:
+            kernels.project[(len(spans),)](
+                self._upload(spans, np.int32),
+                self._upload(poses, np.float64),
+                self._upload(np.array(numbers), np.float64),
+                self.means,
+                self.factors,
+                self.opacities,
+                self.extents,
+                self.sh,
+                records,
+                depths,
+                boxes,
+                counts,
+                near_m,
+                tiles_x,
+                tiles_y,
+                SIZE=self.sh_size,
+                TILE=TILE,
+                BLOCK=BLOCK,
+            )
+        order = torch.sort(depths, stable=True).indices
+        ends = torch.cumsum(counts[order], dim=0)
+        tiles = torch.full(
+            (self.capacity,), tiles_x * tiles_y, dtype=torch.int32, device=self.device
+        )
+        splats = torch.zeros_like(tiles)
+        if total:
+            kernels.list_tiles[(len(spans),)](
+                order,
+                ends,
+                boxes,
+                counts,
+                tiles,
+                splats,
+                total,
+                self.capacity,
+                tiles_x,
+                BLOCK=BLOCK,
+            )
+        sorted_tiles, place = torch.sort(tiles, stable=True)
+        every = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=self.device)
+        starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
+        # A row more holds the counts of pairs and of splats, so that one copy brings back all.
+        image = torch.zeros((height * width + 1, 5), dtype=torch.float32, device=self.device)
+        kernels.composite[(tiles_x * tiles_y,)](
+            records,
+            splats[place],
+            starts,
+            image,
+            width,
+            height,
+            tiles_x,
+            TILE=TILE,
+            CHUNK=CHUNK,
+        )
+        image[-1, 0] = counts.sum(dtype=torch.int32).view(torch.float32)
+        image[-1, 1] = (counts > 0).sum(dtype=torch.int32).view(torch.float32)
+        downloaded = image.cpu().numpy()
+        pairs, visible = downloaded[-1, :2].view(np.int32).tolist()
+        return downloaded[:-1].reshape(height, width, 5), pairs, visible
+
+    def _spans(self, clouds: Sequence[int]) -> npt.NDArray[np.int32]:
+        """Return the table of blocks ``(B, 3)``: node, first Gaussian, number of Gaussians."""
+        spans = []
+        for node, cloud in enumerate(clouds):
+            begins = np.arange(0, self.sizes[cloud], BLOCK)
+            sizes = np.minimum(self.sizes[cloud] - begins, BLOCK)
+            spans.append(
+                np.column_stack([np.full_like(begins, node), self.first[cloud] + begins, sizes])
+            )
+        return _joined(spans, (3,)).astype(np.int32)
+
+    def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
+        return torch.from_numpy(np.array(array, dtype)).to(self.device)
+
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+
+def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """Return arrays of rows of a shape as one, also where there is none."""
+    return np.concatenate([np.zeros((0, *shape)), *arrays])
+
+
+def _padded(sh: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floating]:
+    """Return harmonics ``(N, K, 3)`` with zeros up to ``size`` coefficients."""
+    return np.pad(sh, ((0, 0), (0, size - sh.shape[1]), (0, 0)))
+
+
+def rasterize_triton(
+    cloud: GaussianCloud,
+    camera: PinholeCamera,
+    background: Background = (0.0, 0.0, 0.0),
+    *,
+    near_m: float = NEAR_M,
+    device: str = "cuda",
+) -> RasterOutput:
+    """Upload and render one cloud in world coordinates; `UploadedClouds` draws repeated frames.
+
+    Raises:
+        InputError: The cloud or the background cannot be drawn.
+        RendererError: Triton is not installed.
+        InfrastructureError: There is no such device.
+    """
+    return UploadedClouds([cloud], device).draw([(0, None)], camera, background, near_m)

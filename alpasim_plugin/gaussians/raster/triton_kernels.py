@@ -1,0 +1,289 @@
+"""Triton kernels of the GPU rasteriser: project Gaussians, list them per tile, composite tiles.
+
+`alpasim_plugin.gaussians.raster.rasterize_reference` is the reference implementation. Importing
+this module needs Triton, which torch's CUDA wheels bring. With ``TRITON_INTERPRET=1`` in the
+environment before the first import, the kernels run interpreted on the CPU.
+"""
+
+# Triton's decorators and tensor types are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator,misc"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from alpasim_plugin.gaussians import constants, sh
+
+POSE = 12  # float64 per node: rotation node to camera by rows, camera centre in the node
+SPAN = 3  # int32 per block: number of the node, first Gaussian, number of Gaussians
+CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
+RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
+BOX = 4  # int32 per splat: first and last + 1 tile column, first and last + 1 tile row
+
+_EPS2D_PX2 = tl.constexpr(constants.EPS2D_PX2)
+_ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
+_ALPHA_MAX = tl.constexpr(constants.ALPHA_MAX)
+_STOP = tl.constexpr(constants.TRANSMITTANCE_STOP)
+_FAR_M = tl.constexpr(constants.FAR_M)
+_MARGIN_PX = tl.constexpr(0.01)  # boxes grow by it: rounding never cuts a pixel that is drawn
+_C0 = tl.constexpr(sh.C0)
+_C1 = tl.constexpr(sh.C1)
+_C20, _C21, _C22 = (tl.constexpr(value) for value in sh.C2)
+_C30, _C31, _C32, _C33, _C34 = (tl.constexpr(value) for value in sh.C3)
+
+
+@triton.jit
+def _colour(sh_ptr, at, drawn, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.constexpr):
+    """Return one colour channel of splats seen along unit directions, 0 where it would be less.
+
+    ``at`` is the first coefficient of each splat; the order is that of `sh.sh_terms`.
+    """
+    at += CHANNEL
+    value = 0.5 + _C0 * tl.load(sh_ptr + at, drawn, 0.0)
+    if SIZE > 1:
+        value -= _C1 * y * tl.load(sh_ptr + at + 3, drawn, 0.0)
+        value += _C1 * z * tl.load(sh_ptr + at + 6, drawn, 0.0)
+        value -= _C1 * x * tl.load(sh_ptr + at + 9, drawn, 0.0)
+    if SIZE > 4:
+        value += _C20 * x * y * tl.load(sh_ptr + at + 12, drawn, 0.0)
+        value -= _C20 * y * z * tl.load(sh_ptr + at + 15, drawn, 0.0)
+        value += _C21 * (2 * z * z - x * x - y * y) * tl.load(sh_ptr + at + 18, drawn, 0.0)
+        value -= _C20 * x * z * tl.load(sh_ptr + at + 21, drawn, 0.0)
+        value += _C22 * (x * x - y * y) * tl.load(sh_ptr + at + 24, drawn, 0.0)
+    if SIZE > 9:
+        four_zz = 4 * z * z - x * x - y * y
+        value -= _C30 * y * (3 * x * x - y * y) * tl.load(sh_ptr + at + 27, drawn, 0.0)
+        value += _C31 * x * y * z * tl.load(sh_ptr + at + 30, drawn, 0.0)
+        value -= _C32 * y * four_zz * tl.load(sh_ptr + at + 33, drawn, 0.0)
+        cubic = z * (2 * z * z - 3 * x * x - 3 * y * y)
+        value += _C33 * cubic * tl.load(sh_ptr + at + 36, drawn, 0.0)
+        value -= _C32 * x * four_zz * tl.load(sh_ptr + at + 39, drawn, 0.0)
+        value += _C34 * z * (x * x - y * y) * tl.load(sh_ptr + at + 42, drawn, 0.0)
+        value -= _C30 * x * (x * x - 3 * y * y) * tl.load(sh_ptr + at + 45, drawn, 0.0)
+    return tl.maximum(value, 0.0)
+
+
+@triton.jit
+def _tiles(low, high, count, TILE: tl.constexpr):
+    """Return the first tile and the last + 1 that pixels ``low`` to ``high`` meet, in 0..count."""
+    # Clamped as floats: a splat at 1e30 pixels has no tile number.
+    first = tl.minimum(tl.maximum(tl.floor(low / TILE), 0.0), count).to(tl.int32)
+    last = tl.minimum(tl.maximum(tl.floor(high / TILE), -1.0), count - 1.0).to(tl.int32) + 1
+    return first, last
+
+
+@triton.jit
+def project(
+    spans,
+    poses,
+    camera,
+    means,
+    factors,
+    opacities,
+    extents,
+    sh_ptr,
+    records,
+    depths,
+    boxes,
+    counts,
+    near_m,
+    tiles_x,
+    tiles_y,
+    SIZE: tl.constexpr,
+    TILE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Project a block of Gaussians of one node: its record, depth, box of tiles and their count.
+
+    Positions are float64 up to the camera's axes, so that UTM-sized coordinates keep millimetres.
+    A Gaussian that is not drawn has depth infinity and no tile.
+    """
+    block = tl.program_id(0)
+    node = tl.load(spans + block * 3)
+    lane = tl.arange(0, BLOCK)
+    present = lane < tl.load(spans + block * 3 + 2)
+    i = (tl.load(spans + block * 3 + 1) + lane).to(tl.int64)
+    pose = poses + node * 12
+    r00 = tl.load(pose)
+    r01 = tl.load(pose + 1)
+    r02 = tl.load(pose + 2)
+    r10 = tl.load(pose + 3)
+    r11 = tl.load(pose + 4)
+    r12 = tl.load(pose + 5)
+    r20 = tl.load(pose + 6)
+    r21 = tl.load(pose + 7)
+    r22 = tl.load(pose + 8)
+    dx = tl.load(means + 3 * i, present, 0.0) - tl.load(pose + 9)
+    dy = tl.load(means + 3 * i + 1, present, 0.0) - tl.load(pose + 10)
+    dz = tl.load(means + 3 * i + 2, present, 0.0) - tl.load(pose + 11)
+    x = r00 * dx + r01 * dy + r02 * dz
+    y = r10 * dx + r11 * dy + r12 * dz
+    z = r20 * dx + r21 * dy + r22 * dz
+    opacity = tl.load(opacities + i, present, 0.0)
+    drawn = present & (z >= near_m) & (z <= _FAR_M) & (opacity >= _ALPHA_MIN)
+    z = tl.where(drawn, z, 1.0)
+    fx = tl.load(camera)
+    fy = tl.load(camera + 1)
+    slope_x = x / z
+    slope_y = y / z
+    u = (fx * slope_x + tl.load(camera + 2)).to(tl.float32)
+    v = (fy * slope_y + tl.load(camera + 3)).to(tl.float32)
+    sx = tl.minimum(tl.maximum(slope_x, tl.load(camera + 4)), tl.load(camera + 5)).to(tl.float32)
+    sy = tl.minimum(tl.maximum(slope_y, tl.load(camera + 6)), tl.load(camera + 7)).to(tl.float32)
+    along_x = (fx / z).to(tl.float32)
+    along_y = (fy / z).to(tl.float32)
+    # Rows of J R: how the image moves with the node's axes.
+    jx0 = along_x * (r00.to(tl.float32) - sx * r20.to(tl.float32))
+    jx1 = along_x * (r01.to(tl.float32) - sx * r21.to(tl.float32))
+    jx2 = along_x * (r02.to(tl.float32) - sx * r22.to(tl.float32))
+    jy0 = along_y * (r10.to(tl.float32) - sy * r20.to(tl.float32))
+    jy1 = along_y * (r11.to(tl.float32) - sy * r21.to(tl.float32))
+    jy2 = along_y * (r12.to(tl.float32) - sy * r22.to(tl.float32))
+    f = factors + 9 * i
+    f00 = tl.load(f, drawn, 0.0)
+    f01 = tl.load(f + 1, drawn, 0.0)
+    f02 = tl.load(f + 2, drawn, 0.0)
+    f10 = tl.load(f + 3, drawn, 0.0)
+    f11 = tl.load(f + 4, drawn, 0.0)
+    f12 = tl.load(f + 5, drawn, 0.0)
+    f20 = tl.load(f + 6, drawn, 0.0)
+    f21 = tl.load(f + 7, drawn, 0.0)
+    f22 = tl.load(f + 8, drawn, 0.0)
+    m0 = jx0 * f00 + jx1 * f10 + jx2 * f20
+    m1 = jx0 * f01 + jx1 * f11 + jx2 * f21
+    m2 = jx0 * f02 + jx1 * f12 + jx2 * f22
+    n0 = jy0 * f00 + jy1 * f10 + jy2 * f20
+    n1 = jy0 * f01 + jy1 * f11 + jy2 * f21
+    n2 = jy0 * f02 + jy1 * f12 + jy2 * f22
+    mm = m0 * m0 + m1 * m1 + m2 * m2
+    nn = n0 * n0 + n1 * n1 + n2 * n2
+    c11 = mm + _EPS2D_PX2
+    c22 = nn + _EPS2D_PX2
+    c12 = m0 * n0 + m1 * n1 + m2 * n2
+    # The determinant as a sum of squares (Cauchy-Binet) does not cancel for needles.
+    cross0 = m1 * n2 - m2 * n1
+    cross1 = m2 * n0 - m0 * n2
+    cross2 = m0 * n1 - m1 * n0
+    det = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
+    det += _EPS2D_PX2 * (mm + nn) + _EPS2D_PX2 * _EPS2D_PX2
+    l11 = tl.sqrt(c22 / det)
+    l22 = 1.0 / tl.sqrt(c22)
+    extent = tl.load(extents + i, present, 0.0)
+    half_width = extent * tl.sqrt(c11)
+    half_height = extent * tl.sqrt(c22)
+    distance = tl.sqrt(dx * dx + dy * dy + dz * dz)
+    distance = tl.where(drawn, distance, 1.0)
+    toward_x = (dx / distance).to(tl.float32)
+    toward_y = (dy / distance).to(tl.float32)
+    toward_z = (dz / distance).to(tl.float32)
+    x0, x1 = _tiles(u - half_width - _MARGIN_PX, u + half_width + _MARGIN_PX, tiles_x, TILE)
+    y0, y1 = _tiles(v - half_height - _MARGIN_PX, v + half_height + _MARGIN_PX, tiles_y, TILE)
+    count = tl.maximum(x1 - x0, 0) * tl.maximum(y1 - y0, 0)
+    count = tl.where(drawn, count, 0)
+    slot = block * BLOCK + lane
+    tl.store(depths + slot, tl.where(drawn, z.to(tl.float32), float("inf")))
+    tl.store(counts + slot, count)
+    tl.store(boxes + slot * 4, x0)
+    tl.store(boxes + slot * 4 + 1, x1)
+    tl.store(boxes + slot * 4 + 2, y0)
+    tl.store(boxes + slot * 4 + 3, y1)
+    seen = count > 0
+    record = records + slot * 12
+    tl.store(record, u, seen)
+    tl.store(record + 1, v, seen)
+    tl.store(record + 2, l11, seen)
+    tl.store(record + 3, -(c12 / c22) * l11, seen)
+    tl.store(record + 4, l22, seen)
+    tl.store(record + 5, opacity, seen)
+    at = i * (SIZE * 3)
+    tl.store(record + 6, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 0, SIZE), seen)
+    tl.store(record + 7, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 1, SIZE), seen)
+    tl.store(record + 8, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 2, SIZE), seen)
+    tl.store(record + 9, z.to(tl.float32), seen)
+
+
+@triton.jit
+def list_tiles(
+    order, ends, boxes, counts, tiles, splats, total, capacity, tiles_x, BLOCK: tl.constexpr
+):
+    """Write the tiles of each splat, nearest splat first: pairs of tile and splat.
+
+    ``ends`` is the running sum of the counts in the order of depth; pairs beyond ``capacity`` are
+    left out.
+    """
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    present = rank < total
+    slot = tl.load(order + rank, present, 0)
+    count = tl.where(present, tl.load(counts + slot, present, 0), 0)
+    begin = tl.load(ends + rank, present, 0) - count
+    x0 = tl.load(boxes + slot * 4, present, 0)
+    columns = tl.maximum(tl.load(boxes + slot * 4 + 1, present, 0) - x0, 1)
+    y0 = tl.load(boxes + slot * 4 + 2, present, 0)
+    most = tl.max(count, axis=0)
+    for k in range(most):
+        at = begin + k
+        wanted = (k < count) & (at < capacity)
+        tile = (y0 + k // columns) * tiles_x + x0 + k % columns
+        tl.store(tiles + at, tile, wanted)
+        tl.store(splats + at, slot.to(tl.int32), wanted)
+
+
+@triton.jit
+def composite(
+    records,
+    splats,
+    starts,
+    image,
+    width,
+    height,
+    tiles_x,
+    TILE: tl.constexpr,
+    CHUNK: tl.constexpr,
+):
+    """Blend a tile's splats, nearest first, into colour, weighted depth and opacity per pixel."""
+    tile = tl.program_id(0)
+    column = (tile % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
+    row = (tile // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
+    column, row = tl.broadcast(column, row)
+    px = column.to(tl.float32) + 0.5
+    py = row.to(tl.float32) + 0.5
+    transmittance = tl.full((TILE, TILE), 1.0, tl.float32)
+    red = tl.zeros((TILE, TILE), tl.float32)
+    green = tl.zeros((TILE, TILE), tl.float32)
+    blue = tl.zeros((TILE, TILE), tl.float32)
+    depth = tl.zeros((TILE, TILE), tl.float32)
+    inside = (column < width) & (row < height)
+    open_ = inside
+    begin = tl.load(starts + tile)
+    end = tl.load(starts + tile + 1)
+    while begin < end:
+        stop = tl.minimum(begin + CHUNK, end)
+        for k in range(begin, stop):
+            record = records + tl.load(splats + k).to(tl.int64) * 12
+            dx = px - tl.load(record)
+            dy = py - tl.load(record + 1)
+            s = tl.load(record + 2) * dx + tl.load(record + 3) * dy
+            t = tl.load(record + 4) * dy
+            alpha = tl.load(record + 5) * tl.exp(-0.5 * (s * s + t * t))
+            alpha = tl.minimum(alpha, _ALPHA_MAX)
+            drawn = (alpha >= _ALPHA_MIN) & open_
+            after = transmittance * (1.0 - alpha)
+            # The splat that would close a pixel is left out, and so is all behind it.
+            open_ = open_ & ~(drawn & (after <= _STOP))
+            drawn = drawn & open_
+            weight = tl.where(drawn, alpha * transmittance, 0.0)
+            red += weight * tl.load(record + 6)
+            green += weight * tl.load(record + 7)
+            blue += weight * tl.load(record + 8)
+            depth += weight * tl.load(record + 9)
+            transmittance = tl.where(drawn, after, transmittance)
+        begin = stop
+        if tl.max(open_.to(tl.int32)) == 0:
+            begin = end
+    pixel = image + (row * width + column) * 5
+    tl.store(pixel, red, inside)
+    tl.store(pixel + 1, green, inside)
+    tl.store(pixel + 2, blue, inside)
+    tl.store(pixel + 3, depth, inside)
+    tl.store(pixel + 4, 1.0 - transmittance, inside)

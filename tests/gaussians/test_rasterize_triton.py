@@ -1,0 +1,164 @@
+"""Compare the GPU rasteriser with the float64 reference, its kernels interpreted on the CPU, and
+compile them for two generations of cards.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from tests.gaussians.gaussian_scenes import (
+    LSB,
+    assert_same_image,
+    camera,
+    random_cloud,
+    random_rigid,
+    splats,
+)
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
+
+
+def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0), near_m=0.1):
+    return UploadedClouds([cloud], "cpu").draw([(0, None)], cam, behind, near_m)
+
+
+def needle(length_px: float, angle: float) -> GaussianCloud:
+    quat = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+    return splats([0.1, -0.05, 2.0], [[length_px / 40, 0.02, 0.003]], 0.9, quats=quat)
+
+
+def moved(cloud: GaussianCloud, offset) -> GaussianCloud:
+    return GaussianCloud(
+        cloud.means + np.asarray(offset), cloud.quats, cloud.scales, cloud.opacities, cloud.sh
+    )
+
+
+def kilometre_splats() -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600])
+    return splats(means, 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
+
+
+HARD = {
+    "no Gaussian": random_cloud(0),
+    "all shapes": random_cloud(200, 4),
+    "constant colours": random_cloud(60, 5, degree=0),
+    "harmonics of degree 1": random_cloud(60, 6, degree=1),
+    "harmonics of degree 2": random_cloud(60, 7, degree=2),
+    "saturated layers": splats(np.column_stack([np.zeros((8, 2)), np.arange(2.0, 10)]), 5.0, 1.0),
+    "kilometre splats": kilometre_splats(),
+    "zero scale": splats([0, 0, 3.0], 0.0, 0.9),
+    "centre behind": splats([0, 0, -0.5], 3.0, 0.9),
+    "far off axis": splats([9.8, 0, 1.7], 0.3, 0.95),
+    "needle of 10 pixels": needle(10, 0.3),
+    "needle of 1,000 pixels": needle(1_000, 1.1),
+    "needle of 10,000 pixels": needle(10_000, 2.0),
+    "overflowing width": splats([0, 0, 5.0], [[np.exp(19.9), 1e-30, 1.0]], 0.5),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_every_pixel_of_a_hard_case_is_within_one_grey_level(name: str) -> None:
+    cloud, behind = HARD[name], (0.2, 0.3, 0.4)
+    found = interpreted(cloud, camera(), behind)
+    wanted = rasterize_reference(cloud, camera(), behind, brute=True)
+    assert_same_image(found, wanted, LSB)
+    assert np.mean(np.abs(found.rgb - wanted.rgb)) < 1e-4
+
+
+def test_a_wall_at_the_near_plane_is_drawn_beyond_it_only() -> None:
+    for z in (0.095, 0.105):
+        wall = splats([[0, 0, z], [0.01, 0, z]], 0.1, 0.9)
+        wanted = rasterize_reference(wall, camera())
+        assert_same_image(interpreted(wall, camera()), wanted, LSB)
+        assert wanted.alpha.any() == (z > 0.1)
+
+
+def test_coordinates_of_utm_size_cost_no_precision() -> None:
+    cloud, offset = random_cloud(60, 8), np.array([691_600.0, 5_334_760.0, 520.0])
+    T = np.eye(4)
+    T[:3, 3] = -offset
+    far = camera(T_camera_world=T)
+    assert_same_image(interpreted(moved(cloud, offset), far), interpreted(cloud, camera()), LSB)
+
+
+def test_nodes_at_poses_equal_the_processor() -> None:
+    clouds = [random_cloud(60, 1), *(random_cloud(20, seed, degree=1) for seed in (2, 3))]
+    poses = [None, *(random_rigid(seed, 1.0) for seed in (2, 3))]
+    behind = np.random.default_rng(1).random((64, 96, 3)).astype(np.float32)
+    found = UploadedClouds(clouds, "cpu").draw(list(enumerate(poses)), camera(), behind)
+    nodes = [(prepare(cloud), T) for cloud, T in zip(clouds, poses, strict=True)]
+    wanted = rasterize_prepared(nodes, camera(), behind)
+    assert_same_image(found, wanted, LSB)
+    assert found.stats["visible"] >= wanted.stats["visible"]
+
+
+def test_equal_depths_are_drawn_in_the_order_of_the_nodes() -> None:
+    red, green = (splats([0, 0, 4.0], 3.0, 0.9, rgb) for rgb in ((1, 0, 0), (0, 1, 0)))
+    clouds = UploadedClouds([red, green], "cpu")
+    first = clouds.draw([(0, None), (1, np.eye(4))], camera()).rgb[32, 48]
+    second = clouds.draw([(1, np.eye(4)), (0, None)], camera()).rgb[32, 48]
+    assert first == pytest.approx([0.9, 0.09, 0], abs=2e-3)
+    assert second == pytest.approx([0.09, 0.9, 0], abs=2e-3)
+
+
+def test_lists_that_outgrow_their_room_are_drawn_again() -> None:
+    cloud = random_cloud(60, 9)
+    small = UploadedClouds([cloud], "cpu")
+    small.capacity = 10
+    found = small.draw([(0, None)], camera())
+    assert small.capacity > 10
+    assert_same_image(found, interpreted(cloud, camera()), 0.0)
+
+
+def test_a_window_shows_what_the_whole_image_does() -> None:
+    cloud = random_cloud(60, 10)
+    part = interpreted(cloud, camera().window(slice(8, 40), slice(16, 80)))
+    whole = interpreted(cloud, camera())
+    np.testing.assert_allclose(part.rgb, whole.rgb[8:40, 16:80], atol=1e-4)
+
+
+def test_bad_devices_are_refused() -> None:
+    with pytest.raises(InputError):
+        UploadedClouds([], "gpu")
+    import torch
+
+    if not torch.cuda.is_available():
+        with pytest.raises(InfrastructureError):
+            rasterize(random_cloud(1), camera(), backend="triton")
+
+
+COMPILE = Path(__file__).parents[2] / "docs" / "scripts" / "compile_gpu_kernels.py"
+
+
+@pytest.mark.parametrize("capability", [80, 90])
+def test_kernels_compile_without_spilling(capability: int) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    done = subprocess.run(
+        [sys.executable, str(COMPILE), str(capability)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
+    )
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["project", "list_tiles", "composite"]
+    assert all("stack 0 " in line for line in lines), lines
+
+
+@pytest.mark.gpu
+def test_a_card_draws_what_the_reference_does() -> None:
+    cloud = random_cloud(2000, 11)
+    found = rasterize(cloud, camera(960, 544, 700.0), backend="triton")
+    assert_same_image(found, rasterize_reference(cloud, camera(960, 544, 700.0)), LSB, 1e-4)
