@@ -12,7 +12,7 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
-from alpasim_plugin.core.errors import FixerError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.parts import names
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -140,7 +140,7 @@ def test_an_untrained_wan_autoencoder_is_no_identity() -> None:
 
 def test_a_device_that_does_not_work_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(FixerError):
+    with pytest.raises(InfrastructureError):
         load_networks(small_settings(), "cuda")
 
 
