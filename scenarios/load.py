@@ -77,7 +77,9 @@ def load_scenario(
     drawn = draw(document, seed, overrides)
     default = drawn.spec.vehicle or VehicleSpec()
     drive = (
-        built_drive(drawn, _vehicle(default)) if drawn.spec.log is None else recorded_drive(drawn)
+        built_drive(drawn, _vehicle(default))
+        if drawn.spec.log is None
+        else recorded_drive(drawn, source)
     )
     scenario = _scenario(drawn, drive)
     check_scenario(scenario, drawn.document.path)

@@ -5,13 +5,13 @@ writes the JSON Schema.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
 from alpasim_plugin.core import limits as b
+from alpasim_plugin.core.printing import say
 from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, RoadSpec, within
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
@@ -419,4 +419,4 @@ def models() -> dict[str, type[BaseModel]]:
 
 if __name__ == "__main__":
     SCHEMA_FILE.write_text(json_schema(), encoding="utf-8")
-    sys.stdout.write(f"wrote {SCHEMA_FILE}\n")
+    say(f"wrote {SCHEMA_FILE}")

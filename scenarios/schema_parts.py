@@ -201,7 +201,7 @@ class LogSpec(Part):
     source: str | None = Field(
         default=None,
         min_length=1,
-        description="A source of an installed package, or package.module:Class; it reads path.",
+        description="A source of an installed package; it reads path.",
     )
     path: str | None = Field(
         default=None, min_length=1, description="File or folder that source reads."

@@ -10,7 +10,7 @@ from pathlib import Path
 from alpasim_plugin.core.config import Document, load_yaml
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Source
-from alpasim_plugin.core.parts import PartSpec, build, names, resolve
+from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
 from alpasim_plugin.core.reading import parsing
 from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog
@@ -141,8 +141,12 @@ def detect(path: Path) -> str:
     )
 
 
-def recorded_drive(drawn: Drawn) -> RecordedLog:
+def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:
     """Read the recorded log that a specification names, and check what the reader returns.
+
+    Args:
+        drawn: The specification.
+        named: A reader that need not be installed, since the user has named it.
 
     Raises:
         InputError: Nothing is there, anything is wrong with the log, or the reader gives something
@@ -158,6 +162,7 @@ def recorded_drive(drawn: Drawn) -> RecordedLog:
             f"{path} does not exist",
             "correct the path; it is relative to the scenario file",
         )
+    require_installed([kind], document.path, [named])
     spec, source = _source(kind)
     with parsing(path, "repair this log, or use another one"):
         record = source.read(path, None if log.ego is None else str(log.ego))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from collections.abc import Iterator
 
 from tests.test_layers import PACKAGES, Module, modules
 
@@ -61,6 +62,43 @@ def test_private_and_deprecated_names_of_other_libraries_are_used_only_where_it_
     used = {name: uses for name, uses in found.items() if uses}
     assert {name: uses for name, uses in used.items() if name not in ALLOWED} == {}
     assert [name for name in ALLOWED if name not in used and name in found] == []
+
+
+# Module -> why it prints by itself.
+PRINTERS = {
+    "alpasim_plugin.core.printing": "it is the printer",
+    "alpasim_plugin.core.subprocesses": "passes on what parts print",
+    "alpasim_plugin.cli.output": "tables of rich, through `Escaped`",
+    "alpasim_plugin.cli.docs": "pages of ours",
+    "alpasim_plugin.alpasim.client.supervisor": "a program of the standard library alone",
+    "alpasim_plugin.alpasim.bridge.client": "a wheel of its own",
+    "alpasim_plugin.alpasim.bridge.build": "a program that builds that wheel",
+}
+PRINTING = {
+    "print",
+    "sys.stdout.write",
+    "sys.stderr.write",
+    "traceback.print_exc",
+    "traceback.print_exception",
+    "typer.echo",
+    "typer.secho",
+    "Console",
+}
+
+
+def calls_of(module: Module) -> Iterator[str]:
+    for node in module.nodes:
+        if isinstance(node, ast.Call):
+            yield dotted(node.func)
+
+
+def test_text_is_printed_in_one_place_which_escapes_it() -> None:
+    found = {
+        module.name
+        for module in modules()
+        if not module.name.startswith("alpasim_plugin.lab") and PRINTING & {*calls_of(module)}
+    }
+    assert found == set(PRINTERS)
 
 
 def names_bound(statement: ast.stmt) -> list[str]:

@@ -22,7 +22,6 @@ from alpasim_plugin.alpasim.client.preflight import (
 from alpasim_plugin.cli.options import Json, Run, run_or_newest, typer_of
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
-from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario
@@ -99,7 +98,7 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
     lines = [*lines, f"{len(inspection.cells)} rollouts, {len(problems)} problems: {state}"]
     if problems:
         lines.append(again(read_run_json(root)))
-    show(as_json, facts, *map(terminal, lines))
+    show(as_json, facts, *lines)
     raise typer.Exit(code)
 
 
@@ -128,7 +127,7 @@ def check_policy(
         "notes": report.notes,
         "latency_ms": dict(zip(("p50", "max"), report.latency_ms, strict=True)),
     }
-    show(as_json, facts, str(report))
+    show(as_json, facts, *str(report).splitlines())
     raise typer.Exit(0 if report.ok else BROKEN)
 
 

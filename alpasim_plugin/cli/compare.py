@@ -97,7 +97,7 @@ def compare(
     for tables in (result.paired, result.with_base, result.policies):
         for variant, entries in tables.items():
             baseline = next((entry["baseline"] for entry in entries.values()), "nothing")
-            lines.append(f"\n{variant} minus {baseline}")
+            lines += ["", f"{variant} minus {baseline}"]
             rows = [
                 row
                 for row in pair_rows({"paired": {variant: entries}}, result.metrics)

@@ -55,7 +55,7 @@ def docs(
         )
     facts = {"page": name, "path": str(folder / f"{name}.md"), "text": texts[name]}
     if as_json or not sys.stdout.isatty():
-        show(as_json, facts, texts[name].rstrip("\n"))
+        show(as_json, facts, *texts[name].rstrip("\n").split("\n"))
         return
     console = Console()
     with console.pager(styles=True):

@@ -10,7 +10,7 @@ import typer
 
 from alpasim_plugin.cli.options import Json, run_and_cell
 from alpasim_plugin.cli.output import show, warn
-from alpasim_plugin.core.errors import InputError, error_text
+from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import resolve, resolve_renderer, split_names
 from alpasim_plugin.log.run_folder.reader import read_json
@@ -38,6 +38,12 @@ def fork(
         str | None, Flag("Policy after the change; it has seen the frames before it.")
     ] = None,
     seed: Annotated[int | None, Flag("Seed of the new parts.", min=0)] = None,
+    own: Annotated[
+        tuple[str, ...],
+        Flag(
+            "A part of your own that drove the rollout: what run.json names does not run unless you name it too. Repeatable."
+        ),
+    ] = (),
     out: Annotated[
         Path | None, Flag("Run folder to write; by default one below RUN/forks/.")
     ] = None,
@@ -57,7 +63,7 @@ def fork(
     if not name:
         raise InputError(f"{cell}: a run, not a rollout", "Name RUN/RENDERER/POLICY/SCENE/SEED.")
     ensure_tables(run, warn)
-    past = find_rollout(run, name)
+    past = find_rollout(run, name, {renderer, policy, *own})
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
     result = fork_rollout(past, change, root, ["simrun", *sys.argv[1:]])
@@ -79,5 +85,5 @@ def fork(
             lines.append(f"continuation      differs first in {where}")
     show(as_json, facts, *lines, f"report   {root / 'report.html'}")
     for failed in () if as_json else result.summary["failures"]["cells"]:
-        warn(f"{failed['path']}\n{error_text(failed['error'])}")
+        warn(failed["path"], *error_lines(failed["error"]))
     raise typer.Exit(result.exit_code)

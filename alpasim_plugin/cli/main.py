@@ -25,6 +25,7 @@ from typer.core import TyperCommand, TyperGroup
 from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import installed_names
+from alpasim_plugin.core.printing import print_any_character, say, warn
 
 # Panel of the help page -> verb -> module of this package and its function, and one line of help,
 # which is the first of the function's docstring.
@@ -229,7 +230,7 @@ def _run(args: list[str]) -> int:
     if args[:1] == ["--version"]:
         from alpasim_plugin import __version__
 
-        print(json.dumps({"version": __version__}) if "--json" in args else f"simrun {__version__}")
+        say(json.dumps({"version": __version__}) if "--json" in args else f"simrun {__version__}")
         return 0
     words = with_verb(args) or ["--help"]
     if words[0] in verbs():
@@ -272,13 +273,13 @@ def run_command(args: list[str]) -> int:
         failure = _unforeseen(error, " ".join(["simrun", *args]))
         failure.__cause__ = error
     if "--debug" in args and isinstance(failure, SimrunError):
-        traceback.print_exception(failure)
+        warn(*"".join(traceback.format_exception(failure)).splitlines())
     with contextlib.suppress(OSError):  # nobody can be told; the exit code still says it
         if "--json" in args:
             facts = {"error": failure.as_dict(), "exit_code": failure.exit_code}
-            print(json.dumps(facts), flush=True)
+            say(json.dumps(facts))
         else:
-            print(failure, file=sys.stderr, flush=True)
+            warn(*str(failure).splitlines())
     _drop_unwritten_output()
     return failure.exit_code
 
@@ -317,6 +318,7 @@ def _drop_unwritten_output() -> None:
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
+    print_any_character()
     if COMPLETION in os.environ:
         app(prog_name="simrun")
     sys.exit(run_command(sys.argv[1:]))

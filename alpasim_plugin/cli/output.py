@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import progress
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
+from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.printing import say
+from alpasim_plugin.core.printing import warn as warn
 from evaluators.report.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
@@ -28,18 +30,31 @@ LINE_EVERY_S = 10.0  # on a pipe, within one stage
 def show(as_json: bool, facts: Mapping[str, Any], *lines: Any) -> None:
     """Print a result: its facts as one JSON document, or lines of text and tables of rich."""
     if as_json:
-        print(json.dumps(facts), flush=True)
+        say(json.dumps(facts))
         return
     for line in lines:
         if isinstance(line, str):
-            print(line, flush=True)
+            say(line)
         else:
-            Console().print(line)
+            Console().print(Escaped(line))
 
 
-def warn(text: str) -> None:
-    """Print a line on standard error."""
-    print(text, file=sys.stderr, flush=True)
+class Escaped:
+    """A table or a page of rich in which no text makes a terminal act; its own styles do.
+
+    Args:
+        inner: What rich prints.
+    """
+
+    def __init__(self, inner: RenderableType) -> None:
+        self.inner = inner
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the segments of what is printed, each with its text escaped."""
+        for segment in console.render(self.inner, options):
+            lines = segment.text.split("\n")
+            text = segment.text if segment.control else "\n".join(map(terminal, lines))
+            yield segment._replace(text=text)
 
 
 class Progress(progress.Progress):
@@ -63,7 +78,7 @@ class Progress(progress.Progress):
     def say(self, text: str) -> None:
         """Print a line above the bar."""
         if not self.silent:
-            self.console.print(text)
+            self.console.print(terminal(text))
 
     def show(self, stage: str, done: int, total: int | None) -> None:
         """Show how much of a stage is done; on a pipe when it begins, and every ten seconds."""
@@ -81,7 +96,8 @@ class Progress(progress.Progress):
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
         """Announce a run."""
-        self.say(headline(plan, root, threads))
+        for line in headline(plan, root, threads):
+            self.say(line)
         self.add_task("rollouts", total=len(plan.cells))
 
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
@@ -104,17 +120,17 @@ class Progress(progress.Progress):
 
     def noticed(self, text: str) -> None:
         """Print a warning, even if silent: what is damaged, or who is waited for."""
-        self.console.print(f"warning: {text}")
+        self.console.print(terminal(f"warning: {text}"))
 
 
-def report_line(root: Path) -> str:
+def report_lines(root: Path) -> list[str]:
     """Return the lines that name a run's report and the command that replays its rollouts."""
     page, run = root / "report.html", shlex.quote(str(root))
     report = shlex.quote(str(page)) if page.exists() else f"not written; simrun report {run}"
-    return f"report   {report}\nwatch    simrun view {run}"
+    return [f"report   {report}", f"watch    simrun view {run}"]
 
 
-def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
+def headline(plan: RunPlan, root: Path, threads: Threads) -> list[str]:
     """Return one line with the size of the run, its workers and its folder, and notes below it."""
     axes = (
         plural(len(plan.renderers), "renderer"),
@@ -125,7 +141,7 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     size = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}"
     notes = [*fixer_labels(plan), *varied_lines(plan), *background_lines(plan)]
-    return "\n".join([f"{size} -> {root}".replace("\u00a0", " "), *notes])
+    return [f"{size} -> {root}".replace("\u00a0", " "), *notes]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

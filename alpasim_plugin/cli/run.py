@@ -21,7 +21,7 @@ from alpasim_plugin.cli.output import (
     Progress,
     background_lines,
     fixer_labels,
-    report_line,
+    report_lines,
     show,
     varied_lines,
     warn,
@@ -283,7 +283,7 @@ def _print_decision(decided: Decided, as_json: bool) -> None:
     record = decided.record
     root = decided.run.root
     facts = {"out": str(root), "exit_code": decided.outcome.exit_code, "decision": record}
-    show(as_json, facts, *decision_lines(record), report_line(root))
+    show(as_json, facts, *decision_lines(record), *report_lines(root))
 
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
@@ -331,7 +331,7 @@ def _print_result(result: RunResult, video: str) -> None:
     for name, path in shipped_names().items():
         following = following.replace(str(path.absolute()), name)
     table = render_table(summary, headline_only=True, known=run.table)
-    show(False, {}, table, *lines, *ending_lines(run), report_line(root), following)
+    show(False, {}, table, *lines, *ending_lines(run), *report_lines(root), following)
     for cell in summary["failures"]["cells"][:SHOWN_FAILURES]:
         warn(f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}")
         for line in last_output(root / cell["path"] / OUTPUT_NAME):

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from alpasim_plugin.cli.options import Evaluators, Json
-from alpasim_plugin.cli.output import Progress, report_line, show, warn
-from alpasim_plugin.core.errors import InputError, error_text
+from alpasim_plugin.cli.output import Progress, report_lines, show, warn
+from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.score import ScoreResult, execute_score
@@ -102,18 +102,18 @@ def score(
         if len(names) == 1:
             known = MetricTable.of_run(read_run_json(result.root))
             lines.append(render_table(result.summary, headline_only=True, known=known))
-        lines.append(report_line(result.root))
+        lines += report_lines(result.root)
     if len(names) > 1 or any(one.protocol for one in chosen.values()):
         lines.append(render_presets({name: one.summary for name, one in results.items()}))
     show(as_json, facts, *lines)
     for result in () if as_json else results.values():
         for cell in result.summary["failures"]["cells"][:SHOWN_FAILURES]:
-            warn(error_text(cell["error"]))
+            warn(*error_lines(cell["error"]))
         aggregation = result.summary.get("alpasim") or {}
         if aggregation.get("skipped"):
             warn(f"AlpaSim's aggregation was not written: {aggregation['skipped']}")
         if aggregation.get("error"):
-            warn(error_text(aggregation["error"]))
+            warn(*error_lines(aggregation["error"]))
     raise typer.Exit(code)
 
 

@@ -15,6 +15,7 @@ import can
 
 from alpasim_plugin.control.can_bus import Address, open_bus
 from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, load_map, open_codec
+from alpasim_plugin.core.printing import say
 
 LOOKAHEAD_S, LEAST_LOOKAHEAD_M = 0.7, 5.0
 WHEELBASE_M = 2.85
@@ -98,13 +99,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     address = Address.parse(parser.parse_args(arguments).address)
     unit = LaneKeeper(open_codec(*load_map(address.map, address.dbc)))
     with open_bus(address) as bus:
-        print(
-            f"control unit on {address.interface}:{address.channel}, map {address.map}", flush=True
-        )
+        say(f"control unit on {address.interface}:{address.channel}, map {address.map}")
         try:
             serve(bus, unit, threading.Event())
         except KeyboardInterrupt:
-            print("stopped", flush=True)
+            say("stopped")
 
 
 if __name__ == "__main__":

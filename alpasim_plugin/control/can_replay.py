@@ -24,6 +24,7 @@ import numpy as np
 from alpasim_plugin.control.can_bus import Address, open_bus
 from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, load_map, open_codec
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.reading import check_regular, parsing
 
 ECHOES = 128  # buses from here on repeat what the recording device sent
@@ -173,12 +174,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     recording = read_recording(given.folder)
     series, counts = decode(recording, codec)
     for name, number in sorted(counts.items()):
-        print(f"{name:28} {number:6} frames")
+        say(f"{name:28} {number:6} frames")
     for quantity, (_, values) in sorted(series.items()):
-        print(f"{quantity:28} {min(values):10.3f} to {max(values):.3f}")
+        say(f"{quantity:28} {min(values):10.3f} to {max(values):.3f}")
     with open_bus(address) as bus:
         sent, worst = replay(recording, codec, bus, given.speed)
-    print(
+    say(
         f"sent {sent} frames in {recording.t_s[-1] / given.speed:.1f} s, at most {worst * 1000:.1f} ms late"
     )
 

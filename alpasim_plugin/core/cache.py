@@ -7,7 +7,6 @@ CACHE / KIND / KEY/        what was made; it appears atomically
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from alpasim_plugin.core import places
 from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import one_writer
+from alpasim_plugin.core.printing import warn
 
 DO_THIS = "free disk space, or name a writable folder in SIMRUN_CACHE"
 
@@ -54,9 +54,9 @@ def cached(
         try:
             return read(folder)
         except InputError as error:
-            _say(f"warning: {what} is damaged ({error.message}); making it again")
+            warn(f"warning: {what} is damaged ({error.message}); making it again")
     with one_writer(
-        folder.with_name(f"{key}.lock"), what, wait=True, waiting=_say, do_this=DO_THIS
+        folder.with_name(f"{key}.lock"), what, wait=True, waiting=warn, do_this=DO_THIS
     ):
         # of a process that was killed while it made this entry
         for left_over in folder.parent.glob(f".{key}.*.tmp"):
@@ -66,13 +66,9 @@ def cached(
                 return read(folder)
             except InputError:
                 pass  # damaged, and said above
-        _say(f"{what} ...")
+        warn(f"{what} ...")
         began = time.perf_counter()
         with atomic_folder(folder, DO_THIS) as partial:
             make(partial)
-        _say(f"{what}: {time.perf_counter() - began:.1f} s")
+        warn(f"{what}: {time.perf_counter() - began:.1f} s")
         return read(folder)
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

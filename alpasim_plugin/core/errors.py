@@ -34,7 +34,7 @@ class SimrunError(Exception):
         super().__init__(self.message, self.hint)
 
     def __str__(self) -> str:
-        return error_text(self.as_dict())
+        return "\n".join(error_lines(self.as_dict()))
 
     def as_dict(self) -> dict[str, str]:
         """Return message, hint and failure class, for ``--json`` and manifests."""
@@ -45,9 +45,9 @@ class SimrunError(Exception):
         }
 
 
-def error_text(error: Mapping[str, str]) -> str:
-    """Return the text of an error from what `SimrunError.as_dict` gave."""
-    return f"error: {error['message']}\n  hint: {error['hint']}"
+def error_lines(error: Mapping[str, str]) -> list[str]:
+    """Return the two lines of an error from what `SimrunError.as_dict` gave."""
+    return [f"error: {error['message']}", f"  hint: {error['hint']}"]
 
 
 class InputError(SimrunError):

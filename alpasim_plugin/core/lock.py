@@ -4,7 +4,9 @@ ends, however it ends.
 
 from __future__ import annotations
 
+import fcntl
 import os
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +15,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from alpasim_plugin.core.atomic import disk_error
-from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.printing import warn
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ def one_writer(
     path: Path,
     what: str,
     wait: bool = False,
-    waiting: Callable[[str], None] = print,
+    waiting: Callable[[str], None] = warn,
     do_this: str | None = None,
 ) -> Iterator[Held]:
     """Hold a lock file during the block.
@@ -48,10 +51,16 @@ def one_writer(
 
     Raises:
         InfrastructureError: Another process holds it, or the folder cannot be written.
+        InputError: Something else lies at the path than a lock file.
     """
     lock = FileLock(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if os.path.lexists(path) and not _is_own_file(path):
+            raise InputError(
+                f"{path}: no lock file, but a link, a folder, a device, or a file with other names",
+                "remove it",
+            )
         try:
             lock.acquire(timeout=0)
         except Timeout:
@@ -74,11 +83,24 @@ def one_writer(
 
 
 def is_locked(path: Path) -> bool:
-    """Tell whether a process holds a lock file; nothing is locked, and nothing is written."""
-    if not path.exists() or not os.access(path, os.W_OK):
-        return False
+    """Tell whether a process holds a lock file; nothing is written, and what is no lock file is held
+    by nobody.
+    """
     try:
-        with FileLock(path, timeout=0):
+        if not _is_own_file(path):
             return False
-    except Timeout:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
         return True
+    except OSError:
+        return False
+    return False
+
+
+def _is_own_file(path: Path) -> bool:
+    """Tell whether a path is a regular file with one name: to open another file for writing would
+    empty it.
+    """
+    state = path.lstat()
+    return stat.S_ISREG(state.st_mode) and state.st_nlink == 1

@@ -12,13 +12,13 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
-import sys
 import tempfile
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.printing import warn
 
 PACKAGE = Path(__file__).resolve().parents[1]
 CACHE = "SIMRUN_CACHE"
@@ -57,7 +57,7 @@ def prepare() -> None:
         atexit.register(_remove, folder, os.getpid())
     named = os.environ.get(KERNELS)
     if named and not is_writable(Path(named)):
-        print(f"warning: {KERNELS} names {named}, which cannot be written", file=sys.stderr)
+        warn(f"warning: {KERNELS} names {named}, which cannot be written")
         del os.environ[KERNELS]
     if not os.environ.get(KERNELS) and not os.access(PACKAGE, os.W_OK):
         os.environ[KERNELS] = str(cache() / "numba")

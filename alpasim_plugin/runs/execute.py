@@ -9,7 +9,6 @@ therefore run cells in any order.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
@@ -52,11 +52,7 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
         return
     for subject, got in run_jobs(compile_kernels, cold, min(workers, len(cold))):
         if isinstance(got, Lost):
-            print(
-                f"warning: compiling {subject} kernels: {got.reason}; the rollouts compile them",
-                file=sys.stderr,
-                flush=True,
-            )
+            warn(f"warning: compiling {subject} kernels: {got.reason}; the rollouts compile them")
 
 
 def is_cold(subject: str) -> bool:

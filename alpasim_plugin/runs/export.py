@@ -30,7 +30,7 @@ from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, se3
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.parts import resolve_renderer
+from alpasim_plugin.core.parts import require_installed, resolve_renderer
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -141,6 +141,7 @@ def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]
                 "export a folder that simrun run wrote",
             )
         ref = ref_of(given)
+        require_installed([ref.source], f"scene {scene_id!r}")
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.content_hash != stated["content_hash"]:
             raise InputError(
@@ -316,6 +317,7 @@ def _export_rollout(
                 "Add a camera to the scenario.",
             )
         options = options_of(info)
+        require_installed([manifest["renderer"]], source)
         spec = resolve_renderer(manifest["renderer"], options.fixer)
         seed = int(manifest["seed"])
         threads = thread_budget(1, 1).per_worker

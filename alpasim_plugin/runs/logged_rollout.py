@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.parts import overrides_of, resolve_renderer
+from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
-from alpasim_plugin.runs.plan import (
-    Cell,
-    RunOptions,
-    make_plan,
-    options_of,
-    ref_of,
-    refuse_commands,
-)
+from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of
 
 
 @dataclass(frozen=True)
@@ -57,16 +50,18 @@ class LoggedRollout:
             )
 
 
-def find_rollout(root: Path, name: str) -> LoggedRollout:
+def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> LoggedRollout:
     """Find a finished rollout in a run folder and load its scenario and parts.
 
     Args:
         root: Run folder.
         name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run
             folder.
+        named: Parts that are not installed and that the user has named too: others are not made.
 
     Raises:
-        InputError: No such rollout, it did not finish, or its scenario or its parts have changed.
+        InputError: No such rollout, it did not finish, its scenario or its parts have changed, or
+            it was driven with a part that is neither installed nor named.
     """
     row = named_row(root, name)
     if row["status"] != "ok":
@@ -94,7 +89,8 @@ def find_rollout(root: Path, name: str) -> LoggedRollout:
         )
     ref = ref_of(dict(stated))
     options = replace(options_of(info), baseline=None, video="none")
-    refuse_commands([row["policy"]], str(root))
+    own_parts = (row["renderer"], row["policy"], ref.source, options.controller)
+    require_installed([*own_parts, *options.evaluators], root / RUN_INFO, named)
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
     # fixer.
     has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None

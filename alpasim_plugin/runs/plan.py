@@ -15,7 +15,7 @@ from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
-from alpasim_plugin.core.parts.source import COMMAND, package_digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.schema import rollout_folder
 from alpasim_plugin.renderers.background import background_note
@@ -289,24 +289,6 @@ def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
     return replace(
         plan, cells=tuple(cells), scenarios=scenarios, seeds=kept, whole=plan.whole or plan
     )
-
-
-def refuse_commands(policies: Sequence[str], where: str) -> None:
-    """Refuse policies that a file names as commands: only what a user types is run.
-
-    Args:
-        policies: Names that were read from a run folder.
-        where: The run folder, or its file.
-
-    Raises:
-        InputError: One begins with ``exec:``.
-    """
-    for name in policies:
-        if name.startswith(COMMAND):
-            raise InputError(
-                f"{where}: its policy is a command, {name}; no command is run because a file names it",
-                "give simrun run the same command again: it drives what is missing or damaged",
-            )
 
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:

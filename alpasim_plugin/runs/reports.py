@@ -11,14 +11,20 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.images import smaller
-from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
 from evaluators.report import write_junit, write_report, write_summary_md
-from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips, key_of_entry
+from evaluators.report.flips import (
+    FLIPS_NAME,
+    Flip,
+    FlipKey,
+    find_flips,
+    flip_entries,
+    key_of_entry,
+)
 from evaluators.viewer.cause import cause_of, write_cause
 from evaluators.viewer.cells import read_log
 from evaluators.viewer.page import write_flips_page
@@ -62,11 +68,7 @@ def write_causes(run: Run) -> None:
 
 def divergences_of(run: Run, rollout: Rollout) -> list[Mapping[str, Any]]:
     """Return the entries of ``flips.json`` about a rollout; none where the file is absent."""
-    path = run.folder / FLIPS_NAME
-    if not path.is_file():
-        return []
-    entries = read_json(path).get("cells") or []
-    return [entry for entry in entries if key_of_entry(entry)[:4] == rollout.cell]
+    return [entry for entry in flip_entries(run) if key_of_entry(entry)[:4] == rollout.cell]
 
 
 MAX_FLIPS = 60  # cells whose logs are read

@@ -5,20 +5,21 @@ from the baseline's.
 from __future__ import annotations
 
 import base64
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
 import cv2
+from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.reading import inside, read_bytes, read_json_as
 from alpasim_plugin.core.reading.images import decode_image
-from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import STRIP_NAME, cell_name
+from alpasim_plugin.log.run_folder.schema import AGAIN, STRIP_NAME
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short
@@ -259,11 +260,9 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
         The rows, how many more flips there are, and the number of pairs compared.
     """
     flips, compared = find_flips(run)
-    path = run.folder / FLIPS_NAME
-    entries = (read_json(path).get("cells") or []) if path.is_file() else []
-    known = {key_of_entry(entry): entry for entry in entries}
+    known = {key_of_entry(entry): entry for entry in flip_entries(run)}
     unknown = "the run folder has no logs to look for it in"
-    if path.is_file():
+    if known:
         unknown = "not looked for: there are too many flips"
     spent = 0
     rows = []
@@ -274,12 +273,42 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     return rows, len(flips) - len(rows), compared
 
 
-def key_of_entry(entry: Mapping[str, Any]) -> FlipKey:
+class FlipEntry(TypedDict):
+    """An entry of ``flips.json``; the other members are there where plans diverge."""
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    baseline: str
+    against: str
+    t_us: int | None
+    reason: NotRequired[str]
+    after_us: NotRequired[int]
+    gap_m: NotRequired[float]
+    frames: NotRequired[dict[str, str]]
+    frames_reason: NotRequired[str]
+
+
+class FlipsFile(TypedDict):
+    """``flips.json``."""
+
+    cells: list[FlipEntry]
+
+
+def flip_entries(run: Run) -> list[FlipEntry]:
+    """Read the entries of ``flips.json``; none where there is no such file.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    path = run.folder / FLIPS_NAME
+    return read_json_as(FlipsFile, path, AGAIN)["cells"] if os.path.lexists(path) else []
+
+
+def key_of_entry(entry: FlipEntry) -> FlipKey:
     """Return the key of an entry of ``flips.json``."""
-    against = entry.get("against") or cell_name(
-        str(entry["baseline"]), str(entry["policy"])
-    )  # earlier files name the renderer alone
-    return (entry["renderer"], entry["policy"], entry["scene"], entry["seed"], str(against))
+    return entry["renderer"], entry["policy"], entry["scene"], entry["seed"], entry["against"]
 
 
 def _row(run: Run, flip: Flip, entry: Mapping[str, Any], has_room: bool) -> FlipRow:
@@ -299,9 +328,8 @@ def _row(run: Run, flip: Flip, entry: Mapping[str, Any], has_room: bool) -> Flip
     frames = entry.get("frames") or {}
     pictures = []
     for name, colour, _ in sides:
-        path = run.folder / str(frames.get(name))
-        is_inside = path.resolve().is_relative_to(run.folder.resolve())
-        if has_room and is_inside and path.is_file():
+        path = inside(run.folder, str(frames.get(name)))
+        if has_room and path is not None and os.path.isfile(path):
             encoded = inline_jpeg(path)
             if encoded is not None:
                 pictures.append((name, colour, *encoded))

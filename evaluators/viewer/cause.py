@@ -18,6 +18,7 @@ from markupsafe import Markup
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.reading import inside, read_bytes
 from alpasim_plugin.core.types import F64, U8, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
@@ -392,8 +393,8 @@ def _parting_of(run: Run, rollout: Rollout, entry: Mapping[str, Any]) -> Parting
     if entry["baseline"] == rollout.renderer:
         name = str(entry["against"]).removeprefix(rollout.renderer + "/")
         return Parting(name, "policy", t_us, gap_m)
-    paths = [run.folder / name for name in (entry.get("frames") or {}).values()]
-    images = [decode_image(path.read_bytes(), str(path)) for path in paths if path.is_file()]
+    paths = [inside(run.folder, name) for name in (entry.get("frames") or {}).values()]
+    images = [decode_image(read_bytes(path), str(path)) for path in paths if path is not None]
     is_pair = len(images) == 2 and images[0].shape == images[1].shape
     return Parting(str(entry["baseline"]), "renderer", t_us, gap_m, images if is_pair else ())
 

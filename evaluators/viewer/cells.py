@@ -18,12 +18,11 @@ from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
-from evaluators.report.flips import FLIPS_NAME, Flip, baseline_of, find_flips, key_of_entry
+from evaluators.report.flips import Flip, baseline_of, find_flips, flip_entries, key_of_entry
 from evaluators.report.rollouts import clock_zero_us
 from evaluators.viewer.drive_data import (
     Place,
@@ -420,9 +419,5 @@ def index_data(
 
 
 def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:
-    path = run.folder / FLIPS_NAME
-    if not cell.flips or not path.is_file():
-        return []
     keys = {flip.key for flip in cell.flips}
-    entries = read_json(path).get("cells") or []
-    return [entry for entry in entries if key_of_entry(entry) in keys]
+    return [entry for entry in flip_entries(run) if key_of_entry(entry) in keys] if keys else []

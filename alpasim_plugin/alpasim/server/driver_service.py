@@ -33,6 +33,7 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
+from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -436,7 +437,7 @@ class _Serving(DriverService):
 
     def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
         super().failed(call, code, text, error)
-        traceback.print_exception(error)
+        warn(*"".join(traceback.format_exception(error)).splitlines())
 
 
 def _unknown_scene(scene_id: str) -> Scenario:

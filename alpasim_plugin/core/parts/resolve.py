@@ -8,7 +8,7 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,29 @@ class RendererSpec:
         """Give what identifies both; None where either has no digest."""
         parts = [part.digest for part in (self.base, self.fixer) if part is not None]
         return None if None in parts else digest(parts)
+
+
+def require_installed(
+    names_in_file: Iterable[str | None], where: Path | str, named: Collection[str | None] = ()
+) -> None:
+    """Refuse names of parts that a file holds, unless the parts are installed: a file is data, and
+    what it names does not run.
+
+    Args:
+        names_in_file: Names of parts as `resolve` and `resolve_renderer` take them; None is no name.
+        where: The file, for messages.
+        named: What the user named on the command line; it may be the same.
+
+    Raises:
+        InputError: A name stands for code of a file or of a module, for an address, or for a
+            command.
+    """
+    for name in names_in_file:
+        if name is not None and name not in named and ":" in split_settings(name)[0]:
+            raise InputError(
+                f"{where}: it names {name}, which is not installed; nothing runs because a file names it",
+                "name it on the command line if you trust it and the command has an option for it",
+            )
 
 
 def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpec:

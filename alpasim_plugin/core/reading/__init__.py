@@ -20,6 +20,7 @@ from __future__ import annotations
 from alpasim_plugin.core.reading.files import (
     check_regular,
     exists,
+    inside,
     parse_json,
     parsing,
     read_bytes,
@@ -28,11 +29,13 @@ from alpasim_plugin.core.reading.files import (
     read_json_lines,
     read_json_object,
     read_text,
+    real,
 )
 
 __all__ = [
     "check_regular",
     "exists",
+    "inside",
     "parse_json",
     "parsing",
     "read_bytes",
@@ -41,4 +44,5 @@ __all__ = [
     "read_json_lines",
     "read_json_object",
     "read_text",
+    "real",
 ]

@@ -87,6 +87,21 @@ def exists(path: Path | str) -> bool:
     return True
 
 
+def real(path: Path | str) -> Path:
+    """Return where a path leads through links; unlike `Path.resolve` it goes through circles of links
+    without an error.
+    """
+    return Path(os.path.realpath(path))
+
+
+def inside(folder: Path, name: str) -> Path | None:
+    """Return the path of a name that a file of a folder holds; None where nothing is there, or where
+    it leads out of the folder.
+    """
+    path = folder / name
+    return path if exists(path) and real(path).is_relative_to(real(folder)) else None
+
+
 def check_regular(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_PATH) -> None:
     """Check a file that a library will open by its path; see `open_regular`."""
     with open_regular(path, bound, do_this):

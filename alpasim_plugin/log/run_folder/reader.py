@@ -5,6 +5,7 @@ It works on a folder that was copied from another machine, without scenario file
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -18,9 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
-from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import parsing, read_bytes, read_json_as, read_json_object
+from alpasim_plugin.core.reading import inside, parsing, read_bytes, read_json_as, read_json_object
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
@@ -150,7 +150,7 @@ class Run:
         folder.
         """
         path = self._inside(rollout, name)
-        return path if path is not None and path.is_file() else None
+        return path if path is not None and os.path.isfile(path) else None
 
     def href(self, rollout: Rollout, name: str = "") -> str | None:
         """Give a relative link to a rollout's folder or to a file in it; None where it does not
@@ -164,14 +164,7 @@ class Run:
         )
 
     def _inside(self, rollout: Rollout, name: str) -> Path | None:
-        path = self.folder / rollout.path / name
-        return (
-            path
-            if rollout.path
-            and path.exists()
-            and path.resolve().is_relative_to(self.folder.resolve())
-            else None
-        )
+        return inside(self.folder, f"{rollout.path}/{name}") if rollout.path else None
 
     def steps(self, metrics: Sequence[str], scenes: Sequence[str] | None = None) -> pa.Table:
         """Read the named series from ``steps.parquet``.
@@ -273,7 +266,7 @@ def last_output(path: Path) -> list[str]:
     if not path.is_file():
         return []
     lines = read_bytes(path, SOURCE_BYTES).decode("utf-8", "replace").rstrip().splitlines()
-    return [*(terminal(line.rstrip()) for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
+    return [*(line.rstrip() for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
 
 
 def reporting(run: Run) -> AbstractContextManager[None]:

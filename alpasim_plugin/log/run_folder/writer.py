@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
+from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
     KEYS,
@@ -44,7 +45,7 @@ _TEMPORARY = re.compile(
 
 @contextmanager
 def writing(
-    root: Path, wait: bool = False, waiting: Callable[[str], None] = print
+    root: Path, wait: bool = False, waiting: Callable[[str], None] = warn
 ) -> Iterator[None]:
     """Be the only writer of a run folder during the block; left-overs of killed writers are removed
     first.

@@ -22,6 +22,7 @@ from multiprocessing.context import BaseContext
 from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, safe_path
 
 J = TypeVar("J")
@@ -93,11 +94,7 @@ def run_jobs(
         else:
             yield job, future.result()
     if victims:
-        print(
-            f"warning: a worker process ended; {len(victims)} jobs run again, one at a time",
-            file=sys.stderr,
-            flush=True,
-        )
+        warn(f"warning: a worker process ended; {len(victims)} jobs run again, one at a time")
     for job in victims:
         result = known(job)
         if result is not None:
