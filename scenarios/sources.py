@@ -11,12 +11,16 @@ from alpasim_plugin.core.config import Document, load_yaml
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
-from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading import contents, parsing
 from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
 from scenarios.variation import Drawn
 
+SCENARIO_FILE = "scenario.yaml"  # of an imported drive
+MODELS = (".ply", ".splat", ".spz", ".sog")
+FILMS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
+DRIVES = ("transforms.json", "calib.txt", "cameras.bin", "cameras.txt", "sparse", "colmap")
 DRIVE_FILE = "drive.json"  # of an imported drive, as `scenarios.drive` has it
 
 
@@ -129,16 +133,28 @@ def detect(path: Path) -> str:
     name = source_of(path)
     if name is not None:
         return name
-    what = (
-        f"a folder with {', '.join(sorted(p.name for p in path.iterdir())[:5]) or 'nothing'}"
-        if path.is_dir()
-        else "a file"
-    )
+    what = contents(path)
+    advice = import_advice(path)
+    if advice is not None:
+        raise InputError(f"{path}: {what}, which is no scenario yet", advice)
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
     raise InputError(
         f"{path}: {what} that no reader recognises",
         f"give a scenario .yaml, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)",
     )
+
+
+def import_advice(path: Path) -> str | None:
+    """Return the command that makes a scenario of a path; None where nothing suggests one."""
+    out = f"-o OUT, then simrun OUT/{SCENARIO_FILE}"
+    if path.suffix.lower() in MODELS or (path / "meta.json").is_file():
+        return f"make one: simrun import splat {path} --poses POSES {out}"
+    if path.suffix.lower() in FILMS:
+        return "find the film's poses with COLMAP, then simrun import drive (docs/real-drives.md)"
+    places = [path / name for name in DRIVES]
+    if path.name == DRIVES[0] or any(one.exists() for one in places):
+        return f"make one: simrun import drive {path} {out}"
+    return None
 
 
 def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:

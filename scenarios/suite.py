@@ -20,7 +20,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.reading import exists
 from scenarios.schema_parts import Part, within
-from scenarios.sources import source_of
+from scenarios.sources import import_advice, source_of
 
 LIBRARY = Path(__file__).resolve().parent
 
@@ -167,7 +167,7 @@ def _expand(
         if not files:
             raise InputError(
                 f"{path}: a folder without scenario files",
-                "give a folder of scenario .yaml files, or a log folder",
+                import_advice(path) or "give a folder of scenario .yaml files, or a log folder",
             )
         return [ScenarioRef(str(f)) for f in files]
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):

@@ -23,7 +23,14 @@ from alpasim_plugin.core.reading import read_bytes, read_json
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import NO_MAP, PlacedDrive, corridor, given_map, place
+from alpasim_plugin.drives.placing import (
+    NO_MAP,
+    PlacedDrive,
+    check_motion,
+    corridor,
+    given_map,
+    place,
+)
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
@@ -72,13 +79,18 @@ class Shown:
     T_world_camera: F64
     file: str
 
+    @property
+    def name(self) -> str:
+        """Return its name as a view: camera and number, which sorts along the way."""
+        return f"{self.camera}-{Path(self.file).stem}"
+
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
         full = replace(self.picture, T_world_camera=self.T_world_camera).view()
         whole = full.camera.width
         width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
-        return replace(small, name=f"{self.camera}-{self.picture.file.stem}")
+        return replace(small, name=self.name)
 
 
 def import_drive(
@@ -148,6 +160,7 @@ def _built(
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
+    check_motion(drive, placed)
     roads, notes = (
         given_map(map_file, drive, placed)
         if map_file
@@ -353,8 +366,8 @@ def _write_transforms(
             "camera": one.camera,
             "use": one.use,
         }
-        name = f"{one.camera}-{one.picture.file.stem}"
-        frames.append(frame | ({"exposure": list(exposures[name])} if name in exposures else {}))
+        exposure = exposures.get(one.name)
+        frames.append(frame | ({} if exposure is None else {"exposure": list(exposure)}))
     write_json(
         work / TRANSFORMS_FILE, {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames}
     )

@@ -17,35 +17,36 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se3
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.core.reading import natural_order, read_bytes
 from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.drives.source import Points, SourceDrive, timed
+from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture
 
 DO_THIS = "give a whole model: cameras, images and points3D, all .txt or all .bin"
-PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of the model below the folder
+PLACES = ("", "sparse", "colmap/sparse")  # of models below a folder, or of folders of models
 PICTURES = (
     "images",
     "",
     "../images",
     "../../images",
 )  # of the pictures, from the folder and from the model
-PERIOD_US = 100_000
 SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
-# Number in a binary file, name, and where parameters stand: focal lengths and middle, then OpenCV's
-# coefficients; None is zero.
-MODELS: dict[int, tuple[str, int, bool]] = {  # (name, parameters, whether it is a fisheye)
-    0: ("SIMPLE_PINHOLE", 3, False),
-    1: ("PINHOLE", 4, False),
-    2: ("SIMPLE_RADIAL", 4, False),
-    3: ("RADIAL", 5, False),
-    4: ("OPENCV", 8, False),
-    5: ("OPENCV_FISHEYE", 8, True),
-    6: ("FULL_OPENCV", 12, False),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4, True),
-    9: ("RADIAL_FISHEYE", 5, True),
+# Numbers of lens models in a binary file; those without a name in `PARAMETERS` are refused.
+_NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
+    SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"""
+MODELS = dict(enumerate(_NAMES.split()))
+PARAMETERS = {  # focal lengths and middle, then OpenCV's coefficients
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
 }
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -57,46 +58,45 @@ class _Image:
     T_camera_world: F64
 
 
-def model_folder(folder: Path) -> Path | None:
-    """Return where the model lies in or below a folder; None where there is none."""
-    places = (folder / place for place in PLACES)
-    return next(
-        (
-            one
-            for one in places
-            if any((one / f"cameras{end}").is_file() for end in (".bin", ".txt"))
-        ),
-        None,
-    )
+def models_in(folder: Path) -> list[Path]:
+    """Return the folders in or below a folder that hold models, in natural order."""
+    tops = [folder / place for place in PLACES]
+    below = [one for top in tops if top.is_dir() for one in top.iterdir() if one.is_dir()]
+    found = {one.resolve(): one for one in (*tops, *below) if _ending(one) is not None}
+    return sorted(found.values(), key=lambda one: natural_order(one.as_posix()))
+
+
+def _ending(model: Path) -> str | None:
+    return next((end for end in (".bin", ".txt") if (model / f"cameras{end}").is_file()), None)
 
 
 def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     """Read a model. Pictures in folders of their own are cameras of their own; they are taken in
-    the order of their names.
+    the natural order of their names.
 
     Args:
-        folder: Holds the model, here or in ``sparse/0``.
+        folder: Holds models, here or in ``sparse``; the one with most images is read.
         photographs: Whether they must be there.
 
     Raises:
         InputError: A file is missing, damaged or of a lens that OpenCV does not have; or there are
             no pictures.
     """
-    model = model_folder(folder)
-    if model is None:
+    models = [(model, _images_of(model)) for model in models_in(folder)]
+    if not models:
         raise InputError(f"{folder}: no cameras.bin or cameras.txt", DO_THIS)
-    binary = (model / "cameras.bin").is_file()
-    end = ".bin" if binary else ".txt"
-    data = {
-        name: read_bytes(model / f"{name}{end}", SOURCE_BYTES, DO_THIS)
-        for name in ("cameras", "images", "points3D")
-    }
+    model, images = max(models, key=lambda one: len(one[1]))
+    notes = []
+    if len(models) > 1:
+        sizes = ", ".join(f"{one.relative_to(folder)}: {len(listed)}" for one, listed in models)
+        notes.append(
+            f"{len(models)} models, of which the one with most images is read: {model.relative_to(folder)} ({sizes} images)"
+        )
+    images.sort(key=lambda one: natural_order(one.name))
+    binary = _ending(model) == ".bin"
+    data = {name: _data(model, name) for name in ("cameras", "points3D")}
     with parsing(model, DO_THIS, "a damaged model"):
         cameras = dict(_cameras_bin(data["cameras"]) if binary else _cameras_txt(data["cameras"]))
-        images = sorted(
-            _images_bin(data["images"]) if binary else _images_txt(data["images"]),
-            key=lambda one: one.name,
-        )
         xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
@@ -115,9 +115,7 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     ]
     names = sorted({str(shot.camera) for shot in shots})
     every = tuple(
-        shot
-        for name in names
-        for shot in timed([one for one in shots if one.camera == name], PERIOD_US)
+        shot for name in names for shot in timed([one for one in shots if one.camera == name])
     )
     front = next((name for name in names if "front" in name), names[0])
     centres = np.array([shot.T_world_camera[:3, 3] for shot in every])
@@ -129,8 +127,22 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         else np.zeros(0)
     )
     points = Points(xyz, rgb, np.eye(3) * ((SPREAD * near) ** 2)[:, None, None])
-    notes = (f"no times: {1_000_000 // PERIOD_US} photographs a second are assumed",)
-    return SourceDrive("colmap", folder.resolve().name, every, front, points=points, notes=notes)
+    notes.append(
+        f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
+    )
+    return SourceDrive(
+        "colmap", folder.resolve().name, every, front, points=points, notes=tuple(notes)
+    )
+
+
+def _data(model: Path, name: str) -> bytes:
+    return read_bytes(model / f"{name}{_ending(model)}", SOURCE_BYTES, DO_THIS)
+
+
+def _images_of(model: Path) -> list[_Image]:
+    data = _data(model, "images")
+    with parsing(model, DO_THIS, "a damaged model"):
+        return list(_images_bin(data) if _ending(model) == ".bin" else _images_txt(data))
 
 
 def _camera(name: str) -> str:
@@ -151,15 +163,15 @@ def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     )
 
 
-def _lens(number: int, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    if number not in MODELS:
+def _lens(name: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
+    if name not in PARAMETERS:
         raise InputError(
-            f"camera model {number}: a lens that OpenCV does not have",
+            f"camera model {name}: a lens that is not read, only {', '.join(PARAMETERS)}",
             "undistort the images (colmap image_undistorter)",
         )
-    name, count, fisheye = MODELS[number]
-    if len(p) != count:
-        raise ValueError(f"{len(p)} parameters of a {name}, which has {count}")
+    if len(p) != PARAMETERS[name]:
+        raise ValueError(f"{len(p)} parameters of a {name}, which has {PARAMETERS[name]}")
+    fisheye = "FISHEYE" in name
     if name in ONE_FOCAL:
         p = (p[0], *p)
     K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
@@ -173,32 +185,31 @@ def _lens(number: int, width: int, height: int, p: tuple[float, ...]) -> Lens:
 
 def _rows(data: bytes) -> Iterator[list[str]]:
     for line in data.decode("utf-8").splitlines():
-        if not line.startswith("#"):
+        if line.strip() and not line.startswith("#"):
             yield line.split()
 
 
 def _cameras_txt(data: bytes) -> Iterator[tuple[int, Lens]]:
-    numbers = {name: number for number, (name, _, _) in MODELS.items()}
-    for words in _rows(data):
-        if words:
-            yield (
-                int(words[0]),
-                _lens(
-                    numbers.get(words[1], -1),
-                    int(words[2]),
-                    int(words[3]),
-                    tuple(float(w) for w in words[4:]),
-                ),
-            )
+    for number, name, width, height, *p in _rows(data):
+        yield int(number), _lens(name, int(width), int(height), tuple(float(w) for w in p))
 
 
 def _images_txt(data: bytes) -> Iterator[_Image]:
-    rows = list(_rows(data))
-    for words in rows[::2]:  # every other line lists the image's points, and may be empty
-        if words:
-            yield _image(
-                int(words[8]), " ".join(words[9:]), np.array([float(w) for w in words[1:8]])
-            )
+    """Yield the images. Below each stands a line of points, which may be empty or left out."""
+    for line in data.decode("utf-8").splitlines():
+        words = line.split()
+        if line.startswith("#") or (len(words) % 3 == 0 and all(map(_is_number, words))):
+            continue
+        name = line.split(maxsplit=9)[9].strip()
+        yield _image(int(words[8]), name, np.array([float(w) for w in words[1:8]]))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _image(camera: int, name: str, pose: F64) -> _Image:
@@ -212,9 +223,7 @@ def _image(camera: int, name: str, pose: F64) -> _Image:
 
 
 def _points_txt(data: bytes) -> tuple[F64, F64]:
-    table = np.array([[float(w) for w in words[1:7]] for words in _rows(data) if words]).reshape(
-        -1, 6
-    )
+    table = np.array([[float(w) for w in words[1:7]] for words in _rows(data)]).reshape(-1, 6)
     return table[:, :3], table[:, 3:] / 255.0
 
 
@@ -245,8 +254,8 @@ def _cameras_bin(data: bytes) -> Iterator[tuple[int, Lens]]:
     reader = _Reader(data)
     for _ in range(int(reader.take("Q")[0])):
         number, model, width, height = (int(v) for v in reader.take("iiQQ"))
-        count = MODELS[model][1] if model in MODELS else 0
-        yield number, _lens(model, width, height, reader.take("d" * count))
+        name = MODELS.get(model, f"number {model}")
+        yield number, _lens(name, width, height, reader.take("d" * PARAMETERS.get(name, 0)))
 
 
 def _images_bin(data: bytes) -> Iterator[_Image]:

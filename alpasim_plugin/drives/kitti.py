@@ -1,23 +1,26 @@
 """KITTI odometry folders: pictures of one or two rectified stereo pairs, poses of the left grey
 camera, projections.
 
-Read are the benchmark's own layout (``image_0`` to ``image_3``, named rows in ``calib.txt``,
-``times.txt``, poses beside or in ``../../poses/NN.txt``) and copies with ``image_l`` and
-``image_r`` and a ``calib.txt`` of bare rows. Poses map the left camera to the world, metres, axes
-of OpenCV; a row of ``calib.txt`` is the projection K [I | t] of a camera, t against the left one.
+Read are the benchmark's own layout (``image_0`` to ``image_3``, rows P0 to P3 in ``calib.txt`` in
+any order, ``times.txt``, poses beside or in ``../../poses/NN.txt``) and copies with ``image_l`` and
+``image_r`` and a ``calib.txt`` of two bare rows. Poses map the left camera to the world, metres,
+axes of OpenCV; a row of ``calib.txt`` is the projection K [I | t] of a camera, t against the left
+one.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_bytes, read_text
+from alpasim_plugin.core.reading import natural_order, parsing, read_bytes, read_text
 from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.drives.source import SourceDrive
+from alpasim_plugin.drives.source import PERIOD_US, SourceDrive
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
 
@@ -26,8 +29,18 @@ PAIRS = (
     ("image_0", "image_1"),
     ("image_l", "image_r"),
 )  # the first that is there is read, left and right
-ROWS = {"image_l": 0, "image_r": 1, "image_0": 0, "image_1": 1, "image_2": 2, "image_3": 3}
-PERIOD_US = 100_000
+ROWS = {  # of `calib.txt` by the folder of their images
+    "image_l": "P0",
+    "image_r": "P1",
+    "image_0": "P0",
+    "image_1": "P1",
+    "image_2": "P2",
+    "image_3": "P3",
+}
+# Rows that say nothing of a rectified camera: other sensors, and how raw images were rectified.
+UNUSED = re.compile(r"Tr|Tr_.*|(R|S|K|D|T)(_rect)?(_?\d+)?(_rect)?|calib_time|corner_dist")
+NAMED = re.compile(r"^\s*([A-Z]\w*)\s+(?!:)")  # a name without its colon
+RECTIFIED = re.compile(r"P_rect_0?(\d)")  # how raw drives name the row Pn
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -44,15 +57,15 @@ def read_kitti(folder: Path) -> SourceDrive:
             it.
     """
     left, right = next(pair for pair in PAIRS if (folder / pair[0]).is_dir())
-    projections, poses = _projections(folder / "calib.txt"), _poses(folder)
-    notes, pictures = [], []
+    projections, unknown = _projections(folder / "calib.txt")
+    poses, pictures = _poses(folder), []
+    notes = [f"calib.txt: unknown rows are not read: {', '.join(unknown)}"] if unknown else []
     for name, side in ((left, "left"), (right, "right")):
         if not (folder / name).is_dir():
             notes.append(f"no {name}: no second camera to judge the fit by")
             continue
-        files = sorted(
-            path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES
-        )
+        files = [path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES]
+        files.sort(key=lambda path: natural_order(path.name))
         taken, note = _matched(folder, name, files, len(poses))
         notes += note
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")
@@ -112,27 +125,20 @@ def _matched(
     ]
 
 
-def _rows(path: Path, width: int) -> list[list[float]]:
-    """Return the rows of a text file of numbers, names before a colon left out."""
-    rows = []
+def _numbers(words: str, where: str, count: int) -> list[float]:
+    do_this = f"give a line of {count} for each, and no header"
+    with parsing(where, do_this, "not only numbers"):
+        numbers = [float(word) for word in words.split()]
+    if len(numbers) != count:
+        raise InputError(f"{where}: {len(numbers)} numbers", do_this)
+    return numbers
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a text file that are not empty, each after its place."""
     for i, line in enumerate(read_text(path).splitlines()):
-        words = line.rpartition(":")[2].split()
-        if not words:
-            continue
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError as error:
-            raise InputError(
-                f"{path}, line {i + 1}: {error}", f"give {width} numbers a line"
-            ) from error
-        if len(numbers) == width:
-            rows.append(numbers)
-        elif len(words) not in (9, 12):  # calib.txt of raw drives also holds rotations
-            raise InputError(
-                f"{path}, line {i + 1}: {len(numbers)} numbers",
-                f"give {width} numbers a line",
-            )
-    return rows
+        if line.strip():
+            yield f"{path}, line {i + 1}", line
 
 
 def _poses(folder: Path) -> list[F64]:
@@ -143,39 +149,50 @@ def _poses(folder: Path) -> list[F64]:
             f"{folder}: no poses.txt",
             "put the poses of the left camera beside the pictures, one row of 12 numbers each",
         )
-    rows = _rows(path, 12)
-    if len(rows) < 2:
-        raise InputError(
-            f"{path}: {len(rows)} poses", "give a row of 12 numbers for each photograph"
-        )
-    return [
-        rigid_pose(np.reshape(row, (3, 4)).tolist(), f"{path}, line {i + 1}")
-        for i, row in enumerate(rows)
+    poses = [
+        rigid_pose(np.reshape(_numbers(line, where, 12), (3, 4)).tolist(), where)
+        for where, line in _lines(path)
     ]
-
-
-def _projections(path: Path) -> list[F64]:
-    rows = _rows(path, 12)
-    if not rows:
+    if len(poses) < 2:
         raise InputError(
-            f"{path}: no row of 12 numbers",
-            "give the cameras' projections, left and right",
+            f"{path}: {len(poses)} poses", "give a row of 12 numbers for each photograph"
         )
-    return [np.reshape(row, (3, 4)) for row in rows]
+    return poses
 
 
-def _camera(projections: list[F64], name: str, path: Path) -> tuple[F64, F64]:
+def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
+    """Return the projections by the names of their rows, P0 on, and the names of unknown rows.
+
+    Rows without names count from P0.
+    """
+    rows: dict[str, F64] = {}
+    unknown = []
+    for where, line in _lines(path):
+        line = NAMED.sub(r"\1: ", line)
+        name, colon, words = line.partition(":")
+        name = RECTIFIED.sub(r"P\1", name.strip()) if colon else f"P{len(rows)}"
+        if name in rows:
+            raise InputError(f"{where}: a second row {name}", "give each camera one row")
+        if re.fullmatch(r"P\d", name):
+            rows[name] = np.reshape(_numbers(words if colon else line, where, 12), (3, 4))
+        elif UNUSED.fullmatch(name) is None:
+            unknown.append(name)
+    return rows, unknown
+
+
+def _camera(projections: dict[str, F64], name: str, path: Path) -> tuple[F64, F64]:
     """Return a camera's intrinsics and its pose against the left grey camera."""
-    if ROWS[name] >= len(projections):
+    row = ROWS[name]
+    if row not in projections:
         raise InputError(
-            f"{path}: {len(projections)} projections, none for {name}",
-            "give a row of 12 numbers for each camera",
+            f"{path}: no row {row} for {name}, only {', '.join(projections) or 'none of P0 to P3'}",
+            "give the projection of each camera whose images are there, a row of 12 numbers",
         )
-    P = projections[ROWS[name]]
+    P = projections[row]
     K = P[:, :3].copy()
     if not np.isfinite(P).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(
-            f"{path}, row {ROWS[name] + 1}: no focal length",
+            f"{path}, row {row}: no focal length",
             "give the projection of a rectified camera",
         )
     T = np.eye(4)
@@ -189,7 +206,7 @@ def _times(folder: Path, count: int) -> list[int]:
     path = folder / "times.txt"
     if not path.is_file():
         return [i * PERIOD_US for i in range(count)]
-    seconds = np.array([float(word) for word in read_text(path).split()])
+    seconds = np.array([_numbers(line, where, 1)[0] for where, line in _lines(path)])
     if len(seconds) < count or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
         found = (
             f"{len(seconds)} times for {count} poses"

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_object
-from alpasim_plugin.drives.colmap import model_folder, read_colmap
+from alpasim_plugin.core.reading import contents, natural_order, parsing, some_of
+from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
-from alpasim_plugin.drives.source import Points, SourceDrive, timed
+from alpasim_plugin.drives.source import Points, SourceDrive, in_order
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
+    KNOWN_KEYS,
     Picture,
     present,
     read_pictures,
@@ -23,7 +25,6 @@ from alpasim_plugin.gaussians.fit.photographs import (
 )
 from alpasim_plugin.gaussians.sh import C0
 
-PERIOD_US = 100_000  # between photographs without times
 PAIRS, FEWEST, CLEARLY = (
     6,
     40,
@@ -45,58 +46,65 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
     """
     if not folder.exists():
         raise InputError(f"{folder}: it does not exist", f"give {FORMS}")
-    if folder.is_dir() and (folder / FILE).is_file():
-        return _transforms(folder, photographs)
-    if folder.is_dir() and is_kitti(folder):
-        return read_kitti(folder)
-    if folder.is_dir() and model_folder(folder) is not None:
-        return read_colmap(folder, photographs=photographs)
-    inside = (
-        ", ".join(sorted(path.name for path in folder.iterdir())[:5])
-        if folder.is_dir()
-        else "a file"
-    )
-    raise InputError(f"{folder}: {inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
+    if folder.name == FILE:
+        folder = folder.parent
+    with parsing(folder, f"give {FORMS}"):
+        if (folder / FILE).is_file():
+            return _transforms(folder, photographs)
+        if is_kitti(folder):
+            return read_kitti(folder)
+        if models_in(folder):
+            return read_colmap(folder, photographs=photographs)
+    raise InputError(f"{folder}: {contents(folder)}: no known form of a drive", f"give {FORMS}")
 
 
 def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
-    document = read_json_object(folder / FILE)
+    document, listed = read_pictures(folder, "opencv")
     notes = []
-    if "axes" in document:
-        axes = str(document["axes"])
-    else:
-        axes, note = recognised_axes(folder)
-        notes.append(note)
-    _, listed = read_pictures(folder, axes)
     some = photographs or any(one.file.is_file() for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())
+    if "axes" not in document:
+        if not some:
+            raise InputError(
+                f"{folder / FILE}: no key 'axes', and no photographs to recognise it by",
+                'write "axes": "opengl" into the file, as nerfstudio and Instant-NGP mean it, or "axes": "opencv" (y down, z forward)',
+            )
+        axes, note = recognised_axes(folder, there)
+        notes.append(note)
+        there = [replace(one, T_world_camera=one.T_world_camera @ AXES[axes]) for one in there]
     if missing:
         notes.append(
-            f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}..."
+            f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {some_of(missing)}"
         )
+    unknown = sorted({key for one in listed for key in one.more} - KNOWN_KEYS)
+    if unknown:
+        notes.append(f"keys of {FILE} that are not read: {some_of(unknown)}")
     names = sorted({one.camera or "front" for one in there})
     front = next((name for name in names if "front" in name), names[0])
     pictures: list[Picture] = []
     for name in names:
         mine = [replace(one, camera=name) for one in there if (one.camera or "front") == name]
         if all(one.t_us is None for one in mine):
-            mine.sort(key=lambda one: one.file.name)
-            notes.append(
-                f"no times: photographs of {name} are taken by name, {1_000_000 // PERIOD_US} a second"
-            )
-        elif any(one.t_us is None for one in mine):
+            ordered, note = in_order(mine)
+            pictures += ordered
+            notes.append(note)
+            continue
+        if any(one.t_us is None for one in mine):
             bad = next(one for one in mine if one.t_us is None)
             raise InputError(
                 f"{bad.where}: no t_us, which other photographs have",
                 "give every photograph its time, or none",
             )
-        pictures += sorted(timed(mine, PERIOD_US), key=lambda one: int(one.t_us or 0))
+        pictures += sorted(mine, key=lambda one: int(one.t_us or 0))
     kept = tuple(
         sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"})
     )
-    metric = "the file's word that its unit is the metre" if document.get("unit") == "m" else None
-    points = document.get("ply_file_path")
+    unit = document.get("unit")
+    if unit not in (None, "m"):
+        raise InputError(f"{folder / FILE}, unit: {unit!r}", 'give metres, "unit": "m", or no unit')
+    metric = "the file's word that its unit is the metre" if unit else None
+    points = document.get("ply_file_path") if photographs else None
     cloud = None if points is None else read_points(folder / str(points))
     given = (
         None
@@ -119,17 +127,20 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     )
 
 
-def recognised_axes(folder: Path) -> tuple[str, str]:
+def recognised_axes(folder: Path, pictures: Sequence[Picture]) -> tuple[str, str]:
     """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs
     fit together, and a note.
 
     With the wrong one epipolar lines are mirrored, or points lie behind the cameras.
 
+    Args:
+        folder: Holds the file.
+        pictures: Read as if it were that of OpenCV.
+
     Raises:
         InputError: Both fit, or neither.
     """
-    _, listed = read_pictures(folder, "opencv")
-    there = sorted(present(folder, listed)[0], key=lambda one: one.file.name)
+    there = sorted(pictures, key=lambda one: natural_order(one.file.as_posix()))
     chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
     counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
     inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))

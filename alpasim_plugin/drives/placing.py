@@ -28,6 +28,8 @@ from scenarios.recorded import SourceFiles
 
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
+MOST_MPS, MOST_MPS2 = 100.0, 50.0  # speed and acceleration that no car has
+MOST_STEP_MPS = 10.0  # a smaller change of speed may be an error of the poses
 OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median
 LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
     3.5,
@@ -111,6 +113,34 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         poses,
         {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)},
         tuple(notes),
+    )
+
+
+def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
+    """Refuse a drive whose speed, or change of speed from one photograph to the next, no car has.
+
+    Raises:
+        InputError: Names the photograph.
+    """
+    centres = placed.poses[drive.front][:, :3, 3]
+    pictures = drive.of(drive.front)
+    dt_s = np.diff([int(one.t_us or 0) for one in pictures]) * 1e-6
+    velocity = np.diff(centres, axis=0) / dt_s[:, None]
+    speed = np.linalg.norm(velocity, axis=1)
+    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    accel = 2 * change / (dt_s[1:] + dt_s[:-1])
+    jumps = np.flatnonzero((accel > MOST_MPS2) & (change > MOST_STEP_MPS))
+    fast = int(np.argmax(speed))
+    if speed[fast] > MOST_MPS:
+        at, found = fast + 1, f"{speed[fast]:.0f} m/s"
+    elif len(jumps):
+        at = int(jumps[0]) + 2
+        found = f"its speed changes by {change[jumps[0]]:.0f} m/s in {dt_s[jumps[0] + 1]:.2g} s"
+    else:
+        return
+    raise InputError(
+        f"{pictures[at].where}, {pictures[at].file.name}: {found}, which no car does",
+        "check the order of the photographs, their times (t_us) and the unit of the poses",
     )
 
 

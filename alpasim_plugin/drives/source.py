@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import natural_order
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
@@ -19,6 +20,8 @@ JUMP = (
 )
 LEAST_M = 1.0
 FEWEST, MOST = 8, 400  # photographs of a camera
+PERIOD_US = 100_000  # between photographs without times
+SAME_LENGTH = 0.01  # paths that differ by less are equally long
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +181,28 @@ def _unit_change(steps: F64) -> tuple[int, float] | None:
     return None
 
 
-def timed(pictures: Sequence[Picture], period_us: int) -> tuple[Picture, ...]:
-    """Return pictures without times as taken one after another."""
-    return tuple(
-        replace(one, t_us=i * period_us) if one.t_us is None else one
-        for i, one in enumerate(pictures)
+def timed(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
+    """Return pictures without times as taken one after another, `PERIOD_US` apart."""
+    return tuple(replace(one, t_us=i * PERIOD_US) for i, one in enumerate(pictures))
+
+
+def in_order(pictures: Sequence[Picture]) -> tuple[tuple[Picture, ...], str]:
+    """Return a camera's pictures without times as they were taken, with a note.
+
+    The order is that of the file. Some tools list photographs in an order of their own: where the
+    path along the names, in natural order, is shorter, the names count.
+    """
+    by_name = sorted(pictures, key=lambda one: natural_order(one.file.as_posix()))
+    listed, named = _length(pictures), _length(by_name)
+    name, rate = pictures[0].camera, 1_000_000 // PERIOD_US
+    if named < (1 - SAME_LENGTH) * listed:
+        note = f"in the order of their names: in the file's order the path is {listed / max(named, 1e-12):.1f} times as long"
+        return timed(by_name), f"no times: photographs of {name} are taken {note}; {rate} a second"
+    return timed(pictures), (
+        f"no times: photographs of {name} are taken in the file's order, {rate} a second"
     )
+
+
+def _length(pictures: Sequence[Picture]) -> float:
+    centres = np.array([one.T_world_camera[:3, 3] for one in pictures])
+    return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())

@@ -10,7 +10,9 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.build import (
     Report,
     begin,
@@ -22,13 +24,14 @@ from alpasim_plugin.drives.build import (
     write_photographs,
 )
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, corridor, place
+from alpasim_plugin.drives.placing import PlacedDrive, check_motion, corridor, place
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud, require_rigid
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.raster.rasterize import rasterize
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.world.ground import height_at
@@ -41,6 +44,11 @@ MIN_ON_ROAD = 0.5  # share of the poses
 ROADSIDE_M = 15.0  # from the path, where objects stand on the ground
 CLEARLY_M = 0.5  # above the ground, or below it
 VIEW_PX = 320  # width of the views of a model without photographs
+TRAINED = "dataparser_transforms.json"  # of nerfstudio
+SWAPPED = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))  # applied before it was stated
+VIEWS, OPAQUE_PIXEL = 8, 0.5  # that coverage is measured on
+LEAST_COVERED = 0.3  # of the lower half of the images
+MOST_ROLL_DEG = 20.0  # of the camera against the ground
 
 
 def import_splat(
@@ -64,14 +72,14 @@ def import_splat(
     """
     tell = report or (lambda stage, done, total: None)
     with working_folder(out) as work:
-        source = poses.parent if poses.name == "transforms.json" else poses
-        drive = read_source(source, photographs=False)
+        drive = read_source(poses, photographs=False)
         has_photographs = all(picture.file.is_file() for picture in drive.pictures)
         drive = checked(drive, poses, has_photographs)
         tell("reading the model", 0, 1)
         cloud, kept = read_gaussians(file)
         if kept.n_kept == 0:
             raise InputError(f"{file}: {kept}", "Give a file with at least one drawable Gaussian.")
+        cloud, frame_notes = _in_frame(file, cloud, poses, drive)
         key = key_of(drive, None, file if file.is_file() else None)
         if out.exists():
             return finished(out, key)
@@ -81,6 +89,8 @@ def import_splat(
             quality = "no photographs: how well the model shows them is not measured"
         notes = (
             f"the model is {file.name}: {size}",
+            *kept.notes,
+            *frame_notes,
             quality,
             "the sky is black: a model of Gaussians has none",
         )
@@ -93,6 +103,7 @@ def import_splat(
         )
         placed = place(drive, points)
         _check_frame(file, placed)
+        check_motion(drive, placed)
         sky = Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))
         model = Reconstruction(placed_cloud(cloud, placed.T_world_source), {}, sky)
         begin(work, key)
@@ -106,6 +117,89 @@ def import_splat(
             views["fitted"] = _blank_views(drive, placed)
         roads = corridor(placed.ego, placed.ground)
         return write_folder(work, drive, placed, roads, model, shown, views, {}, tell)
+
+
+def _in_frame(
+    file: Path, cloud: GaussianCloud, poses: Path, drive: SourceDrive
+) -> tuple[GaussianCloud, tuple[str, ...]]:
+    """Return a model in the frame of the poses, with notes.
+
+    nerfstudio trains in a frame of its own and states it in ``dataparser_transforms.json``. Models
+    are exported in either frame, so the one in which the poses see the model counts.
+
+    Raises:
+        InputError: The poses see too little of the model.
+    """
+    places = [folder / TRAINED for folder in (file.parent, _folder_of(poses))]
+    stated = next((place for place in places if place.is_file()), None)
+    if stated is None:
+        covered, moved, notes = _covered(cloud, drive), cloud, ()
+    else:
+        frames = {"as it is": np.eye(4), **_T_trained_source(stated, drive)}
+        models = {name: placed_cloud(cloud, np.linalg.inv(T)) for name, T in frames.items()}
+        shares = {name: _covered(model, drive) for name, model in models.items()}
+        best = max(shares, key=lambda name: shares[name])
+        covered, moved = shares[best], models[best]
+        seen = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
+        notes = (f"the model is taken {best}: from the poses it covers {seen}",)
+    if covered < LEAST_COVERED:
+        raise InputError(
+            f"{file}: from the poses it covers {100 * covered:.1f} % of the images' lower half, less than {100 * LEAST_COVERED:.0f} %",
+            f"Give the poses in the model's own frame and unit; {TRAINED} of nerfstudio is read where it lies beside the model.",
+        )
+    return moved, notes
+
+
+def _folder_of(poses: Path) -> Path:
+    return poses if poses.is_dir() else poses.parent
+
+
+def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
+    """Return the transforms ``(4, 4)``, with scale, that may lead from the poses to the trainer's
+    frame.
+
+    The file maps the frame from before a ``transforms.json`` was written, whose own
+    ``applied_transform`` and ``applied_scale`` lead from there to its poses. Old files do not state
+    that they exchanged axes.
+    """
+    more = drive.pictures[0].more
+    applied = {"": more.get("applied_transform", np.eye(3, 4))}
+    if drive.kind == "transforms" and "applied_transform" not in more:
+        applied[" with the axes of an old ns-process-data"] = SWAPPED
+    with parsing(path, "copy it from the trained model again", "no transform and scale"):
+        document = read_json_object(path)
+        scale = float(document["scale"]) / float(more.get("applied_scale", 1.0))
+        trained = _rigid(document["transform"])
+        return {
+            f"in the frame of {path.name}{name}": np.diag([scale, scale, scale, 1.0])
+            @ trained
+            @ np.linalg.inv(_rigid(rows))
+            for name, rows in applied.items()
+        }
+
+
+def _rigid(rows: Any) -> F64:
+    T = np.vstack([np.asarray(rows, dtype=np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
+    require_rigid(T)
+    return T
+
+
+def _covered(cloud: GaussianCloud, drive: SourceDrive) -> float:
+    """Return the share of the lower half of the images that a model in the frame of the poses
+    covers.
+    """
+    steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
+    unit = 1 / float(np.median(steps[steps > 0]))
+    scaled = placed_cloud(cloud, np.diag([unit, unit, unit, 1.0]))
+    pictures = drive.of(drive.front)
+    shares = []
+    for i in np.unique(np.linspace(0, len(pictures) - 1, VIEWS).astype(int)):
+        lens, pose = pictures[i].lens.resized(VIEW_PX), pictures[i].T_world_camera.copy()
+        pose[:3, 3] *= unit
+        camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose)
+        alpha = rasterize(scaled, camera).alpha
+        shares.append(float((alpha[camera.height // 2 :] > OPAQUE_PIXEL).mean()))
+    return float(np.mean(shares))
 
 
 def _surface(cloud: GaussianCloud) -> Points:
@@ -131,6 +225,14 @@ def _check_frame(file: Path, placed: PlacedDrive) -> None:
         raise InputError(
             f"{file}: {100 * share:.0f} % of the poses lie over Gaussians of the model",
             "Give the poses in the model's own frame and unit: those that it was trained with.",
+        )
+    poses = placed.poses[next(iter(placed.poses))]
+    mean = poses[:, :3, :3].mean(axis=0)
+    roll = float(np.degrees(np.arctan2(mean[2, 0], -mean[2, 1])))
+    if abs(roll) > MOST_ROLL_DEG:
+        raise InputError(
+            f"{file}: the ground under the path is rolled by {abs(roll):.0f} degrees against the cameras",
+            "Give the poses in the model's own frame, with cameras that stand upright.",
         )
     away_m, _ = scipy.spatial.KDTree(placed.ego.xyz[:, :2]).query(xyz[:, :2])
     height_m = (xyz[:, 2] - height_at(placed.ground, xyz))[away_m < ROADSIDE_M]

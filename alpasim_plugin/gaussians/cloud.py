@@ -31,12 +31,14 @@ class CleanReport:
         dropped: Cause to count; each dropped Gaussian is counted once, under the first cause that
             applies in the order listed.
         repaired: Cause to count of Gaussians kept with a changed value.
+        notes: What the file says that was applied, or is not drawn.
     """
 
     n_input: int
     n_kept: int
     dropped: Mapping[str, int]
     repaired: Mapping[str, int]
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Say it in one line."""
@@ -330,6 +332,7 @@ class GaussianArrays(NamedTuple):
         scales: ``(N, 3)`` linear standard deviations.
         opacities: ``(N,)`` linear, 0..1.
         sh: ``(N, K, 3)`` colour coefficients, constant term first.
+        notes: What the file says that was applied, or is not drawn.
     """
 
     means: FloatArray
@@ -337,6 +340,7 @@ class GaussianArrays(NamedTuple):
     scales: FloatArray
     opacities: FloatArray
     sh: FloatArray
+    notes: tuple[str, ...] = ()
 
 
 def sigmoid(x: FloatArray) -> F64:
@@ -354,7 +358,7 @@ def logit(p: FloatArray) -> F64:
 
 def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
     """Clean decoded columns into a cloud; bands of harmonics above what can be drawn are left out
-    and counted as repaired.
+    and noted.
 
     Raises:
         InputError: Shapes disagree.
@@ -362,10 +366,13 @@ def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
     k = arrays.sh.shape[1]
     kept = min(k, SH_SIZES[-1])
     cloud, report = GaussianCloud.cleaned(*arrays[:4], arrays.sh[:, :kept])
+    notes = arrays.notes
     if k > kept:
-        cause = f"colour harmonics beyond {kept} coefficients left out"
-        report = replace(report, repaired={**report.repaired, cause: len(cloud)})
-    return cloud, report
+        left_out = float(np.nanmax(np.abs(arrays.sh[:, kept:]), initial=0.0))
+        notes += (
+            f"harmonics of degree {SH_SIZES.index(kept) + 1} and above are left out; the largest coefficient is {left_out:.2g}",
+        )
+    return cloud, replace(report, notes=notes)
 
 
 def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:

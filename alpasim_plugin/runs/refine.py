@@ -24,6 +24,7 @@ import numpy as np
 from alpasim_plugin.core.atomic import atomic_folder, write_bytes
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Fixer
+from alpasim_plugin.core.reading import natural_order
 from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter
@@ -35,7 +36,7 @@ GREY_LEVELS = 40  # channels of an opacity video may differ by this much, becaus
 
 
 class PictureFolderReader:
-    """Iterate over the ``.png`` files of a folder in order of name; like `log.video.VideoReader`.
+    """Iterate over the ``.png`` files of a folder in natural order of their names; like `log.video.VideoReader`.
 
     Args:
         path: The folder.
@@ -47,7 +48,8 @@ class PictureFolderReader:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.names = tuple(sorted(file.name for file in self.path.glob("*.png")))
+        names = (file.name for file in self.path.glob("*.png"))
+        self.names = tuple(sorted(names, key=natural_order))
         if not self.names:
             raise self._refusal(
                 "no .png files", "give a folder of pictures named in order, such as 000000.png"

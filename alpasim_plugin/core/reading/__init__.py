@@ -19,8 +19,10 @@ from __future__ import annotations
 
 from alpasim_plugin.core.reading.files import (
     check_regular,
+    contents,
     exists,
     inside,
+    natural_order,
     parse_json,
     parsing,
     read_bytes,
@@ -30,12 +32,15 @@ from alpasim_plugin.core.reading.files import (
     read_json_object,
     read_text,
     real,
+    some_of,
 )
 
 __all__ = [
     "check_regular",
+    "contents",
     "exists",
     "inside",
+    "natural_order",
     "parse_json",
     "parsing",
     "read_bytes",
@@ -45,4 +50,5 @@ __all__ = [
     "read_json_object",
     "read_text",
     "real",
+    "some_of",
 ]

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -74,6 +75,30 @@ def open_regular(
             yield stream
         except OSError as error:
             raise InputError(f"{path}: it cannot be read: {error.strerror}", do_this) from error
+
+
+def natural_order(name: str) -> tuple[str, str]:
+    """Return the key that sorts names as people count: ``2.jpg`` before ``10.jpg``.
+
+    Example:
+        >>> sorted(["10.jpg", "2.jpg", "1.jpg"], key=natural_order)
+        ['1.jpg', '2.jpg', '10.jpg']
+    """
+    return re.sub(r"\d+", lambda digits: digits.group().zfill(20), name), name
+
+
+def some_of(names: Sequence[str], most: int = 5) -> str:
+    """Return the first names in a sentence, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def contents(path: Path) -> str:
+    """Say what a path is, for messages: a file, or a folder with its first names."""
+    if not path.is_dir():
+        return "a file"
+    names = sorted((one.name for one in path.iterdir()), key=natural_order)
+    return f"a folder with {some_of(names) or 'nothing'}"
 
 
 def exists(path: Path | str) -> bool:

@@ -49,14 +49,25 @@ AXES = {
     "opencv": np.eye(4),
     "opengl": np.diag([1.0, -1.0, -1.0, 1.0]),
 }  # the file's camera axes to ours
+BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of OpenCV
 COEFFICIENTS = {  # of each lens model, in the order of OpenCV
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-    "PINHOLE": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV": BENDS[:5],
+    "PINHOLE": BENDS[:5],
     "SIMPLE_PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": BENDS,
 }
+# Keys of a file and of its frames that change nothing of what is read, or are read below.
+_KEYS = """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y cx cy
+    camera_angle_x camera_angle_y x_fov y_fov k1 k2 k3 k4 k5 k6 p1 p2 file_path transform_matrix
+    t_us camera use exposure sky_path mask_path aabb_scale scale offset render_aabb up sharpness
+    colmap_im_id applied_transform applied_scale orientation_override auto_scale_poses_override
+    train_filenames val_filenames test_filenames depth_file_path depth_unit_scale_factor
+    integer_depth_scale enable_depth_loading n_extra_learnable_dims white_transparent
+    black_transparent"""
+KNOWN_KEYS = frozenset(_KEYS.split())
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
 ActorsAt = Callable[[int], Mapping[str, F64]]  # time in microseconds -> actor id to T_world_box
@@ -176,15 +187,18 @@ def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], t
     """
     there = [picture for picture in pictures if picture.file.is_file()]
     missing = tuple(
-        picture.file.relative_to(folder).as_posix()
+        picture.file.as_posix().removeprefix(f"{folder.as_posix()}/")
         for picture in pictures
         if not picture.file.is_file()
     )
     if len(there) < 2:
-        raise InputError(
-            f"{folder}: {len(there)} of {len(pictures)} listed images exist",
-            "give the images that the file names",
-        )
+        found = f"{folder}: {len(there)} of {len(pictures)} listed images exist"
+        if missing and Path(missing[0]).is_absolute():
+            raise InputError(
+                f"{found}: the file names paths of another machine, {missing[0]} the first",
+                "write the paths relative to the folder",
+            )
+        raise InputError(found, f"give the images that the file names, {', '.join(missing[:1])} on")
     return there, missing
 
 
@@ -254,12 +268,17 @@ def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> P
 
 
 def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
-    model = frame.get("camera_model", "OPENCV")
-    if model not in COEFFICIENTS or (frame.get("k4") and model != "OPENCV_FISHEYE"):
-        found = f"lens model {model}" if model not in COEFFICIENTS else "a coefficient k4"
+    model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
+    undistort = "undistort the images first (colmap image_undistorter)"
+    if model not in COEFFICIENTS:
         raise InputError(
-            f"{where}: {found}",
-            "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)",
+            f"{where}: lens model {model!r}", f"use {', '.join(COEFFICIENTS)}, or {undistort}"
+        )
+    others = [key for key in BENDS if frame.get(key) and key not in COEFFICIENTS[model]]
+    if others or frame.get("distortion_params"):
+        raise InputError(
+            f"{where}: {others[0] if others else 'distortion_params'} of a lens model {model}",
+            f"give it by {', '.join(COEFFICIENTS[model]) or 'none'}, or {undistort}",
         )
     do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/renderers.md)"
     try:

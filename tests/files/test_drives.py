@@ -1,0 +1,256 @@
+"""Recorded drives as other tools write them: order, rows by name, lenses, models and frames.
+
+Every file is made here; photographs are left out where they do not matter.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import quat_from_matrix
+from alpasim_plugin.drives.opening import read_source
+from alpasim_plugin.drives.placing import check_motion, place
+from alpasim_plugin.drives.source import SourceDrive, checked
+from alpasim_plugin.drives.splat import _in_frame
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street
+
+STEP_M = 1.2
+LENS = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 160.0, "cy": 54.0}
+
+
+def poses(count: int) -> list[np.ndarray]:
+    return [Street().pose(STEP_M * i) for i in range(count)]
+
+
+def transforms(folder: Path, names: list[str], order: list[int] | None = None, **keys: Any) -> Path:
+    """Write a ``transforms.json`` whose photograph i is taken i steps along the street."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+        for name, pose in zip(names, poses(len(names)), strict=True)
+    ]
+    listed = [frames[i] for i in order or range(len(frames))]
+    document = {"axes": "opencv", **LENS, "frames": listed, **keys}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def colmap(model: Path, names: list[str], points: bool = True, camera: str = "") -> None:
+    model.mkdir(parents=True)
+    lens = camera or f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 160 54"
+    (model / "cameras.txt").write_text(f"# cameras\n7 {lens}\n")
+    rows = []
+    for i, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
+        back = np.linalg.inv(pose)
+        numbers = [*quat_from_matrix(back[:3, :3]), *back[:3, 3]]
+        rows.append(f"{i + 1} {' '.join(map(repr, map(float, numbers)))} 7 {name}")
+        rows += ["10 20 -1 30 40 5" if i % 2 else ""] if points else []
+    (model / "images.txt").write_text("# images\n" + "\n".join(rows) + "\n")
+    (model / "points3D.txt").write_text("1 1.0 0.0 0.0 90 90 90 0.5 1 0\n")
+
+
+def kitti(folder: Path, calib: str, pair: str = "image_2", times: str | None = None) -> Path:
+    (folder / pair).mkdir(parents=True)
+    for i in range(8):
+        cv2.imwrite(str(folder / pair / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
+    rows = [" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses(8)]
+    (folder / "poses.txt").write_text("\n".join(rows))
+    (folder / "calib.txt").write_text(calib)
+    if times is not None:
+        (folder / "times.txt").write_text(times)
+    return folder
+
+
+def row(name: str, focal: float) -> str:
+    return f"{name}: {focal} 0 160 0 0 {focal} 54 0 0 0 1 0\n"
+
+
+def along(drive: SourceDrive) -> list[float]:
+    return [round(float(x), 3) for x in drive.path[:, 0]]
+
+
+STRAIGHT = [round(STEP_M * i, 3) for i in range(13)]
+
+
+@pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        ([f"{i}.jpg" for i in range(1, 14)], None),  # sorted as text: 1, 10, 11, 12, 13, 2
+        ([f"{i}.jpg" for i in range(1, 14)], [0, 9, 10, 11, 12, *range(1, 9)]),
+        ([f"{i}.jpg" for i in reversed(range(13))], None),  # named backwards: the list counts
+        ([f"{(7 * i) % 13:x}{i}.jpg" for i in range(13)], None),  # names without an order
+        ([f"IMG_{i}.JPG" for i in range(95, 108)], None),
+    ],
+)
+def test_photographs_without_times_are_taken_along_the_path(
+    tmp_path: Path, names: list[str], order: list[int] | None
+) -> None:
+    drive = read_source(transforms(tmp_path / "a", names, order, unit="m"), photographs=False)
+    assert along(drive) == STRAIGHT
+    assert any("no times" in note for note in drive.notes)
+
+
+def test_a_colmap_model_is_read_in_natural_order_with_any_line_of_points(tmp_path: Path) -> None:
+    names = [f"my photo  {i}.png" for i in range(1, 14)]
+    for points in (True, False):
+        colmap(tmp_path / f"{points}/sparse/0", names, points)
+        drive = read_source(tmp_path / str(points), photographs=False)
+        assert along(drive) == STRAIGHT
+        assert drive.pictures[2].file.name == "my photo  3.png"
+
+
+def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path: Path) -> None:
+    colmap(tmp_path / "sparse/0", ["a.png", "b.png"])
+    colmap(tmp_path / "sparse/10", [f"{i}.png" for i in range(13)])
+    drive = read_source(tmp_path, photographs=False)
+    assert len(drive.pictures) == 13
+    assert any("2 models" in note and "sparse/10" in note for note in drive.notes)
+
+
+@pytest.mark.parametrize("name", ["FOV", "THIN_PRISM_FISHEYE", "NEWEST"])
+def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path: Path, name: str) -> None:
+    colmap(tmp_path / "sparse", ["a.png"], camera=f"{name} 320 128 180 180 160 54 0.1")
+    with pytest.raises(InputError, match=name):
+        read_source(tmp_path, photographs=False)
+
+
+@pytest.mark.parametrize(
+    ("calib", "focal"),
+    [
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n" + row("P0", 150) + row("P2", 180), 180),
+        (row("P3", 190) + row("P2", 180), 180),
+        ("calib_time: 09-Jan-2012 13:57:47\n" + row("P_rect_02", 180) + row("P_rect_00", 150), 180),
+        (row("P2", 180).replace(":", ""), 180),
+        (row("P0", 150), None),
+        (row("P2", 180) + row("P2", 150), None),
+        ("projections\n" + row("P2", 180), None),
+    ],
+)
+def test_rows_of_kitti_are_found_by_name(tmp_path: Path, calib: str, focal: float | None) -> None:
+    folder = kitti(tmp_path / "a", calib)
+    if focal is None:
+        with pytest.raises(InputError):
+            read_source(folder)
+    else:
+        assert read_source(folder).pictures[0].lens.K[0, 0] == focal
+
+
+def test_unknown_rows_of_kitti_are_said(tmp_path: Path) -> None:
+    drive = read_source(kitti(tmp_path / "a", row("P2", 180) + "W_odd: 1 2\n"))
+    assert any("W_odd" in note for note in drive.notes)
+
+
+def test_a_header_of_times_is_refused_with_its_line(tmp_path: Path) -> None:
+    times = "# seconds\n" + "\n".join(str(0.1 * i) for i in range(8))
+    with pytest.raises(InputError, match="line 1"):
+        read_source(kitti(tmp_path / "a", row("P2", 180), times=times))
+
+
+@pytest.mark.parametrize(
+    ("keys", "found"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"camera_model": "OPENCV", "k4": 0.1}, "k4"),
+        ({"camera_model": "SIMPLE_PINHOLE", "k1": 0.1}, "k1"),
+        ({"distortion_params": [0.1, 0.0]}, "distortion_params"),
+        ({"unit": "cm"}, "cm"),
+        ({"axes": "opengll"}, "opengll"),
+    ],
+)
+def test_what_transforms_cannot_mean_is_refused_by_name(
+    tmp_path: Path, keys: dict[str, Any], found: str
+) -> None:
+    with pytest.raises(InputError, match=found):
+        read_source(transforms(tmp_path / "a", ["1.png", "2.png"], **keys), photographs=False)
+
+
+def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", ["1.png", "2.png"], is_fisheye=True, k1=0.1, wobble=3)
+    drive = read_source(folder, photographs=False)
+    assert drive.pictures[0].lens.model == "fisheye"
+    assert any("wobble" in note for note in drive.notes)
+
+
+def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", ["1.png", "2.png"], ply_file_path="gone.ply")
+    assert read_source(folder, photographs=False).points is None
+    with pytest.raises(InputError):
+        read_source(folder)
+
+
+def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", ["1.png", "2.png"])
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"]:
+        frame["file_path"] = f"/home/someone/{frame['file_path']}"
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"/home/someone/images/1\.png"):
+        read_source(folder)
+    del document["axes"]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="'axes'"):
+        read_source(folder, photographs=False)
+
+
+def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)], unit="m")
+    document = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(document["frames"]):
+        frame["t_us"] = 100_000 * i if i != 7 else 650_000
+    document["frames"][7]["transform_matrix"][0][3] += 2.0
+    (folder / "transforms.json").write_text(json.dumps(document))
+    drive = checked(read_source(folder, photographs=False), folder, photographs=False)
+    with pytest.raises(InputError, match=r"7\.png"):
+        check_motion(drive, place(drive, street_points(drive)))
+
+
+def street_points(drive: SourceDrive) -> Any:
+    from alpasim_plugin.drives.splat import _surface
+
+    return _surface(street_cloud())
+
+
+def street_cloud() -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2.0, -4.0, 0.0], [40.0, 4.0, 0.0], (6000, 3))
+    points[:, 2] = Street().ground(points[:, 0])
+    n = len(points)
+    turns = np.tile([1.0, 0, 0, 0], (n, 1))
+    return GaussianCloud(
+        points, turns, np.full((n, 3), 0.15), np.full(n, 0.95), np.zeros((n, 1, 3))
+    )
+
+
+@pytest.mark.parametrize("keys", ["none", "stated", "old"])
+def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(
+    tmp_path: Path, keys: str
+) -> None:
+    before = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    more = {"applied_transform": before[:3].tolist(), "applied_scale": 2.0}
+    names = [f"{i}.png" for i in range(13)]
+    folder = transforms(tmp_path / "a", names, **(more if keys == "stated" else {}))
+    drive = read_source(folder, photographs=False)
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array([0.7, 0.2, -0.4]))[0]
+    T[:3, 3] = -6.9, 0.5, -1.7
+    model = placed_cloud(street_cloud(), np.diag([0.145, 0.145, 0.145, 1.0]) @ T)
+    with pytest.raises(InputError):
+        _in_frame(tmp_path / "splat.ply", model, folder, drive)
+    document = {
+        "transform": (T if keys == "none" else T @ before)[:3].tolist(),
+        "scale": 0.145 * (2.0 if keys == "stated" else 1.0),
+    }
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(document))
+    moved, notes = _in_frame(tmp_path / "splat.ply", model, folder, drive)
+    assert np.abs(moved.means - street_cloud().means).max() < 1e-6
+    assert any("dataparser_transforms.json" in note for note in notes)
+    unmoved, _ = _in_frame(tmp_path / "splat.ply", street_cloud(), folder, drive)
+    assert np.abs(unmoved.means - street_cloud().means).max() < 1e-9
