@@ -202,7 +202,7 @@ def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, bik
 def test_splat_written_twice_is_the_same(tmp_path: Path, biker: Path) -> None:
     cloud, _ = read_gaussians(biker / "train-1000.ply")
     write_splat(tmp_path / "a.splat", cloud)
-    write_splat(tmp_path / "b.splat", GaussianCloud(*read_splat(tmp_path / "a.splat")))
+    write_splat(tmp_path / "b.splat", GaussianCloud(*read_splat(tmp_path / "a.splat")[:5]))
     assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "b.splat").read_bytes()
 
 

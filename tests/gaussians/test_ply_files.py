@@ -101,7 +101,7 @@ def test_trained_model_is_read_whole_and_normalised(train: Path) -> None:
 
 
 def test_trained_model_comes_back_byte_for_byte(train: Path, tmp_path: Path) -> None:
-    write_ply(tmp_path / "copy.ply", GaussianCloud(*read_ply_arrays(train)))
+    write_ply(tmp_path / "copy.ply", GaussianCloud(*read_ply_arrays(train)[:5]))
     body = 1000 * 62 * 4
     assert (tmp_path / "copy.ply").read_bytes()[-body:] == train.read_bytes()[-body:]
 
@@ -162,7 +162,7 @@ def test_means_and_colours_are_bit_exact(
 
 def test_writing_what_was_read_changes_no_byte(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", make_cloud(200))
-    write_ply(tmp_path / "b.ply", GaussianCloud(*read_ply_arrays(tmp_path / "a.ply")))
+    write_ply(tmp_path / "b.ply", GaussianCloud(*read_ply_arrays(tmp_path / "a.ply")[:5]))
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
