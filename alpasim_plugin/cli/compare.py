@@ -112,18 +112,16 @@ def _table(
     rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], known: MetricTable
 ) -> list[str]:
     """Return one line per metric; lines are not wrapped."""
-    lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
+    lines = [("metric", "difference", "p", "these scenes", "95 %", "margin", "pairs", "others")]
     for row in rows:
         entry = entries[row.metric]
         verdict = str(entry["verdict"])
         if entry["more_scenes"]:
-            verdict += f", about {entry['more_scenes']} more scenes"
-        if entry["difference"] == "better":
-            verdict += " (better)"
+            verdict += f", at least {entry['more_scenes']} more scenes"
         scale = 100.0 if known.shown(row.metric).in_percent else 1.0
         margin = f"{scale * entry['margin']:g}"
         pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
-        numbers = (row.diff.text, row.interval.text, row.p_value.text)
+        numbers = (row.diff.text, row.p_value.text, entry["difference"], row.interval.text)
         lines.append((row.metric, *numbers, margin, pairs, verdict))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     texts = []

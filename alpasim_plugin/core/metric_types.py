@@ -41,8 +41,8 @@ class MetricInfo:
         reference: Which point is measured, and in which frame, for docs/metrics.md.
         curve: Place among the curves over time that a viewer shows first, from 1; 0: only when
             asked for.
-        event: Flag that counts what a distance does not: a scene's difference counts up to a cap,
-            so it decides only together with it.
+        cap: How much of a scene's distance counts in a verdict; None: 40 margins of a difference.
+        event: Flag of what lies beyond the cap: a distance is no worse only together with it.
     """
 
     unit: str
@@ -63,6 +63,7 @@ class MetricInfo:
     invalid: str = "never"
     reference: str = ""
     curve: int = 0
+    cap: float | None = None
     event: str = ""
 
     @property

@@ -21,7 +21,7 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import DIRECTION_M, followed, on_route, recorded_path, to_path
 from evaluators.metrics.score import handover_us, series, with_preset
-from evaluators.metrics.table import METRICS
+from evaluators.metrics.table import LEFT_ROUTE_M, METRICS
 
 if TYPE_CHECKING:
     from alpasim_plugin.log.run_folder.rows import Rollout
@@ -137,7 +137,6 @@ def reached_end(rollout: Rollout) -> bool:
     )
 
 
-LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
 STAND_MPS, STAND_S = 0.3, 3.0
 SLOW_SHARE = 0.5
 LEAST_MPS = 2.0

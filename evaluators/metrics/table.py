@@ -236,6 +236,7 @@ def _min_ade(horizon: float | str, target: str) -> MetricInfo:
     )
 
 
+LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
 FOOTPRINT, CENTRE = "footprint, plan view", "box centre, plan view"
 UNKNOWN = MetricInfo("", "none", "last", "")
 _SIGNED = (None, None)
@@ -299,7 +300,6 @@ METRICS = MetricTable(
             "min",
             margin=0.25,
             curve=3,
-            event="collision_any",
             reference=FOOTPRINT,
             formula="least distance from `F` to any actor's rectangle, 0 on touch",
             invalid="steps with no other actor",
@@ -369,7 +369,6 @@ METRICS = MetricTable(
             "lower",
             "max",
             margin=0.25,
-            event="offroad",
             reference=CENTRE,
             formula="distance from `c` to `P`",
         ),
@@ -380,7 +379,8 @@ METRICS = MetricTable(
             is_headline=True,
             label="lateral distance",
             margin=0.1,
-            event="offroad",
+            cap=LEFT_ROUTE_M,
+            event="left_route",
             reference=CENTRE,
             invalid=_SHORT,
             formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within "
@@ -392,7 +392,7 @@ METRICS = MetricTable(
             "mean",
             label="route distance",
             margin=0.1,
-            event="offroad",
+            cap=LEFT_ROUTE_M,
             reference=CENTRE,
             formula="distance from `c` to `P` as it stands: the paper's route distance, which [charges for driving past the end](presets.md)",
         ),
@@ -403,7 +403,8 @@ METRICS = MetricTable(
             limits=_SIGNED,
             margin=0.1,
             curve=1,
-            event="offroad",
+            cap=LEFT_ROUTE_M,
+            event="left_route",
             reference=CENTRE,
             formula="lateral distance with sign: left of `P` positive",
             invalid=_SHORT,

@@ -28,9 +28,10 @@ from evaluators.report.numbers import (
 from evaluators.report.verdict import tone_of
 from evaluators.statistics.sentences import more_scenes_text
 
-# verdict against the margin, and the difference that is shown -> words
+# verdict on other scenes against the margin, and the difference on these scenes -> words
 VERDICT_WORDS = {
-    ("undecided", "worse"): "worse, margin undecided",
+    ("undecided", "worse"): "worse on these scenes, in others undecided",
+    ("undecided", "better"): "better on these scenes, in others undecided",
     ("non-inferior", "worse"): "worse within margin",
     ("non-inferior", "better"): "better",
 }

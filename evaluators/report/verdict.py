@@ -24,6 +24,7 @@ from evaluators.report.numbers import (
     plural,
     short,
 )
+from evaluators.statistics.intervals import FEW_SCENES
 from evaluators.statistics.outcomes import outcome_table, sentence
 from evaluators.statistics.sentences import difference_text
 from evaluators.statistics.verdicts import shown_questions
@@ -33,7 +34,6 @@ Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 GRAVEST_FIRST: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
 LEADING = 4  # variants named in the headline
 COMPARED = 3  # comparisons named in the title
-FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 NO_PAIR = "no metric is valid in both members of any pair"
 
 
@@ -250,6 +250,9 @@ def _point(
     elif all(tones[metric] == "neutral" for metric in asked):
         tone = "neutral"
         verdict = f"{name} drives no worse than {other}{where} by more than the margin"
+    shown_sides = [metric for metric in asked if tones[metric] in ("worse", "better")]
+    if any(pairs[metric].get("verdict") != "worse" for metric in shown_sides):
+        verdict += " on these scenes"
     texts = {metric: _difference(run, variant, metric, pairs[metric]) for metric in questions}
     sides = [
         f"{side} in {_listing(run, found)}"

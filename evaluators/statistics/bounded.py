@@ -22,8 +22,15 @@ import math
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.core.types import F64
-from evaluators.statistics.intervals import TAIL
+from alpasim_plugin.core.types import F64, MetricInfo
+from evaluators.statistics.intervals import (
+    TAIL,
+    Interval,
+    mean_of,
+    rate_interval,
+    t_interval,
+    within,
+)
 
 # The integral is taken over the logarithm of the frequency, in units of 1 / norm of the
 # coefficients.
@@ -112,6 +119,30 @@ def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
     """
     x = np.clip(np.asarray(values, dtype=np.float64), least, most)
     return -upper_bound(-x, -least), upper_bound(x, most)
+
+
+def mean_interval(means: F64, metric: MetricInfo) -> Interval:
+    """Return the interval of a metric's mean from the mean of each scene ``(G,)``; never without
+    width.
+
+    Rates take `rate_interval`, other quantities with bounds `mean_bounds`. Where a metric counts up
+    to a cap (`MetricInfo.cap`), what was not drawn may lie there: the interval holds the one of t
+    and `mean_bounds` of the values cut to the cap. All others take t, which knows only the spread
+    that it saw.
+    """
+    n, centre = len(means), mean_of(means)
+    least, most = metric.value_range
+    if metric.is_flag:
+        return rate_interval(means)
+    seen = t_interval(means, "scenes")
+    reach = metric.cap if metric.cap is not None else most
+    if n < 2 or not math.isfinite(reach):
+        return within(seen, least, most)
+    low, high = mean_bounds(means, least if math.isfinite(least) else -reach, reach)
+    method = f"mean of scenes up to {reach:g} {metric.unit}".rstrip()
+    if metric.cap is not None:
+        low, high = min(low, *(seen.bounds or [centre])), max(high, *(seen.bounds or [centre]))
+    return within(Interval(centre, low, high, method=method), least, most)
 
 
 def scenes_to_exclude(distance: float, reach: float, tail: float = TAIL) -> int:

@@ -32,7 +32,7 @@ from evaluators.metrics.presets import preset as find_preset
 from evaluators.report.numbers import plural, short
 from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.intervals import TAIL
-from evaluators.statistics.paired import compare, reach_of
+from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (
     LISTED,
@@ -54,7 +54,6 @@ from evaluators.statistics.verdicts import (
     Cause,
     Outcome,
     outcome_of_failures,
-    scenes_without_event,
     worst,
 )
 
@@ -395,7 +394,7 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
     for name, rule in rules.items():
         metric = known.info(name)
         margin = metric.accepted if rule.margin is None else rule.margin
-        least = scenes_without_event(margin, reach_of(metric, margin)) if margin else None
+        least = least_scenes(metric, margin) if margin else None
         if rule.must_decide and n_scenes < max(spec.min_scenes, least or 0):
             raise InputError(
                 f"{n_scenes} scenes: a gate about other scenes needs at least "

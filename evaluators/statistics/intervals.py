@@ -8,6 +8,7 @@ docs/experiments/verdict-error.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,8 @@ ROUNDING = 1e-12  # values that differ by no more than this, relative, are equal
 TOO_LARGE = "the values are too large for their spread to be a number"
 # the squares of larger values are no numbers, and those of their inverses lose their digits
 LARGE = 1e150
+NO_SPREAD = "all {} {} are equal: a sample without spread has no interval"
+FEW_SCENES = 10  # below, counts and exact methods come first
 
 
 @dataclass(frozen=True)
@@ -111,51 +114,12 @@ def t_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
     if len(x) < 2:
         return Interval(centre, reason=f"needs at least two {unit}, found {len(x)}")
     if are_alike(x):
-        return Interval(
-            centre,
-            centre,
-            centre,
-            note=f"all {len(x)} {unit} are equal: the interval has no width",
-            method=f"t on {unit}",
-        )
-    low, high = (float(bound) * scale for bound in t_bounds(x))
+        return Interval(centre, reason=NO_SPREAD.format(len(x), unit))
+    half = float(scipy.special.stdtrit(len(x) - 1, 1 - TAIL) * np.std(x, ddof=1)) / len(x) ** 0.5
+    low, high = centre - half * scale, centre + half * scale
     if not np.isfinite([low, high]).all():
         return Interval(centre, reason=TOO_LARGE)
     return Interval(centre, low, high, method=f"t on {unit}")
-
-
-def t_bounds(means: F64) -> tuple[F64, F64]:
-    """Return the t bounds ``(...,)`` of the mean over the last axis of ``(..., G)`` independent
-    values.
-    """
-    n = means.shape[-1]
-    centre = means.mean(axis=-1)
-    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * means.std(axis=-1, ddof=1) / np.sqrt(n)
-    return np.asarray(centre - half), np.asarray(centre + half)
-
-
-def logit_t_bounds(means: F64) -> tuple[F64, F64]:
-    """Return bounds ``(...,)`` of a rate from the rates ``(..., G)`` of G scenes, always within [0,
-    1].
-
-    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1
-    - p) (delta method; the logit interval of survey statistics, with scenes as sampling units).
-    Where the scenes do not differ there is no spread to go by: the bounds are then the
-    Clopper-Pearson ones of p G events in G trials, one trial per scene, as if the seeds of a scene
-    were copies.
-    """
-    n = means.shape[-1]
-    p = means.mean(axis=-1)
-    error = means.std(axis=-1, ddof=1) / np.sqrt(n)
-    flat = are_alike(means)
-    inside = np.where(flat | (p <= 0.0) | (p >= 1.0), 0.5, p)
-    logit = np.log(inside / (1 - inside))
-    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error / (inside * (1 - inside))
-    low, high = _expit(logit - half), _expit(logit + half)
-    if np.any(flat):
-        exact_low, exact_high = _clopper_pearson(p * n, n)
-        low, high = np.where(flat, exact_low, low), np.where(flat, exact_high, high)
-    return np.asarray(low), np.asarray(high)
 
 
 def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
@@ -185,45 +149,32 @@ def n_clusters(clusters: I64) -> int:
     return int(np.count_nonzero(np.bincount(clusters)))
 
 
-def clustered(
-    values: npt.ArrayLike, clusters: Sequence[str] | I64, is_rate: bool = False
-) -> Interval:
-    """Return the interval with scenes as clusters: t on the scene means, for rates on the logit
-    scale (`logit_t_bounds`).
-
-    Its centre is the mean of the scene means, which is the mean of the values where every scene has
-    as many.
-
-    Args:
-        values: ``(N,)``.
-        clusters: Scene of each value.
-        is_rate: Values are 0 or 1, or averages of such.
-    """
-    means, _ = cluster_means(values, clusters)
-    return rate_interval(means) if is_rate else t_interval(means, "scenes")
-
-
 def rate_interval(means: F64) -> Interval:
-    """Return the interval of a rate from the rate of each scene ``(G,)``; see `logit_t_bounds`.
+    """Return the interval of a rate from the rate of each scene ``(G,)``, always within [0, 1].
+
+    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1
+    - p) (delta method; the logit interval of survey statistics, with scenes as sampling units).
+    Below `FEW_SCENES` scenes, and where scenes are equal, so that no spread is known, the bounds
+    are those of Clopper and Pearson: p G events in G trials, as if the seeds of a scene were copies.
 
     Raises:
         EvaluatorError: A value outside [0, 1].
     """
-    n, centre = len(means), float(np.mean(means))
+    n, p = len(means), float(np.mean(means))
     if means.min() < 0.0 or means.max() > 1.0:
         raise EvaluatorError(
             f"{n} scene means: values from {means.min():g} to {means.max():g}",
             "give rates as fractions in [0, 1]",
         )
     if n < 2:
-        return Interval(centre, reason=f"needs at least two scenes, found {n}")
-    low, high = logit_t_bounds(means)
-    if are_alike(means):
-        note = f"{centre * n:g} of {n} scenes: exact bounds, as equal scenes have no spread"
-        return Interval(
-            centre, float(low), float(high), note=note, method="exact, scenes as trials"
-        )
-    return Interval(centre, float(low), float(high), method="t on scenes, logit scale")
+        return Interval(p, reason=f"needs at least two scenes, found {n}")
+    if n < FEW_SCENES or are_alike(means):
+        note = f"{p * n:.4g} of {n} scenes: exact bounds, with scenes as trials"
+        return Interval(p, *exact_rate(p * n, n), note=note, method="exact, scenes as trials")
+    error = float(np.std(means, ddof=1)) / n**0.5 / (p * (1 - p))
+    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error
+    low, high = scipy.special.expit(scipy.special.logit(p) + np.array([-half, half]))
+    return Interval(p, float(low), float(high), method="t on scenes, logit scale")
 
 
 def exact_rate(k: float, n: int) -> tuple[float, float]:
@@ -233,8 +184,8 @@ def exact_rate(k: float, n: int) -> tuple[float, float]:
         >>> [round(b, 4) for b in exact_rate(0, 10)]
         [0.0, 0.3085]
     """
-    low, high = _clopper_pearson(np.array(float(k)), n)
-    return float(low), float(high)
+    low = float(scipy.special.betaincinv(k, n - k + 1, TAIL)) if k > 0 else 0.0
+    return low, float(scipy.special.betaincinv(k + 1, n - k, 1 - TAIL)) if k < n else 1.0
 
 
 def wilson_rate(k: int, n: int) -> tuple[float, float]:
@@ -266,18 +217,33 @@ def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float
     return float(np.var(means, ddof=1) / len(means) / (np.var(x, ddof=1) / len(x)))
 
 
-def _clopper_pearson(k: F64, n: int) -> tuple[F64, F64]:
-    low = np.where(
-        k <= 0, 0.0, scipy.special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL)
-    )  # quantiles of beta distributions
-    high = np.where(
-        k >= n, 1.0, scipy.special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL)
-    )
-    return np.asarray(low), np.asarray(high)
+def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
+    """Return Tango's score bounds of a difference of rates from ``n`` pairs, of which some gained
+    and some lost the event.
 
+    Source: Tango, Equivalence test and confidence interval for the difference in proportions for
+        the paired-sample design, Statistics in Medicine 17, 1998.
 
-def _expit(x: F64) -> F64:
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))
+    Example:
+        >>> [round(b, 3) for b in paired_rate(1, 0, 3)]
+        [-0.33, 0.792]
+    """
+
+    def score(difference: float) -> float:
+        b = (2 * n - gained + lost) * difference - gained - lost
+        c = -lost * difference * (1 - difference)
+        # The share of pairs that lose it where the likelihood is greatest, given the difference.
+        share = (math.sqrt(b * b - 8 * n * c) - b) / (4 * n)
+        variance = n * (2 * share + difference * (1 - difference))
+        return (gained - lost - n * difference) / math.sqrt(max(variance, 1e-12))
+
+    seen = (gained - lost) / n
+    low, high = -1.0, 1.0
+    if score(-1 + 1e-9) > Z95:
+        low = scipy.optimize.brentq(lambda d: score(d) - Z95, -1 + 1e-9, seen)
+    if score(1 - 1e-9) < -Z95:
+        high = scipy.optimize.brentq(lambda d: score(d) + Z95, seen, 1 - 1e-9)
+    return float(low), float(high)
 
 
 DRAWS = 2000
@@ -314,10 +280,9 @@ def cluster_bootstrap(
     if len(means) < 2:
         return Interval(centre, reason=f"needs at least two scenes, found {len(means)}")
     places = drawn(len(means))
+    if are_alike(means):
+        return Interval(centre, reason=NO_SPREAD.format(len(means), "scenes"))
     low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL]) * scale
-    note = (
-        f"all {len(means)} scenes are equal: the interval has no width" if are_alike(means) else ""
-    )
     return Interval(
-        centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws"
+        centre, float(low), float(high), method=f"cluster bootstrap, {len(places)} draws"
     )

@@ -7,6 +7,7 @@ the scene is the unit of interval and test.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -24,26 +25,32 @@ from alpasim_plugin.log.run_folder.sides import (
     metric_names,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.statistics.bounded import mean_bounds
+from evaluators.statistics.bounded import mean_bounds, upper_bound
 from evaluators.statistics.intervals import (
+    FEW_SCENES,
+    ROUNDING,
     TOO_LARGE,
     Interval,
     are_alike,
     cluster_means,
-    logit_t_bounds,
+    mean_of,
     n_clusters,
+    paired_rate,
+    rate_interval,
     scaled,
     t_interval,
     within,
 )
 from evaluators.statistics.variants import Variant, axis_bases, variants_in
 from evaluators.statistics.verdicts import (
+    BEYOND,
     LEAST_SCENES,
     REACH,
     difference,
     harm,
     more_scenes,
-    p_value,
+    scenes_without_event,
+    sign_flip,
     sign_test,
     verdict,
 )
@@ -51,11 +58,6 @@ from evaluators.statistics.verdicts import (
 Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
 
 LISTED = 50  # missing cells named per metric; the count is always whole
-UNDONE_BY = {
-    "non-inferior": "worse",
-    "better": "worse",
-    "worse": "better",
-}  # what is seen -> what scenes that were not drawn may be
 NO_PAIR = "no scene-seed cell has this metric on both sides"
 
 
@@ -196,7 +198,6 @@ def compare(
     baseline: str,
     margin: float | None = None,
     listed: int = LISTED,
-    sampled: bool = True,
 ) -> dict[str, Any]:
     """Compare one metric of two renderers on their shared cells.
 
@@ -206,8 +207,6 @@ def compare(
         baseline: What to call ``base``.
         margin: How much worse is accepted, in the metric's unit; None: its own margin.
         listed: How many missing cells to name.
-        sampled: Scenes are draws from a population. False: they are all that is asked about, and no
-            unseen one needs a guard.
 
     Returns:
         ``baseline``; ``diff`` (``side`` minus ``base``: mean over scenes of the scene's mean difference);
@@ -251,6 +250,8 @@ def compare(
     if not np.isfinite(delta).all():
         return entry | {"reason": TOO_LARGE}
     means, _ = cluster_means(delta, pairs.scenes)
+    sizes, _ = cluster_means(np.abs(pairs.mine) + np.abs(pairs.base), pairs.scenes)
+    means[np.abs(means) <= ROUNDING * sizes] = 0.0
     n = len(means)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {
@@ -267,55 +268,73 @@ def compare(
             "only_baseline": lost,
             "p_value": sign_test(gained, lost),
         }
-    interval, guarded = difference_bounds(delta, pairs.scenes, metric, margin)
-    interval = within(interval, *metric.difference_range)
-    bounds = interval.bounds
-    entry |= {"diff": interval.centre, "ci95": bounds, "method": interval.method or None}
-    if interval.reason:
-        return entry | {"reason": interval.reason}
+    entry["diff"] = mean_of(means)
+    if n < 2:
+        return entry | {"reason": f"needs at least two scenes, found {n}"}
+    p, test = sign_flip(means)
     small, scale = scaled(means)
-    p, test = p_value(means, metric.is_flag)
     spread = scale * float(np.std(small, ddof=1))
-    entry |= {"guarded": guarded, "spread": spread, "p_value": p, "test": test}
-    both = _both(bounds, guarded) if sampled else bounds
-    # A flag's sign test needs no bound of what was not drawn.
-    shown = bounds if metric.is_flag else both
-    answers = {
-        "verdict": verdict(both, p, margin, metric.direction),
-        "difference": difference(shown, p, metric.direction),
-    }
+    shown = difference(entry["diff"], p, metric.direction)
+    entry |= {"spread": spread, "p_value": p, "test": test, "difference": shown}
+    interval, guarded = difference_bounds(delta, means, pairs.scenes, metric, margin)
+    bounds = within(interval, *metric.difference_range).bounds
+    entry |= {"ci95": bounds, "method": interval.method or None, "guarded": guarded}
+    if bounds is None:
+        return entry | {"reason": interval.reason}
+    reach = reach_of(metric, margin)
+    is_cut = reach > 0.0 and not math.isfinite(max(metric.difference_range))
     notes = [interval.note] if interval.note else []
+    both = _both(bounds, guarded)
+    if is_cut:
+        entry["beyond"] = _beyond(pairs, metric, reach)
     if n < LEAST_SCENES:
         notes.append(f"{n} scenes: a verdict needs at least {LEAST_SCENES}")
-    elif guarded is None and sampled:
+    elif guarded is None:
         notes.append(
             "nothing says how much a scene can differ, so that nothing is decided without a margin"
         )
     else:
-        entry |= answers
-    if guarded is not None:
-        unguarded = {
-            "verdict": verdict(bounds, p, margin, metric.direction),
-            "difference": difference(bounds, p, metric.direction),
-        }
-        unseen = {UNDONE_BY[unguarded[key]] for key in answers if unguarded[key] != answers[key]}
-        if unseen:
-            others = f"a few others are {' or '.join(sorted(unseen))}"
-            reach = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
-            notes.append(f"{n} scenes cannot exclude that {others} by up to {reach}")
+        entry["verdict"] = verdict(both, p, margin, metric.direction)
+        seen = verdict(bounds, p, margin, metric.direction)
+        if seen != entry["verdict"]:
+            turned = "worse" if seen == "non-inferior" else "better"
+            by = f"{reach:g} {metric.unit}".rstrip()
+            notes.append(f"{n} scenes cannot exclude that a few others are {turned} by up to {by}")
+        if entry["verdict"] == "non-inferior" and is_cut and entry["beyond"]["at_most"] >= BEYOND:
+            entry["verdict"] = "undecided"
+            rare = f"{entry['beyond']['event']} in more than {BEYOND:.0%} of others"
+            notes.append(f"{n} scenes cannot exclude {rare}")
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
-        worse = abs(interval.centre)
+        worse = abs(entry["diff"])
         if metric.direction != "none":
-            worse, _ = harm([interval.centre] * 2, metric.direction)
-        most = reach_of(metric, margin) or None
-        entry["more_scenes"] = more_scenes(worse, spread, n, margin, most)
+            worse, _ = harm([entry["diff"]] * 2, metric.direction)
+        entry["more_scenes"] = more_scenes(worse, spread, n, margin, reach or None, is_cut)
     return entry
 
 
+def _beyond(pairs: Pairs, metric: MetricInfo, reach: float) -> dict[str, Any]:
+    """Return the companion of a distance: how much more often something happens that it does not
+    count, by the metric's event where a preset has it, else by differences beyond ``reach``.
+
+    Returns:
+        ``event`` in words, ``diff`` (share of scenes, positive is worse), ``at_most`` (its upper
+        guarded bound).
+    """
+    change, scenes = pairs.of_event(metric.event)
+    what = metric.event
+    if not len(change):
+        what, scenes = f"more than {reach:g} {metric.unit}".rstrip(), pairs.scenes
+        far = pairs.mine - pairs.base
+        worse = {"none": np.abs(far), "lower": far, "higher": -far}[metric.direction]
+        change = np.where(worse > reach, 1.0, 0.0) - np.where(worse < -reach, 1.0, 0.0)
+    means, _ = cluster_means(change, scenes)
+    return {"event": what, "diff": mean_of(means), "at_most": upper_bound(means, 1.0)}
+
+
 def difference_bounds(
-    delta: F64, scenes: I64, metric: MetricInfo, margin: float
+    delta: F64, means: F64, scenes: I64, metric: MetricInfo, margin: float
 ) -> tuple[Interval, list[float] | None]:
     """Return the interval of a mean difference, and the guarded bounds that a verdict must hold for
     too; None where there are none.
@@ -326,23 +345,17 @@ def difference_bounds(
 
     Args:
         delta: ``(N,)`` differences per cell.
+        means: ``(G,)`` their means per scene, at least two.
         scenes: Scene of each cell.
         metric: What it is.
         margin: How much worse is accepted.
     """
-    means, _ = cluster_means(delta, scenes)
     n, reach = len(means), reach_of(metric, margin)
-    if n < 2:
-        return Interval(float(np.mean(means)), reason=f"needs at least two scenes, found {n}"), None
     guarded = list(mean_bounds(means, -reach, reach)) if reach else None
     if metric.is_flag:
         return flag_interval(delta, scenes), guarded
     plain = t_interval(means, "scenes")
-    if (
-        guarded is None
-        or plain.bounds is None
-        or not (are_alike(means) or np.isfinite(metric.difference_range).all())
-    ):
+    if guarded is None or not (are_alike(means) or np.isfinite(metric.difference_range).all()):
         return plain, guarded
     note = (
         f"all {n} scenes are equal, so that they have no spread to go by"
@@ -362,44 +375,48 @@ def _both(bounds: list[float] | None, guarded: list[float] | None) -> list[float
 
 def flag_interval(delta: F64, scenes: I64) -> Interval:
     """Return the interval of a difference of rates from ``(N,)`` differences per cell, in [-1, 1],
-    and their scenes; see `flag_bounds`.
+    and their scenes; never without width.
+
+    The rates of cells that gained and that lost the event get their own intervals
+    (`rate_interval`), which are joined by the method of variance estimates recovery (Zou and
+    Donner, Statistics in Medicine 27, 2008). Below `FEW_SCENES` scenes it is Tango's interval, with
+    scenes as pairs.
     """
     gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
     lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
-    low, high = (float(b) for b in flag_bounds(gained, lost))
+    n, up, down = len(gained), float(np.mean(gained)), float(np.mean(lost))
     changed = int(np.sum((gained > 0) | (lost > 0)))
-    note = f"{changed} of {len(gained)} scenes changed" if changed < LEAST_SCENES else ""
-    return Interval(
-        float(np.mean(gained - lost)), low, high, note=note, method="gained and lost rates joined"
+    note = f"{changed} of {n} scenes changed" if changed < LEAST_SCENES else ""
+    if n < FEW_SCENES:
+        bounds = paired_rate(n * up, n * down, n)
+        return Interval(up - down, *bounds, note=note, method="Tango, scenes as pairs")
+    (up_low, up_high), (down_low, down_high) = (
+        rate_interval(rates).bounds or (0.0, 1.0) for rates in (gained, lost)
     )
-
-
-def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
-    """Return bounds ``(...,)`` of a difference of rates; never without width.
-
-    The rates of cells that gained and that lost the event get their own intervals
-    (`logit_t_bounds`), which are joined by the method of variance estimates recovery (Zou and
-    Donner, Statistics in Medicine 27, 2008).
-
-    Args:
-        gained: ``(..., G)`` share of a scene's cells in which only the renderer has the event.
-        lost: ``(..., G)`` share in which only the baseline has it.
-    """
-    up, down = gained.mean(axis=-1), lost.mean(axis=-1)
-    (up_low, up_high), (down_low, down_high) = logit_t_bounds(gained), logit_t_bounds(lost)
-    low = np.maximum(up - down - np.hypot(up - up_low, down_high - down), -1.0)
-    high = np.minimum(up - down + np.hypot(up_high - up, down - down_low), 1.0)
-    return np.asarray(low), np.asarray(high)
+    low = max(up - down - math.hypot(up - up_low, down_high - down), -1.0)
+    high = min(up - down + math.hypot(up_high - up, down - down_low), 1.0)
+    return Interval(up - down, low, high, note=note, method="gained and lost rates joined")
 
 
 def reach_of(metric: MetricInfo, margin: float) -> float:
     """Return how much worse a scene can be, in the metric's unit; 0 where nothing says so.
 
-    Where differences have no bounds it is `REACH` times the metric's own margin, or the given one
-    where it has none.
+    Where differences have no bounds it is the metric's cap, else `REACH` times its own margin, or
+    the given one where it has none.
     """
     most = max(metric.difference_range)
-    return float(most) if np.isfinite(most) else REACH * (metric.accepted or margin)
+    if math.isfinite(most):
+        return float(most)
+    return REACH * (metric.accepted or margin) if metric.cap is None else metric.cap
+
+
+def least_scenes(metric: MetricInfo, margin: float) -> int | None:
+    """Return how many scenes without any difference `non-inferior` takes; None where none do."""
+    reach = reach_of(metric, margin)
+    needed = scenes_without_event(margin, reach) if reach else None
+    if needed is None or math.isfinite(max(metric.difference_range)):
+        return needed
+    return max(needed, scenes_without_event(BEYOND) or 0)
 
 
 class Pairs:
@@ -414,10 +431,18 @@ class Pairs:
         self.mine = own_values[both]
         self.base = partner[both]
         self.scenes = side.scene[both]
+        self._index = index
         self._sides = {"here": (side, own_values), "baseline": (base, base_values)}
         only_base = np.flatnonzero(base.place_in(side) < 0)
         self._lone = ((side, np.flatnonzero(~both)), (base, only_base))
         self.n_missing = int(np.sum(~both)) + len(only_base)
+
+    def of_event(self, event: str) -> tuple[F64, I64]:
+        """Return the change of a flag on the cells where both sides have it, and their scenes."""
+        (side, _), (base, _) = self._sides.values()
+        change = side.values(event) - np.append(base.values(event), np.nan)[self._index]
+        known = np.isfinite(change)
+        return change[known], side.scene[known]
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
         """Name the first cells without a pair, with side and cause."""

@@ -17,6 +17,8 @@ from evaluators.report.numbers import (
     scale_and_unit,
     short,
 )
+from evaluators.statistics.intervals import FEW_SCENES
+from evaluators.statistics.verdicts import LEAST_SCENES
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 NAMED = 3  # scenes and cells in a sentence
@@ -38,6 +40,10 @@ def difference_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
     places = 1 if metric.in_percent else decimals(*values)
     numbers = [fixed(value, places, sign=True) for value in values]
     text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
+    n, p = int(entry.get("n_scenes") or 0), finite(entry.get("p_value"))
+    if p is not None and 1 < n < FEW_SCENES:
+        can = "" if n >= LEAST_SCENES else f", {plural(n, 'scene')} cannot decide"
+        text = f"exact test p = {short(p)}{can}; {text}"
     if bounds:
         text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
     needed, margin = more_scenes_text(entry.get("more_scenes")), finite(entry.get("margin"))
@@ -47,12 +53,12 @@ def difference_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
 
 
 def more_scenes_text(more: Any) -> str:
-    """Say how many more scenes would decide an undecided verdict; empty where that is unknown."""
+    """Say how many more scenes an undecided verdict needs; empty where that is unknown."""
     if not isinstance(more, int) or more <= 0:
         return ""
     if more > MANY_SCENES:
         return f"more than {MANY_SCENES} more scenes would decide"
-    return f"about {plural(more, 'more scene')} would decide"
+    return f"at least {plural(more, 'more scene')} would decide"
 
 
 def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:

@@ -24,17 +24,18 @@ from alpasim_plugin.log.run_folder.sides import (
     reason_of,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.statistics.bounded import mean_interval
 from evaluators.statistics.intervals import (
     cluster_bootstrap,
-    clustered,
+    cluster_means,
     design_effect,
     exact_rate,
     mean_of,
     n_clusters,
     normal_half_width,
+    rate_interval,
     redraws,
     wilson_rate,
-    within,
 )
 from evaluators.statistics.paired import Table, compare_pairs, pairs_within
 
@@ -107,7 +108,7 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
     entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why
-    interval = within(clustered(values, scenes, metric.is_flag), *metric.value_range)
+    interval = mean_interval(cluster_means(values, scenes)[0], metric)
     entry["ci95_clustered"], entry["ci95_clustered_method"] = (
         interval.bounds,
         interval.method or None,
@@ -229,8 +230,9 @@ def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> dict[s
             out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(
                 values, cut, scored, is_share
             )
+            scenes = side.scene[side.cell]
             ends = [
-                clustered(np.where(np.isfinite(values), values, fill), side.scene[side.cell], True)
+                rate_interval(cluster_means(np.nan_to_num(values, nan=fill), scenes)[0])
                 for fill in (0.0, 1.0)
             ]
             out["bounds_rollouts_ci95"][name] = [ends[0].low, ends[1].high]

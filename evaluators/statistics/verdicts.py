@@ -8,14 +8,17 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Direction
 from evaluators.statistics.bounded import scenes_to_exclude
-from evaluators.statistics.intervals import TAIL, are_alike, scaled
+from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
 
 Cause = Literal[
     "pass", "regression", "incomplete", "policy", "undecided", "infrastructure", "evaluator"
@@ -116,9 +119,11 @@ Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
 LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
-# margins: a scene's difference in a quantity without bounds counts up to so much; beyond, it is an
-# event's matter
+# margins: a scene's difference in a quantity without bounds or a cap of its own counts up to so much
 REACH = 40.0
+BEYOND = 0.01  # share of scenes that may differ by more than what counts of a scene
+FLIPS = 9_999  # drawn where not all of them are counted
+FLIPPED = 10_000_000  # signs that are drawn at most
 
 
 def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
@@ -157,19 +162,13 @@ def verdict(
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
 
 
-def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:
-    """Return whether a difference is shown, independent of the margin: the interval excludes 0 and
-    the test rejects.
+def difference(diff: float, p: float, direction: Direction) -> Difference:
+    """Return whether a difference is shown on the scenes driven: the test rejects, whatever the
+    margin and whatever other scenes may do.
     """
-    if (
-        bounds is None
-        or direction == "none"
-        or p is None
-        or p >= ALPHA
-        or bounds[0] <= 0.0 <= bounds[1]
-    ):
+    if direction == "none" or p >= ALPHA:
         return "none shown"
-    return "worse" if harm(bounds, direction)[0] > 0.0 else "better"
+    return "worse" if (diff > 0.0) == (direction == "lower") else "better"
 
 
 def sign_test(up: int, down: int) -> float:
@@ -186,19 +185,42 @@ def sign_test(up: int, down: int) -> float:
     return min(1.0, 2.0 * float(scipy.special.bdtr(min(up, down), up + down, 0.5)))
 
 
-def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
-    """Test that scene differences ``(G,)`` centre on zero.
+def sign_flip(means: F64) -> tuple[float, str]:
+    """Return the two-sided p of scene differences ``(G,)`` under flips of their signs, and the name
+    of the test.
 
-    Flags, and differences that are all alike (where t has no spread to go by), take the exact
-    two-sided sign test on the scenes that changed; other metrics the paired t test.
+    Two variants that are alike give each difference either sign with the same chance, whatever
+    their tails; so p is the share of all choices of signs whose sum is as far from 0 as the one
+    seen. Where more than `FLIPS` exist, so many are drawn, and the one seen counts among them.
+
+    Source: Fisher, The Design of Experiments, 1935; Phipson and Smyth, Permutation p-values should
+        never be zero, Statistical Applications in Genetics and Molecular Biology 9, 2010.
+
+    Example:
+        >>> sign_flip(np.array([0.2, 0.1, 0.3, 0.2, 0.0, 0.1, 0.2]))
+        (0.03125, 'exact sign-flip test on scenes')
     """
-    means, _ = scaled(means)
-    if is_flag or are_alike(means):
-        return sign_test(
-            int(np.sum(means > 0)), int(np.sum(means < 0))
-        ), "exact sign test on scenes"
-    t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
-    return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
+    changed = scaled(means[means != 0.0])[0]
+    n = len(changed)
+    if 2**n <= FLIPS:
+        is_flipped = np.arange(2**n)[:, None] >> np.arange(n) & 1
+        first, words = 0, "exact sign-flip test on scenes"
+    else:
+        is_flipped = _drawn_flips(n)
+        first, words = 1, f"sign-flip test on scenes, {len(is_flipped):,} draws"
+    total = float(np.sum(changed))
+    blocks = np.array_split(is_flipped, 10)
+    sums = np.concatenate([total - 2.0 * (block @ changed) for block in blocks])
+    far = abs(total) - ROUNDING * float(np.sum(np.abs(changed)))
+    beyond = first + int(np.count_nonzero(np.abs(sums) >= far))
+    return beyond / (first + len(sums)), words
+
+
+@lru_cache(maxsize=1)
+def _drawn_flips(scenes: int) -> npt.NDArray[np.int8]:
+    """Return drawn flips ``(draws, scenes)``, 0 or 1; the same ones for every metric."""
+    draws = min(FLIPS, max(FLIPS // 10, FLIPPED // scenes))
+    return stream("", 0, "paired/sign-flip").integers(0, 2, (draws, scenes), np.int8)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -298,17 +320,18 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
 
 
 def more_scenes(
-    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None
+    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None, is_cut: bool
 ) -> int | None:
-    """Return about how many more scenes would decide an undecided verdict with 80 % probability, if
-    what was seen is true.
+    """Return how many more scenes would decide an undecided verdict at the least: with 80 %
+    probability if what was seen is true, and no other scene is far worse.
 
     Args:
         harm: The difference seen, positive is worse.
         spread: Standard deviation of the difference between scenes.
         n_scenes: Scenes so far.
         margin: As for the verdict.
-        reach: The most that a scene can be worse; None where nothing is known of it.
+        reach: The most that counts of a scene; None where nothing is known of it.
+        is_cut: Scenes may differ by more.
 
     Returns:
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
@@ -319,7 +342,8 @@ def more_scenes(
         unseen = scenes_without_event(
             abs(margin - harm), reach - harm if harm < margin else reach + harm
         )
-        needed = None if unseen is None else max(needed, unseen)
+        beyond = scenes_without_event(BEYOND) if is_cut and harm < margin else 0
+        needed = None if unseen is None or beyond is None else max(needed, unseen, beyond)
     return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 
 

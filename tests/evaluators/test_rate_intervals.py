@@ -15,11 +15,13 @@ from alpasim_plugin.core.seeding import stream
 from evaluators import aggregate
 from evaluators.statistics.intervals import (
     cluster_bootstrap,
-    clustered,
+    cluster_means,
     design_effect,
     exact_rate,
+    paired_rate,
     rate_interval,
     redraws,
+    t_interval,
     wilson_rate,
 )
 from tests.evaluators.test_tables_over_rollouts import rows_of
@@ -51,9 +53,9 @@ def test_counting_non_events_instead_of_events_mirrors_the_bounds(means):
 
 
 def test_the_bounds_are_t_on_the_logit_scale():
-    means = np.array([0.0, 0.2, 0.6, 0.0, 0.4])
+    means = np.tile([0.0, 0.2, 0.6, 0.0, 0.4], 3)
     p, error = means.mean(), stats.sem(means)
-    centre, half = np.log(p / (1 - p)), stats.t.ppf(0.975, 4) * error / (p * (1 - p))
+    centre, half = np.log(p / (1 - p)), stats.t.ppf(0.975, 14) * error / (p * (1 - p))
     one = rate_interval(means)
     assert (one.low, one.high) == pytest.approx(
         tuple(1 / (1 + np.exp(-(centre + s * half))) for s in (-1, 1))
@@ -72,11 +74,37 @@ def test_scenes_that_all_have_the_same_share_are_as_many_trials_as_scenes():
     one = rate_interval(np.full(10, 0.2))
     want = stats.binomtest(2, 10).proportion_ci(0.95, "exact")
     assert (one.low, one.high) == pytest.approx((want.low, want.high))
-    assert one.note == "2 of 10 scenes: exact bounds, as equal scenes have no spread"
+    assert one.note == "2 of 10 scenes: exact bounds, with scenes as trials"
+
+
+def test_below_ten_scenes_a_rate_has_the_bounds_of_clopper_and_pearson_and_a_pair_those_of_tango():
+    one = rate_interval(np.array([1.0, 0.0, 0.0]))
+    assert (one.low, one.high) == pytest.approx((0.00840, 0.90570), abs=1e-5)
+    for gained, lost, n in ((1, 0, 3), (2, 1, 7), (0, 0, 5), (9, 0, 9), (0.4, 1.2, 6)):
+        low, high = paired_rate(gained, lost, n)
+        shares = np.linspace(0, 1, 200_001)
+        for bound, side in ((low, 1), (high, -1)):
+            if abs(bound) == 1.0:
+                continue
+            # The share of pairs that lose the event where the likelihood is greatest, given the
+            # difference: searched, not solved for.
+            lose = shares[(shares + bound >= 0) & (2 * shares + bound <= 1)]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                likelihood = (
+                    np.where(gained > 0, gained * np.log(lose + bound), 0.0)
+                    + np.where(lost > 0, lost * np.log(lose), 0.0)
+                    + (n - gained - lost) * np.log(1 - 2 * lose - bound)
+                )
+            share = lose[np.nanargmax(likelihood)]
+            variance = n * (2 * share + bound * (1 - bound))
+            assert (gained - lost - n * bound) / variance**0.5 == pytest.approx(
+                side * 1.96, abs=0.02
+            )
+    assert paired_rate(2, 1, 7) == pytest.approx([-b for b in paired_rate(1, 2, 7)[::-1]])
 
 
 def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
-    one = clustered([0.0, 1.0, 1.0], ["a"] * 3, is_rate=True)
+    one = rate_interval(np.array([2 / 3]))
     assert (one.bounds, one.reason) == (None, "needs at least two scenes, found 1")
     drawn = cluster_bootstrap([0.0, 1.0, 1.0], ["a"] * 3, by_key("x"))
     assert (drawn.bounds, drawn.reason) == (None, "needs at least two scenes, found 1")
@@ -84,7 +112,7 @@ def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
 
 def test_unequal_seeds_do_not_let_one_scene_outweigh_the_others():
     values, scenes = [1.0] * 50 + [0.0] * 4, ["busy"] * 50 + ["a", "b", "c", "d"]
-    one = clustered(values, scenes, is_rate=True)
+    one = rate_interval(cluster_means(values, scenes)[0])
     assert one.centre == pytest.approx(0.2)
     assert one.high > 0.5
 
@@ -119,7 +147,7 @@ def test_the_bootstrap_follows_its_generator_and_nears_t_where_scenes_are_many()
     one = cluster_bootstrap(values, scenes, by_key("x"))
     assert one == cluster_bootstrap(values, scenes, by_key("x"))
     assert one != cluster_bootstrap(values, scenes, by_key("y"))
-    t = clustered(values, scenes)
+    t = t_interval(cluster_means(values, scenes)[0])
     assert (one.low, one.high) == pytest.approx((t.low, t.high), abs=0.02)
 
 

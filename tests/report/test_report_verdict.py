@@ -125,7 +125,9 @@ def test_what_a_fixer_does_to_its_own_base_is_said_and_told_apart(usual_run: Pat
     }
     own = {"onefixer": {"offroad": pair(-0.2, -0.3, -0.1, "better") | {"baseline": "3dgs"}}}
     finding = find(with_summary(usual_run, metrics=metrics, paired=pairs, paired_with_base=own))
-    assert finding.title.endswith("onefixer drives better than 3dgs in off-road rollouts")
+    assert finding.title.endswith(
+        "onefixer drives better than 3dgs in off-road rollouts on these scenes"
+    )
     assert [finding.name_of(point) for point in finding.points][1:] == [
         "onefixer \u2212 clean",
         "onefixer \u2212 3dgs",
