@@ -43,7 +43,7 @@ class Address:
         """Read an address.
 
         Example:
-            >>> Address.parse("udp_multicast:239.74.163.2?map=toyota&timeout_ms=20").timeout_s
+            >>> Address.parse("udp_multicast:239.74.163.2?map=car.yaml&timeout_ms=20").timeout_s
             0.02
 
         Raises:
@@ -135,13 +135,8 @@ class Exchange:
     latencies_s: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        parts = self.codec.map.steer, self.codec.map.accel
-        if parts[0] is None or parts[1] is None:
-            raise InputError(
-                f"a map for {self.codec.map.dbc}: it has no steering or acceleration command",
-                "use a map with both",
-            )
-        self._steer, self._accel = (_Command(part) for part in parts if part is not None)
+        self._steer = _Command(self.codec.map.steer)
+        self._accel = _Command(self.codec.map.accel)
         self._began_us: int | None = None
         self._own_ids = {self.codec.message(sent.message).frame_id for sent in self.codec.map.send}
         self._by_id = {

@@ -48,31 +48,14 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Content(_Part):
-    """What a signal carries: a quantity, or what is left of it after another signal of the message
-    took its rounded part.
-    """
-
-    quantity: Quantity
-    scale: float = 1.0
-    rest_of: str | None = None
-
-
 class Sent(_Part):
     """A message from the simulation."""
 
     message: str
     period_us: Annotated[int, Field(gt=0)]
-    signals: dict[str, Quantity | Content]
+    signals: dict[str, Quantity]
     counter: str | None = None
     checksum: str | None = None  # the signal of one byte that holds it
-
-    def contents(self) -> dict[str, Content]:
-        """Give every signal's content."""
-        return {
-            name: one if isinstance(one, Content) else Content(quantity=one)
-            for name, one in self.signals.items()
-        }
 
 
 class Received(_Part):
@@ -89,22 +72,20 @@ class Received(_Part):
 
 
 class CanMap(_Part):
-    """A whole map. Without ``steer`` and ``accel`` it can send and read recorded drives, but not
-    drive.
-    """
+    """The messages that are sent, and the two commands that are received."""
 
     dbc: str
     steering_ratio: Annotated[float, Field(gt=0)]  # steering wheel angle over road-wheel angle
     send: tuple[Sent, ...]
-    steer: Received | None = None
-    accel: Received | None = None
+    steer: Received
+    accel: Received
 
 
 def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     """Read a map and return it with the path of its database.
 
     Args:
-        name: A shipped map (``example``, ``toyota``) or a YAML file.
+        name: The shipped map ``example`` or a YAML file.
         dbc: The database; by default the one that the map names, beside it.
 
     Raises:
@@ -143,12 +124,10 @@ class Codec:
 
     def encode(self, sent: Sent, quantities: Mapping[str, float]) -> tuple[int, bytes]:
         """Return identifier and data of a message, with the next counter and its checksum."""
-        values: dict[str, float] = {}
-        for name, content in sent.contents().items():
-            wanted = quantities[content.quantity] * content.scale
-            if content.rest_of is not None:
-                wanted -= values[content.rest_of]
-            values[name] = self._carried(sent.message, name, wanted)
+        values = {
+            name: self._carried(sent.message, name, quantities[quantity])
+            for name, quantity in sent.signals.items()
+        }
         return self.pack(sent.message, values, sent.counter, sent.checksum)
 
     def encode_command(self, received: Received, value: float) -> tuple[int, bytes]:
@@ -240,11 +219,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             "repair the database, or remove the message that it names",
         ) from error
     codec = Codec(can_map, loaded)
-    parts: list[Sent | Received] = [
-        *can_map.send,
-        *(one for one in (can_map.steer, can_map.accel) if one is not None),
-    ]
-    for part in parts:
+    for part in (*can_map.send, can_map.steer, can_map.accel):
         signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
         signals += [name for name in (part.counter, part.checksum) if name is not None]
         try:

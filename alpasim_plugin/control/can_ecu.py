@@ -48,16 +48,11 @@ class LaneKeeper:
             )
         except BadFrame:
             return []
-        for name, content in one.contents().items():
-            value = values[name] / content.scale
-            self._seen[content.quantity] = value + (
-                self._seen[content.quantity] if content.rest_of is not None else 0.0
-            )
+        for name, quantity in one.signals.items():
+            self._seen[quantity] = values[name]
         if frame.arbitration_id != self._trigger or "speed_kph" not in self._seen:
             return []
         steer, accel = self._codec.map.steer, self._codec.map.accel
-        assert steer is not None
-        assert accel is not None
         wheel_deg, accel_mps2 = self.command(self._seen)
         return [
             self._codec.encode_command(steer, wheel_deg),

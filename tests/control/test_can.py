@@ -1,12 +1,11 @@
-"""The CAN bus: frames against real databases and a real drive, and what happens to commands that
-are lost, late, wrong or missing.
+"""The CAN bus: frames, databases, and what happens to commands that are lost, late, wrong or
+missing.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,6 @@ from alpasim_plugin.control.can_bus import HOLD_US, STOP_MPS2, Address, Exchange
 from alpasim_plugin.control.can_codec import BadFrame, Codec, checksum_of, load_map, open_codec  # noqa: E402
 from alpasim_plugin.control.can_ecu import LaneKeeper, serve  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
-from alpasim_plugin.control.can_replay import decode, read_recording, replay  # noqa: E402
 from alpasim_plugin.core.types import Vehicle  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -79,46 +77,6 @@ def test_checksums_by_hand() -> None:
     assert checksum_of(0x3231, b"3456789\0", 7) == 0x4B
 
 
-def test_a_real_drive_decodes_to_what_its_publisher_states(shared_data: Path) -> None:
-    codec = open_codec(*load_map("toyota", str(shared_data / "opendbc" / "_toyota_2017.dbc")))
-    recording = read_recording(shared_data / "comma2k19")
-    series, counts = decode(recording, codec)
-    assert counts == {
-        "STEER_ANGLE_SENSOR": 3314,
-        "WHEEL_SPEEDS": 3313,
-        "KINEMATICS": 3314,
-        "SPEED": 1657,
-    }
-    stated = shared_data / "comma2k19" / "processed_log" / "CAN"
-    np.testing.assert_array_equal(
-        series["steering_wheel_deg"][1], np.load(stated / "steering_angle" / "value.npy").ravel()
-    )
-    wheels = (
-        np.mean([series[f"wheel_{name}_kph"][1] for name in ("fl", "fr", "rl", "rr")], axis=0) / 3.6
-    )
-    np.testing.assert_allclose(wheels, np.load(stated / "speed" / "value.npy").ravel(), atol=1e-12)
-    with pytest.raises(InputError, match="no frame of bus 7"):
-        read_recording(shared_data / "comma2k19", 7)
-
-
-def test_a_real_drive_replays_as_bus_traffic(
-    shared_data: Path, wires: tuple[can.BusABC, can.BusABC]
-) -> None:
-    codec = open_codec(*load_map("toyota", str(shared_data / "opendbc" / "_toyota_2017.dbc")))
-    whole = read_recording(shared_data / "comma2k19")
-    second = replace(whole, t_s=whole.t_s[:900], address=whole.address[:900], data=whole.data[:900])
-    waited: list[float] = []
-    count, _ = replay(second, codec, wires[0], 2.0, clock=lambda: sum(waited), sleep=waited.append)
-    assert sum(waited) == pytest.approx(
-        [t for t, _ in second.frames(codec)][-1] / 2
-    )  # twice as fast as recorded
-    heard = []
-    while (frame := wires[1].recv(0)) is not None:
-        heard.append((frame.arbitration_id, bytes(frame.data)))
-    assert heard == [(frame.arbitration_id, bytes(frame.data)) for _, frame in second.frames(codec)]
-    assert len(heard) == count > 500
-
-
 def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> None:
     message = codec.message("EGO_MOTION")
     step = float(message.get_signal_by_name("SPEED").scale)
@@ -131,19 +89,17 @@ def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> No
 
 def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "opendbc"
-    with pytest.raises(InputError, match="KINEMATICS"):
-        open_codec(*load_map("toyota", str(folder / "comma_body.dbc")))
-    with pytest.raises(
-        InputError, match=r"1073808953|40140639|frame id"
-    ):  # a pseudo message with an impossible identifier
-        open_codec(*load_map("toyota", str(folder / "toyota_2017_ref_pt.dbc")))
+    # The second has a pseudo message with an impossible identifier.
+    for name in ("comma_body.dbc", "toyota_2017_ref_pt.dbc"):
+        with pytest.raises(InputError):
+            open_codec(*load_map("example", str(folder / name)))
     (tmp_path / "no.dbc").write_text("not a database")
-    with pytest.raises(InputError, match="repair the database"):
+    with pytest.raises(InputError):
         open_codec(*load_map("example", str(tmp_path / "no.dbc")))
-    with pytest.raises(InputError, match="known: example, toyota"):
+    with pytest.raises(InputError, match="example"):
         load_map("volvo")
-    with pytest.raises(InputError, match="dbc=FILE"):
-        load_map("toyota")
+    with pytest.raises(InputError):
+        load_map("example", str(tmp_path / "absent.dbc"))
 
 
 @pytest.mark.parametrize(
