@@ -11,14 +11,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import shapely
 
-from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw, rectangle_corners
-from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.limits import STEP, TIME_STEP_S
 from alpasim_plugin.core.types import (
     F64,
@@ -32,7 +29,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import number, point, read_lanelets
-from scenarios.map_lines import lane_edges, merge_areas, predecessors
+from scenarios.map_lines import lane_edges
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
 LABELS = {
@@ -217,10 +214,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     Args:
         path: The XML file.
         ego: Id of the recorded vehicle that becomes the ego; None picks the car with the longest
-            drive among those that are present all the time, keep inside one lane (if none does:
-            stay on the lanelets) and touch nobody; ties go to the smaller id. Lanes and gaps are
-            tested with a footprint at least as large as the default vehicle's, because the
-            evaluators score with that one.
+            drive among those that are present all the time; ties go to the smaller id.
 
     Raises:
         InputError: The file is missing, malformed or no CommonRoad scenario; no vehicle can be the
@@ -250,7 +244,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     for obstacle in obstacles:
         files.near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(files, file, root, origin)
-    chosen, why = _choose_ego(files, file, obstacles, lane_map, ego)
+    chosen, why = _choose_ego(files, file, obstacles, ego)
     scale = (
         chosen.box.length_m / DEFAULT.box.length_m
     )  # the file has sizes and no axles: the default chassis in proportion
@@ -336,7 +330,6 @@ def _choose_ego(
     files: SourceFiles,
     path: Path,
     obstacles: tuple[Obstacle, ...],
-    lane_map: LaneMap,
     ego: str | None,
 ) -> tuple[Obstacle, str]:
     moving = {o.obstacle_id: o for o in obstacles if not o.static}
@@ -356,71 +349,22 @@ def _choose_ego(
         and (o.steps[0], o.steps[-1], len(o.steps)) == (first, last, last - first + 1)
     ]
     always.sort(key=lambda o: (-_driven_m(o), len(o.obstacle_id), o.obstacle_id))
-    surface = merge_areas([lane_polygon(lane) for lane in lane_map.lanes.values()])
-    corridors = _corridors(lane_map)
-    best, manner = None, "stay on the lanelets and touch nobody (none keeps inside one lane)"
-    for candidate in always:
-        footprints = _rectangles(candidate, least=DEFAULT.box)
-        if not shapely.covers(surface, footprints).all() or _touches(
-            candidate, footprints, obstacles
-        ):
-            continue
-        best = best or candidate
-        if shapely.covers(corridors[:, None], footprints[None, :]).any(axis=0).all():
-            best, manner = candidate, "keep inside one lane and touch nobody"
-            break
-    if best is not None:
-        drive = f"ego is the recorded car {best.obstacle_id}: the longest drive ({_driven_m(best):.1f} m)"
-        return (
-            best,
-            f"{drive} among cars that are present all the time, {manner}; choose another with ego=ID",
+    if not always:
+        raise files.fail(
+            path,
+            f"{len(moving)} moving obstacles, none a car that is present all the time",
+            "name the recorded vehicle that shall be the ego",
         )
-    found = f"{len(moving)} moving obstacles, none a car that is present all the time, stays on the lanelets and touches nobody"
-    raise files.fail(path, found, "name the recorded vehicle that shall be the ego")
+    drive = f"the longest drive ({_driven_m(always[0]):.1f} m)"
+    return (
+        always[0],
+        f"ego is the recorded car {always[0].obstacle_id}: {drive} among cars that are present all "
+        "the time; choose another with ego=ID",
+    )
 
 
 def _driven_m(obstacle: Obstacle) -> float:
     return float(np.linalg.norm(np.diff(obstacle.centre[:, :2], axis=0), axis=1).sum())
-
-
-def _corridors(lane_map: LaneMap) -> Any:
-    """Return each lane's area joined with its predecessors and successors ``(L,)``: where a car is
-    that keeps its lane.
-    """
-    lanes, before = lane_map.lanes, predecessors(lane_map.lanes)
-    joined = []
-    for key, lane in lanes.items():
-        after = [successor for successor in lane.successors if successor in lanes]
-        joined.append(
-            merge_areas([lane_polygon(lanes[one]) for one in (key, *before[key], *after)])
-        )
-    return np.array(joined, dtype=object)
-
-
-def _rectangles(obstacle: Obstacle, least: Box | None = None) -> Any:
-    """Return the plan-view rectangles ``(T,)`` of an obstacle, at least as large as ``least``."""
-    size = np.array([obstacle.box.length_m, obstacle.box.width_m])
-    size = size if least is None else np.maximum(size, [least.length_m, least.width_m])
-    corners = rectangle_corners(
-        obstacle.centre[:, :2], obstacle.yaw, np.broadcast_to(size, (len(obstacle.centre), 2))
-    )
-    return shapely.polygons(corners)
-
-
-def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) -> bool:
-    at = {int(step): i for i, step in enumerate(ego.steps)}
-    for other in obstacles:
-        if other is ego:
-            continue
-        shapes = _rectangles(other)
-        if other.static and len(other.steps) == 1:
-            if shapely.intersects(footprints, shapes[0]).any():
-                return True
-            continue
-        common = [(at[int(step)], j) for j, step in enumerate(other.steps) if int(step) in at]
-        if any(shapely.intersects(footprints[i], shapes[j]) for i, j in common):
-            return True
-    return False
 
 
 def _ground(lane_map: LaneMap, drive: F64) -> HeightField:

@@ -314,12 +314,12 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
 
 def _print_result(result: RunResult, video: str) -> None:
     from evaluators.opening import read_run  # what a run ends with is loaded while it is driven
-    from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
+    from evaluators.report import ending_lines, fixer_lines, next_line, render_table
 
     root = result.root
     summary = result.summary
     run = read_run(root)
-    lines = [*fixer_lines(summary), *(f"warning  {line}" for line in plan_warnings(summary))]
+    lines = [*fixer_lines(summary)]
     if video != "none":
         count = len(list(root.glob("rollouts/*/*/*/*/front.mp4")))
         lines.append(

@@ -9,93 +9,18 @@ therefore run cells in any order.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core import places
-from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.core.parts import digest
-from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
-from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
-from alpasim_plugin.runs import kernels
 from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runs.provenance import hardware
-
-KERNELS = "kernels"
-GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves
-
-
-def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers: int) -> None:
-    """Compile what rollouts need that several workers are about to drive; nothing where that was
-    done before.
-
-    Args:
-        todo: The rollouts.
-        scenarios: Their scenarios by scene.
-        workers: Processes. One compiles nothing here: it compiles while it drives.
-    """
-    if workers < 2:
-        return
-    cold = [one for one in needed(todo, scenarios) if is_cold(one)]
-    if not cold:
-        return
-    for subject, got in run_jobs(compile_kernels, cold, min(workers, len(cold))):
-        if isinstance(got, Lost):
-            warn(f"warning: compiling {subject} kernels: {got.reason}; the rollouts compile them")
-
-
-def is_cold(subject: str) -> bool:
-    """Tell whether the kernels of a subject are still to be compiled."""
-    return not (places.cache() / KERNELS / _key(subject)).exists()
-
-
-def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
-    """Return the subjects of `kernels.SUBJECTS` whose kernels some rollouts call."""
-    found = set()
-    for cell in todo:
-        if cell.renderer.base.name in GAUSSIANS:
-            found.add("rasteriser")
-        if cell.renderer.base.name == "3dgs" and is_reconstructed(scenarios[cell.scene]):
-            found.add("gradient")
-        if cell.renderer.fixer is not None:
-            found |= {"map", "network"}
-    return [subject for subject in kernels.SUBJECTS if subject in found]
-
-
-def compile_kernels(subject: str) -> None:
-    """Compile the kernels of a subject on a tiny case, unless that was done; wait where another
-    process is about to.
-    """
-
-    def make(folder: Path) -> None:
-        kernels.call(subject)
-
-    cached(
-        KERNELS,
-        _key(subject),
-        make,
-        lambda folder: folder,
-        f"compiling {subject} kernels, once on this machine",
-    )
-
-
-def _key(subject: str) -> str:
-    """Name what is compiled: by the code, numba's version, its folder and the processor."""
-    folder = os.environ.get("NUMBA_CACHE_DIR")
-    facts = [package_digest(), version("numba"), folder, hardware()["cpu"]]
-    return f"{subject}-{digest(facts)[:16]}"
-
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 
@@ -207,8 +132,6 @@ Done = Iterator[tuple[Cell, dict[str, Any]]]
 def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     workers = how.threads.workers
-    if workers > 1 or how.limit_s is not None:
-        compile_for(todo, plan.scenarios, workers)
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         todo = sorted(todo, key=lambda cell: cell.renderer.fixer is None)
     threads = how.threads.per_worker

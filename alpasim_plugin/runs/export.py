@@ -6,8 +6,8 @@ AlpaSim's own evaluation takes as it is.
     OUT/scenes/SCENE.usdz
 
 The logs are copied entry by entry. What differs: the main camera is called as AlpaSim's image check
-expects it, the session ids of runs of older versions are replaced by ones that sort as their seeds,
-and a rollout of a policy without cameras gets frames of the main one.
+expects it, and the session ids of runs of older versions are replaced by ones that sort as their
+seeds.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import os
 import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,30 +27,17 @@ import yaml
 from alpasim_plugin.core.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, offset_trajectory, se3
-from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.parts import require_installed, resolve_renderer
 from alpasim_plugin.core.types import (
-    F64,
-    CameraSpec,
-    RenderRequest,
     RolloutLog,
     Scenario,
-    Trajectory,
 )
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.asl import Renaming, Stage, copy_log
-from alpasim_plugin.log.images import encode_image
+from alpasim_plugin.log.asl import Renaming, copy_log
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
-from alpasim_plugin.log.schema import session_uuid, wire_camera, wire_image, wire_render_request
-from alpasim_plugin.log.wire import logging_pb2, sensorsim_pb2
-from alpasim_plugin.runs.cell import make_renderer
-from alpasim_plugin.runs.execute import thread_budget
-from alpasim_plugin.runs.guards import checked_frames
-from alpasim_plugin.runs.loop_state import shutter_poses
-from alpasim_plugin.runs.plan import options_of, ref_of
+from alpasim_plugin.log.schema import session_uuid
+from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.score_logs import check_vouched
 from evaluators.alpasim import EvalSettings
 from scenarios.ftheta import FRONT_WIDE
@@ -213,7 +199,7 @@ class ExportedRun:
         folder: Below the export.
         rollouts: How many logs it holds.
         failed: How many rollouts failed in the run and are only named in ``failed_rollouts.json``.
-        notes: What AlpaSim's tables will lack, and what was added.
+        notes: What AlpaSim's tables will lack.
     """
 
     renderer: str
@@ -283,9 +269,7 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
             if manifest["status"] != "ok":
                 run.failed += 1
                 continue
-            _export_rollout(
-                root, partial / run.folder, manifest, loaded[manifest["scene"]][1], info, run
-            )
+            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1], run)
             run.rollouts += 1
             say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
         for run in runs.values():
@@ -299,39 +283,23 @@ def _export_rollout(
     folder: Path,
     manifest: Mapping[str, Any],
     scenario: Scenario,
-    info: Mapping[str, Any],
     run: ExportedRun,
 ) -> None:
-    """Copy one log, renamed and with images, and mark it complete."""
+    """Copy one log with AlpaSim's names, and mark it complete."""
     source = root / manifest["path"] / LOG_NAME
     check_vouched(source)
     rollout = read_asl(source)
     uuid = session_uuid(int(manifest["seed"]), str(manifest["rollout_key"]))
     cameras = alpasim_cameras(scenario.cameras)
     names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
-    stages: list[Stage] = []
     if not rollout.images:
-        if not cameras:
-            raise InputError(
-                f"{manifest['path']}: no camera in the scenario, and no image in the log",
-                "Add a camera to the scenario.",
-            )
-        options = options_of(info)
-        require_installed([manifest["renderer"]], source)
-        spec = resolve_renderer(manifest["renderer"], options.fixer)
-        seed = int(manifest["seed"])
-        threads = thread_budget(1, 1).per_worker
-        make = partial(make_renderer, spec, scenario, seed, options.device, threads)
-        main = next(iter(cameras.values()))
-        stages.append(AddedFrames(rollout, main, scenario.rates.camera_us, make))
-        _note(
-            run,
-            "the log holds no camera image: frames of the main camera were rendered along the drive",
+        raise InputError(
+            f"{manifest['path']}: the log holds no camera image, and AlpaSim's evaluation needs them",
+            f"run again without {manifest['policy']}: it uses no camera",
         )
-    stages.append(Renaming(uuid, names))
     target = folder / "rollouts" / manifest["scene"] / uuid
     target.mkdir(parents=True)
-    copy_log(source, target / LOG_NAME, *stages)
+    copy_log(source, target / LOG_NAME, Renaming(uuid, names))
     (target / COMPLETE).touch()
     _note_plans(rollout, run)
 
@@ -397,98 +365,3 @@ def _check_free(out: Path) -> None:
             f"--alpasim {out}: it is there and not empty",
             "name a new folder, or remove it first",
         )
-
-
-class AddedFrames:
-    """Adds a camera and its frames to a log; a stage of `alpasim_plugin.log.asl.copy_log`.
-
-    Args:
-        rollout: The log as read.
-        camera: The camera to add.
-        interval_us: Time from frame to frame; the first is at the log's render start.
-        make_renderer: Makes the rollout's renderer; called once, at the first frame.
-    """
-
-    def __init__(
-        self,
-        rollout: RolloutLog,
-        camera: CameraSpec,
-        interval_us: int,
-        make_renderer: Callable[[], Renderer],
-    ) -> None:
-        self._rollout = rollout
-        self._camera = camera
-        self._make = make_renderer
-        self._requests = logged_requests(rollout, camera, interval_us)
-        self._index = {request.t_us: i for i, request in enumerate(self._requests)}
-        self._renderer: Renderer | None = None
-        self._waiting: list[RenderRequest] = []
-        self._blocks = 0
-
-    def __call__(self, entry: logging_pb2.LogEntry) -> list[logging_pb2.LogEntry]:
-        """Return the entry, with its cameras extended, and the frames that are due after it."""
-        kind = entry.WhichOneof("log_entry")
-        if kind == "available_cameras_return":
-            entry.available_cameras_return.available_cameras.append(wire_camera(self._camera))
-        elif kind == "driver_session_request":
-            entry.driver_session_request.rollout_spec.vehicle.available_cameras.append(
-                wire_camera(self._camera)
-            )
-        elif kind == "actor_poses" and int(entry.actor_poses.timestamp_us) in self._index:
-            return [entry, *self._render(self._index[int(entry.actor_poses.timestamp_us)])]
-        return [entry]
-
-    def _render(self, i: int) -> list[logging_pb2.LogEntry]:
-        """Return the entries of the frames that are ready: those of a whole block, for a renderer
-        that works in blocks.
-        """
-        renderer = self._renderer = self._renderer or self._make()
-        self._waiting.append(
-            replace(self._requests[i], ahead=self._requests[i + 1 : i + 1 + renderer.lookahead])
-        )
-        if renderer.block is not None and len(self._waiting) < renderer.block.frames(self._blocks):
-            return []
-        requests, self._waiting = self._waiting, []
-        self._blocks += 1
-        entries = []
-        for request, frame in zip(requests, checked_frames(renderer, requests), strict=True):
-            item = sensorsim_pb2.BatchRGBRenderRequestItem(
-                camera_name=self._camera.name,
-                request=wire_render_request(self._rollout.scene_id, request, "jpeg"),
-            )
-            batch = sensorsim_pb2.BatchRGBRenderRequest(items=[item])
-            image = wire_image(
-                self._rollout.session_uuid,
-                self._camera.name,
-                request.t_us - self._camera.shutter_us,
-                request.t_us,
-                encode_image(frame.rgb, "jpeg"),
-            )
-            entries += [
-                logging_pb2.LogEntry(batch_render_request=batch),
-                logging_pb2.LogEntry(driver_camera_image=image),
-            ]
-        return entries
-
-
-def logged_requests(
-    rollout: RolloutLog, camera: CameraSpec, interval_us: int
-) -> list[RenderRequest]:
-    """Return the requests for a camera along a log's poses, one every ``interval_us`` from its
-    render start.
-    """
-    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    after_us = rig.t_us - rollout.render_start_us
-    due = rig.t_us[(after_us >= 0) & (after_us % interval_us == 0)].tolist()
-    actors: dict[int, dict[str, F64]] = {t: {} for t in due}
-    for name, actor in rollout.actors.items():
-        poses = se3(actor.track.xyz, actor.track.quat)
-        for t, pose in zip(actor.track.t_us.tolist(), poses, strict=True):
-            if t in actors:
-                actors[t][name] = pose
-    out = []
-    for t in due:
-        upto = int(np.searchsorted(rig.t_us, t, side="right"))
-        history = Trajectory(rig.t_us[:upto], rig.xyz[:upto], rig.quat[:upto])
-        out.append(RenderRequest(t, camera, shutter_poses(history, camera, t), actors[t]))
-    return out

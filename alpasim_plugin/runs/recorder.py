@@ -20,7 +20,6 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.places import temporary_folder
-from alpasim_plugin.core.plan_check import unit_guess
 from alpasim_plugin.core.types import (
     F64,
     U8,
@@ -28,13 +27,11 @@ from alpasim_plugin.core.types import (
     EgoState,
     Frame,
     Observation,
-    Plan,
     RenderRequest,
     RolloutLog,
     Scenario,
     SensorSpec,
     Trajectory,
-    Vehicle,
 )
 from alpasim_plugin.log import (
     AslWriter,
@@ -56,12 +53,6 @@ from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
-REACH_S = 1.0
-MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
-SLACK = 2.0  # a plan may ask for more than the vehicle gives: only what is far beyond counts
-SLACK_M = 5.0
-WARN_SHARE = 0.2
-MIN_PLANS = 5
 STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, of the rollout
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
@@ -101,93 +92,6 @@ class StageTimes:
         }
 
 
-class PlanMotion:
-    """Counts the plans of one rollout that reach much further, or much less far, than the vehicle
-    can drive.
-
-    A plan's reach is its straight-line advance ``d`` in the first second (or up to its end). At
-    speed ``v`` the vehicle drives at most ``v t + a t^2 / 2`` with full throttle, and at least its
-    braking distance. A plan is beyond the vehicle if ``d`` is more than twice the former and 5 m,
-    and below it if ``d`` is less than a tenth of the latter.
-    """
-
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._plans = self._beyond = self._below = 0
-        self._ratios: list[float] = []
-
-    def add(self, plan: Plan, ego: EgoState) -> None:
-        """Count a plan that `alpasim_plugin.core.plan_check.plan_problem` has passed."""
-        t_s = (plan.times_us - plan.times_us[0]) * 1e-6
-        reach_s = min(REACH_S, float(t_s[-1]))
-        if reach_s <= 0.0:
-            return  # one pose: the ego is to stand
-        self._plans += 1
-        end = [np.interp(reach_s, t_s, plan.xy[:, axis]) for axis in (0, 1)]
-        advance_m = float(np.hypot(*(end - plan.xy[0])))
-        speed = abs(ego.speed_mps)
-        accel = self._vehicle.max_accel_mps2
-        brake = self._vehicle.max_brake_mps2
-        most_m = speed * reach_s + 0.5 * accel * reach_s**2
-        braking_s = min(reach_s, speed / brake)
-        least_m = speed * braking_s - 0.5 * brake * braking_s**2
-        self._beyond += advance_m > SLACK * most_m + SLACK_M
-        self._below += speed > MOVING_MPS and advance_m < 0.1 * least_m
-        if speed > MOVING_MPS:
-            self._ratios.append(advance_m / (speed * reach_s))
-
-    def facts(self) -> dict[str, Any]:
-        """Return ``plans``, ``beyond``, ``below``, and ``speed_ratio``: median of plan speed over
-        the ego's (None if it never moved).
-        """
-        ratio = round(float(np.median(self._ratios)), 4) if self._ratios else None
-        return {
-            "plans": self._plans,
-            "beyond": self._beyond,
-            "below": self._below,
-            "speed_ratio": ratio,
-        }
-
-
-def plan_table(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return for each renderer the counts of `PlanMotion` over rollouts, and ``warning``: a
-    sentence where plans and vehicle do not fit.
-
-    Args:
-        manifests: Of finished rollouts of one policy; those of scored logs have no plans counted.
-    """
-    out: dict[str, Any] = {}
-    for name in dict.fromkeys(m["renderer"] for m in manifests):
-        facts = [
-            m["plan_motion"] for m in manifests if m["renderer"] == name and m.get("plan_motion")
-        ]
-        if not facts:
-            continue
-        ratios = [one["speed_ratio"] for one in facts if one["speed_ratio"] is not None]
-        entry: dict[str, Any] = {
-            key: sum(one[key] for one in facts) for key in ("plans", "beyond", "below")
-        }
-        entry["speed_ratio"] = round(float(np.median(ratios)), 4) if ratios else None
-        out[name] = entry | {"warning": _warning(entry)}
-    return out
-
-
-def _warning(entry: Mapping[str, Any]) -> str:
-    far = entry["beyond"]
-    short = entry["below"]
-    if entry["plans"] < MIN_PLANS or max(far, short) < WARN_SHARE * entry["plans"]:
-        return ""
-    how = "less far than its braking distance"
-    if far >= short:
-        how = "further than the vehicle can drive in that time"
-    text = f"{max(far, short)} of {entry['plans']} plans reach {how}"
-    if entry["speed_ratio"] is None:
-        return text
-    unit = unit_guess(entry["speed_ratio"])
-    guess = f", as if in {unit}" if unit else ""
-    return f"{text}; their speed is {entry['speed_ratio']:.3g} times the ego's{guess}"
-
-
 class Recorder:
     """Records a rollout in the loop's order.
 
@@ -221,7 +125,6 @@ class Recorder:
         self._keep_frames = keep_frames
         self._versions = dict(versions or {})
         self._times = StageTimes()
-        self.plan_motion = PlanMotion(scenario.vehicle)
         self._frames: list[dict[str, Any]] = []
         self._debug: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
@@ -370,7 +273,6 @@ class Recorder:
             "steps": self._steps,
             "frame_events": dict(events),
             "passed_path_end": self._passed,
-            "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
             "strip_t_us": [t_us for t_us, _ in strip],

@@ -153,7 +153,6 @@ class Loop:
                 began = time.perf_counter()
                 with recorder.stage("policy"):
                     plan = yield observation
-                recorder.plan_motion.add(plan, state.ego)
                 plan_world, *samples = state.to_world(plan)
                 plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
                 recorder.policy_plan(plan_world, samples, plan.debug)

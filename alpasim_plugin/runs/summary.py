@@ -21,7 +21,6 @@ from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import fixers
-from alpasim_plugin.runs.recorder import plan_table
 from evaluators import censoring
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.statistics.outcomes import outcome_table, rollouts_of
@@ -71,7 +70,6 @@ def write_summary(
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": _failures(manifests),
         "fixers": by_policy(_of_policies(done), fixers),
-        "plans": by_policy(_of_policies(done), plan_table),
         "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
         **more,
     }

@@ -13,13 +13,11 @@ if TYPE_CHECKING:
     from evaluators.report.fixers import fixer_lines
     from evaluators.report.html import write_report
     from evaluators.report.terminal import ending_lines, next_line, render_presets, render_table
-    from evaluators.report.verdict import plan_warnings
 
 __all__ = [
     "ending_lines",
     "fixer_lines",
     "next_line",
-    "plan_warnings",
     "render_presets",
     "render_table",
     "write_junit",
@@ -30,7 +28,6 @@ __all__ = [
 _HOMES = {
     ".ci": ("write_junit", "write_summary_md"),
     ".fixers": ("fixer_lines",),
-    ".verdict": ("plan_warnings",),
     ".html": ("write_report",),
     ".terminal": ("ending_lines", "next_line", "render_presets", "render_table"),
 }

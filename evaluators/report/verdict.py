@@ -180,20 +180,6 @@ def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
     return "worse" if (difference > 0) == (direction == "lower") else "better"
 
 
-def plan_warnings(summary: Mapping[str, Any]) -> list[str]:
-    """Say in one sentence each whose plans do not fit the vehicle; variants with the same sentence
-    share it.
-    """
-    by_text: dict[str, list[str]] = {}
-    for name, entry in (summary.get("plans") or {}).items():
-        if entry.get("warning"):
-            by_text.setdefault(str(entry["warning"]), []).append(name)
-    return [
-        f"{', '.join(names)}: {text} (simrun check policy tests units)"
-        for text, names in by_text.items()
-    ]
-
-
 def _questions(run: Run, pairs: Mapping[str, Any]) -> list[str]:
     """Return the metrics whose differences the head of a report is about."""
     known = [name for name in pairs if finite(pairs[name].get("diff")) is not None]
@@ -311,7 +297,7 @@ def _alone(run: Run, variant: str) -> str:
 
 
 def _cautions(run: Run) -> tuple[str, ...]:
-    cautions = [*fixer_cautions(run.summary), *(f"{line}." for line in plan_warnings(run.summary))]
+    cautions = [*fixer_cautions(run.summary)]
     failed = Counter(r.failure_class or "unknown cause" for r in run.rollouts if not r.ok)
     if failed:
         causes = ", ".join(f"{name} {count}" for name, count in failed.most_common())

@@ -133,25 +133,3 @@ def test_in_a_run_the_faults_of_a_policy_are_its_own(
     assert found in told
     assert "1 by the policy's own fault" in told
     assert "infrastructure" not in told
-
-
-def test_plans_in_centimetres_are_warned_of_and_plans_in_metres_are_not(
-    parts: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "metres", *SHORT])
-        == 0
-    )
-    assert "warning" not in capsys.readouterr().out
-    assert (
-        run_command(
-            [*GREY, "--policy", "talking_policies.py:Centimetres", "--out", "centimetres", *SHORT]
-        )
-        == 0
-    )
-    told = " ".join(capsys.readouterr().out.split())
-    assert (
-        "reach further than the vehicle can drive in that time; their speed is 100 times the ego's, as if in centimetres"
-        in told
-    )
-    assert "as if in centimetres" in (parts / "centimetres" / "summary.md").read_text()

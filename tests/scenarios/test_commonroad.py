@@ -52,7 +52,7 @@ def refused(tmp_path, ego=None, text=None, **parts):
 # --- what becomes of a file
 
 
-def test_longest_drive_inside_one_lane_is_the_ego_and_no_actor(log):
+def test_longest_drive_is_the_ego_and_no_actor(log):
     assert [a.actor_id for a in log.actors] == ["12", "13"]
     assert log.notes[0].startswith("ego is the recorded car 11: the longest drive (20.0 m)")
 
@@ -86,20 +86,9 @@ def test_another_ego_can_be_asked_for(tmp_path):
     assert log.notes[0] == "ego is the recorded vehicle 12, as asked"
 
 
-def test_car_that_changes_lanes_is_passed_over(tmp_path):
-    slant = [state(k, 20 + 1.5 * k, 0.2 * k, yaw=0.13) for k in range(21)]
-    log = read(tmp_path, traffic=obstacle(11, slant) + obstacle(12, drive(100, 4, speed=5.0)))
-    assert "car 12" in log.notes[0]
-    alone = read(tmp_path, traffic=obstacle(11, slant))
-    assert "none keeps inside one lane" in alone.notes[0]
-
-
-def test_car_that_leaves_the_lanes_or_touches_another_is_passed_over(tmp_path):
-    off = obstacle(20, drive(100, -1.6, speed=15.0))
-    touching = obstacle(21, drive(60, 4, speed=15.0)) + obstacle(
-        22, drive(63, 4, speed=14.0, steps=range(15))
-    )
-    assert "car 11" in read(tmp_path, traffic=off + touching + obstacle(11, drive(20, 0))).notes[0]
+def test_car_that_is_not_present_all_the_time_is_passed_over(tmp_path):
+    late = obstacle(20, drive(100, 4, speed=30.0, steps=range(3, 21)))
+    assert "car 11" in read(tmp_path, traffic=late + obstacle(11, drive(20, 0))).notes[0]
 
 
 def test_static_obstacle_is_there_for_the_whole_recording(tmp_path):
@@ -408,11 +397,10 @@ def check_file(path, facts):
 
 
 def check_log(path, facts):
-    """The default ego drives safely under the evaluators' rules, in lanes that follow each
+    """The ego drives safely under the evaluators' rules, in lanes that follow each
     other.
     """
-    log = read_commonroad(path)
-    assert f"car {facts['ego']}:" in log.notes[0]
+    log = read_commonroad(path, facts["ego"])
     assert len(log.actors) == facts["cars"] - 1
     times = log.ego_log.t_us
     one, union, neither, off = ruling(log, times)
