@@ -311,8 +311,8 @@ def test_unknown_encoding(tmp_path):
         (document().replace("<length>4.4", "<length>0").encode(), "a shape of 0.0 x 1.8 m"),
         (document(traffic=obstacle(1, drive(0, 0, steps=[3]))).encode(), "1 state"),
         (
-            document(traffic=obstacle(1, drive(0, 80.0))).encode(),
-            "none a car that is present all the time, stays on the lanelets",
+            document(traffic=obstacle(1, drive(0, 0), kind="bus")).encode(),
+            "none a car that is present all the time",
         ),
     ],
 )
