@@ -27,6 +27,7 @@ import yaml
 from alpasim_plugin.core.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import require_installed
 from alpasim_plugin.core.types import (
     RolloutLog,
     Scenario,
