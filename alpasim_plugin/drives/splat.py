@@ -132,8 +132,9 @@ def _in_frame(
     """
     places = [folder / TRAINED for folder in (file.parent, _folder_of(poses))]
     stated = next((place for place in places if place.is_file()), None)
+    notes: tuple[str, ...] = ()
     if stated is None:
-        covered, moved, notes = _covered(cloud, drive), cloud, ()
+        covered, moved = _covered(cloud, drive), cloud
     else:
         frames = {"as it is": np.eye(4), **_T_trained_source(stated, drive)}
         models = {name: placed_cloud(cloud, np.linalg.inv(T)) for name, T in frames.items()}

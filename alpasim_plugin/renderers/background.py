@@ -86,7 +86,9 @@ def _count_near(points: F64, at: F64) -> int:
 LEAST = 0.05  # share of the route with Gaussians near it; below it the cameras look into emptiness
 
 
-def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianCloud, Coverage]:
+def read_background(
+    background: BackgroundFile, path: F64
+) -> tuple[GaussianCloud, Coverage, tuple[str, ...]]:
     """Read a background file and measure how it covers the drive.
 
     Args:
@@ -94,7 +96,7 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
         path: ``(N, 3)`` recorded positions, metres, world.
 
     Returns:
-        The Gaussians in the file's frame, and their coverage once placed.
+        The Gaussians in the file's frame, their coverage once placed, and notes on the file.
 
     Raises:
         InputError: It cannot be read, no Gaussian of it can be drawn, or it covers next to nothing
@@ -116,7 +118,7 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
             f"{background.path}: {coverage}, which runs through {drive} m: nothing of it would be seen",
             "give background.transform, from the file's frame to the world (docs/scenario-files.md)",
         )
-    return cloud, coverage
+    return cloud, coverage, report.notes
 
 
 def background_note(scenario: Scenario) -> str:
@@ -127,10 +129,10 @@ def background_note(scenario: Scenario) -> str:
     """
     if scenario.background is None:
         return ""
-    _, coverage = read_background(scenario.background, scenario.ego_log.xyz)
+    _, coverage, notes = read_background(scenario.background, scenario.ego_log.xyz)
     road = (
         "the built road is drawn with it"
         if scenario.background.keep_road
         else "it replaces the built road, markings and houses"
     )
-    return f"background {scenario.background.path}: {coverage}; {road}"
+    return f"background {scenario.background.path}: {'; '.join([str(coverage), road, *notes])}"

@@ -117,7 +117,7 @@ def _build(scenario: Scenario) -> SceneGraph:
     graph = build_scene(scenario, partial(height_at, scenario.ground))
     if scenario.background is None:
         return graph
-    cloud, _ = read_background(scenario.background, scenario.ego_log.xyz)
+    cloud, *_ = read_background(scenario.background, scenario.ego_log.xyz)
     return with_background(graph, cloud, scenario.background.T_world_file)
 
 

@@ -59,5 +59,5 @@ def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
         return read_splat(path)
     raise InputError(
         f"{path}: suffix {path.suffix!r} with first bytes {head!r}",
-        f"give one of {', '.join(SUPPORTED)}; training checkpoints must be converted first",
+        f"give one of {', '.join(SUPPORTED)}; .ksplat, .lcc, .splatv and training checkpoints must be converted first (splat-transform)",
     )

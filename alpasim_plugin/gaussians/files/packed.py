@@ -3,8 +3,9 @@ write ``.splat``.
 
 A compressed PLY holds 16 bytes a Gaussian, quantised within chunks of 256. ``.splat`` holds 32
 bytes a Gaussian without a header, constant colour only. SPZ (versions 2 and 3 by gzip, 4 by zstd
-streams) has coordinates right-up-back (y up) where those of a 3DGS PLY are right-down-front; its
-reader turns the model into PLY axes by default, so that one model in both files lies in one place.
+streams) has coordinates right-up-back (y up), or those that an extension of it states, where those
+of a 3DGS PLY are right-down-front; its reader turns the model into PLY axes, so that one model in
+both files lies in one place.
 """
 
 from __future__ import annotations
@@ -21,10 +22,16 @@ from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading import read_bytes
-from alpasim_plugin.core.reading.files import unzstd
-from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud
-from alpasim_plugin.gaussians.files.ply import PlyHeader, read_ply_element, read_ply_header
-from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.core.reading.files import parsing, some_of, unzstd
+from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, quat_multiply
+from alpasim_plugin.gaussians.files.ply import (
+    UNFILTERED,
+    PlyHeader,
+    read_ply_element,
+    read_ply_header,
+    stated_in,
+)
+from alpasim_plugin.gaussians.sh import C0, SH_SIZES, rotate_sh
 
 CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -70,6 +77,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         scales=np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)),
         opacities=rgba[:, 3],
         sh=np.concatenate([dc[:, None, :], _read_sh(header, len(rows))], axis=1).astype(np.float32),
+        notes=stated_in(header),
     )
 
 
@@ -114,11 +122,13 @@ def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
         return np.zeros((n, 0, 3))
     rows = read_ply_element(header, "sh")
     n_rest = len(rows.dtype.names or ())
-    if n_rest not in (9, 24, 45, 72) or len(rows) != n:
+    if n_rest not in (0, 9, 24, 45, 72) or len(rows) != n:
         raise InputError(
             f"{header.path}, element 'sh': {len(rows)} rows of {n_rest} values for {n} Gaussians",
             "export the file again",
         )
+    if n_rest == 0:  # gsplat writes the element of a model without harmonics too
+        return np.zeros((n, 0, 3))
     table = np.stack([rows[f"f_rest_{i}"] for i in range(n_rest)], axis=1).astype(np.float64)
     # The two end bytes stand for the ends of the range, so that clipped values keep their size.
     fractions = np.where(table == 0, 0.0, np.where(table == 255, 1.0, (table + 0.5) / 256.0))
@@ -133,6 +143,15 @@ def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) 
         for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")
     ]
     missing += [name for name in bounds if name not in (chunks.dtype.names or ())]
+    unknown = sorted(
+        {element.name for element in header.elements} - {"chunk", "vertex", "sh"}
+        | set(rows.dtype.names or ()) - set(_PACKED)
+    )
+    if unknown:
+        raise InputError(
+            f"{header.path}: {some_of(unknown)}: parts that may change what is drawn",
+            "export a plain compressed PLY (SuperSplat, gsplat)",
+        )
     need = -(-len(rows) // CHUNK)
     if missing or len(chunks) < need:
         found = (
@@ -201,12 +220,24 @@ _GZIP = b"\x1f\x8b"
 _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
 
-# Sign of each basis function (degree 0 to 4, order of the 3DGS PLY) when y and z change sign: the
-# parity of its y z factor.
-_FLIP_YZ = np.array(
-    [1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1],
-    dtype=np.float32,
+ANTIALIASED, EXTENDED = 1, 2  # flags of a header
+ORBIT, AXES = 0xADBE0002, 0xADBE0003  # extensions: limits of a viewer's camera; where axes point
+MOST_EXTENDED = 1 << 16  # bytes of extensions
+# Axes by the number in the extension: where x, y and z point.
+SYSTEMS = (
+    "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
 )
+# Right, down and front are the axes of a PLY.
+DIRECTIONS = {
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "D": (0, 1, 0),
+    "U": (0, -1, 0),
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
+QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, and its quaternion
+QUARTER_QUAT = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -217,6 +248,7 @@ class SpzHeader:
     count: int
     sh_degree: int
     fractional_bits: int
+    flags: int = 0
 
     @property
     def stream_bytes(self) -> tuple[int, int, int, int, int, int]:
@@ -227,7 +259,7 @@ class SpzHeader:
 
 def read_spz(path: Path | str) -> GaussianArrays:
     """Read an SPZ file of version 2, 3 or 4, turned into the axes of a 3DGS PLY: ``(x, y, z) ->
-    (x, -y, -z)``.
+    (x, -y, -z)``, unless an extension states other axes.
 
     Args:
         path: The file.
@@ -241,12 +273,60 @@ def read_spz(path: Path | str) -> GaussianArrays:
     if data[:2] == _GZIP:
         data = _gunzip(path, data)
     header = _parse_header(path, data)
-    streams = (
-        _zstd_streams(path, data, header)
-        if header.version == 4
-        else _plain_streams(path, data, header)
+    if header.version == 4:
+        streams = _zstd_streams(path, data, header)
+        extensions = data[32 : struct.unpack_from("<I", data, 16)[0]]
+    else:
+        streams = _plain_streams(path, data, header)
+        extensions = data[16 + sum(header.stream_bytes) :]
+    system = _stated_axes(path, extensions) if header.flags & EXTENDED else SYSTEMS[0]
+    notes: tuple[str, ...] = (UNFILTERED,) if header.flags & ANTIALIASED else ()
+    if system != SYSTEMS[0]:
+        notes += (f"axes {system} as the file states them, turned into those of a PLY",)
+    return _in_ply_axes(_decode(header, streams), system)._replace(notes=notes)
+
+
+def _stated_axes(path: Path, data: bytes) -> str:
+    """Return the axes that extensions state: records of a type, a length and as many bytes."""
+    at, system = 0, SYSTEMS[0]
+    while at < len(data):
+        with parsing(path, _EXPORT_AGAIN, "damaged extensions"):
+            kind, size = struct.unpack_from("<II", data, at)
+            if kind == AXES:
+                system = SYSTEMS[struct.unpack_from("<I", data, at + 8)[0]]
+        if kind not in (AXES, ORBIT):
+            raise _failure(path, f"extension {kind:#010x} of unknown meaning", "export it without")
+        at += 8 + size
+    return system
+
+
+def _in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
+    """Return Gaussians in the axes of a 3DGS PLY: axes that change their sign, then a quarter turn
+    where z is up.
+    """
+    M = np.array([DIRECTIONS[letter] for letter in system], dtype=np.float64).T
+    turned = M[1, 1] == 0
+    x, y, z = np.diag(QUARTER.T @ M if turned else M)
+    means = np.asarray(arrays.means * np.array([x, y, z]), dtype=np.float64)
+    quats = np.asarray(arrays.quats * np.array([1.0, y * z, x * z, x * y]), dtype=np.float64)
+    sh = np.asarray(arrays.sh * _parity(arrays.sh.shape[1], x, y, z)[:, None])
+    if turned:
+        sh = np.asarray(rotate_sh(sh[:, : SH_SIZES[-1]], QUARTER))
+        means, quats = means @ QUARTER.T, quat_multiply(QUARTER_QUAT, quats)
+    return arrays._replace(
+        means=means.astype(np.float32), quats=quats.astype(np.float32), sh=sh.astype(np.float32)
     )
-    return _decode(header, streams)
+
+
+def _parity(size: int, x: float, y: float, z: float) -> NDArray[np.float64]:
+    """Return the sign ``(size,)`` of each basis function when axes change their signs.
+
+    The function of degree n and order m holds z to the power of n - |m| modulo 2, and y where m is
+    negative; what remains of |m| is of x.
+    """
+    orders = [(degree, m) for degree in range(5) for m in range(-degree, degree + 1)]
+    signs = [z ** (n + m) * y ** (m < 0) * x ** (abs(m) + (m < 0)) for n, m in orders]
+    return np.array(signs[:size])
 
 
 def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -280,12 +360,11 @@ def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]]) -> GaussianArra
     rest = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
     sh = np.concatenate([dc, rest], axis=1).astype(np.float32)
     return GaussianArrays(
-        means=(means * np.array([1.0, -1.0, -1.0])).astype(np.float32),
-        # Conjugation by half a turn about x.
-        quats=(quats * np.array([1.0, 1.0, -1.0, -1.0])).astype(np.float32),
+        means=means,
+        quats=quats,
         scales=np.exp(scales.reshape(n, 3) / 16.0 - 10.0),
         opacities=alphas / 255.0,
-        sh=sh * _FLIP_YZ[:k, None],
+        sh=sh,
     )
 
 
@@ -306,7 +385,9 @@ def _gunzip(path: Path, data: bytes) -> bytes:
     try:
         head = stream.decompress(data, 16)
         header = _parse_header(path, head)
-        body = stream.decompress(stream.unconsumed_tail, sum(header.stream_bytes) + 1)
+        extended = MOST_EXTENDED if header.flags & EXTENDED else 0
+        size = sum(header.stream_bytes) + extended + 1
+        body = stream.decompress(stream.unconsumed_tail, size)
     except zlib.error as error:
         raise _failure(path, f"damaged gzip data ({error})", _EXPORT_AGAIN) from error
     return head + body
@@ -315,7 +396,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 def _parse_header(path: Path, data: bytes) -> SpzHeader:
     if len(data) < 16:
         raise _failure(path, f"{len(data)} bytes, shorter than any header", _EXPORT_AGAIN)
-    magic, version, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", data)
+    magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", data)
     if magic != MAGIC:
         raise _failure(path, f"magic {data[:4]!r}, expected b'NGSP'", "give an SPZ file")
     if version not in (2, 3, 4):
@@ -329,7 +410,9 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
         raise _failure(
             path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN
         )
-    return SpzHeader(version, count, degree, bits)
+    if flags & ~(ANTIALIASED | EXTENDED):
+        raise _failure(path, f"flags {flags:#04x} of unknown meaning", "export it without them")
+    return SpzHeader(version, count, degree, bits, flags)
 
 
 def _plain_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np.uint8]]:

@@ -10,6 +10,7 @@ channel by channel: all red coefficients, then green, then blue.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from alpasim_plugin.core.atomic import atomic_file, write_bytes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS
-from alpasim_plugin.core.reading.files import open_regular
+from alpasim_plugin.core.reading.files import open_regular, parsing, read_bytes, some_of
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import (
     GaussianArrays,
     GaussianCloud,
@@ -29,11 +31,24 @@ from alpasim_plugin.gaussians.cloud import (
     sigmoid,
 )
 
+_SCALES = ("scale_0", "scale_1", "scale_2")
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    *("scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 COLOURS = ("red", "green", "blue")
+# What other tools write beside it and nothing is drawn of: normals, colours of points, and features
+# by which Gaussians are grouped.
+_HARMLESS = re.compile(
+    r"n[xyz]|red|green|blue|(obj_dc|ins_feat|semantic|language|label|class|object|instance|segment|id)"
+    r"(_?\w*)?"
+)
+# Elements beside a model: its training camera, as Apple's SHARP writes it.
+_BESIDE = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "version", "color_space"}
+_FLAT = 1e-3  # thickness of a 2D Gaussian, in its smaller scale
+# Comments that state how a model is to be drawn or how its axes lie.
+_STATED = re.compile(r"ax[ie]s|coordinate|handed|unit|scale|antialias|rendermode|frame", re.I)
+UNFILTERED = "the model was trained with antialiasing, which is not drawn: thin and far Gaussians look more opaque"
 
 
 def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
@@ -49,8 +64,8 @@ def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
         The cloud, in the axes and units of the file.
 
     Raises:
-        InputError: Missing or truncated file, missing properties, ASCII body, or several elements
-            and none named.
+        InputError: Missing or truncated file, missing properties, properties that may change what
+            is drawn and are not known, or several elements and none named.
 
     Example:
         >>> cloud = read_ply("background.ply")  # doctest: +SKIP
@@ -63,17 +78,54 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     header = read_ply_header(path)
     chosen = header.element(element) if element is not None else _only_gaussian_element(header)
     n_rest = _check_properties(header, chosen)
+    _check_elements(header)
     rows = read_ply_element(header, chosen.name)
-    log_scales = _columns(rows, [f"scale_{i}" for i in range(3)]).astype(np.float64)
+    notes = stated_in(header)
+    flat = "scale_2" not in chosen.properties
     with np.errstate(over="ignore"):  # overflow becomes infinity, which cleaning drops and counts
-        scales = np.exp(log_scales)
+        scales = np.exp(_columns(rows, _SCALES[: 2 if flat else 3]).astype(np.float64))
+    if flat:
+        thickness = _FLAT * scales.min(axis=1, keepdims=True)
+        scales = np.concatenate([scales, thickness], axis=1)
+        notes += ("2D Gaussians are drawn as flat ellipsoids",)
+    opacities = sigmoid(_columns(rows, ["opacity"])[:, 0])
+    filtered = [name for name in chosen.properties if name.lower() == "filter_3d"]
+    if filtered:
+        scales, opacities = smoothed(scales, opacities, _columns(rows, filtered))
+        notes += ("the 3D filter of Mip-Splatting is applied to scales and opacities", UNFILTERED)
     return GaussianArrays(
         means=_columns(rows, ("x", "y", "z")),
         quats=_columns(rows, [f"rot_{i}" for i in range(4)]),
         scales=scales,
-        opacities=sigmoid(_columns(rows, ["opacity"])[:, 0]),
+        opacities=opacities,
         sh=_sh_from_columns(rows, n_rest),
+        notes=notes,
     )
+
+
+def smoothed(scales: F64, opacities: F64, width: NDArray[np.floating]) -> tuple[F64, F64]:
+    """Return scales ``(N, 3)`` and opacities ``(N,)`` under the 3D smoothing filter of widths ``(N,
+    1)``, metres.
+
+    Source: Mip-Splatting (Yu et al. 2024), equation 9.
+    """
+    square = scales**2
+    wider = square + width.astype(np.float64) ** 2
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(wider), opacities * np.sqrt((square / wider).prod(axis=1))
+
+
+def stated_in(header: PlyHeader) -> tuple[str, ...]:
+    """Return notes on the comments of a file that state how it is to be drawn."""
+    notes = [f"the file says {text!r}" for text in header.comments if _STATED.search(text)]
+    antialiased = False
+    for text in header.comments:  # of Brush and of Postshot; the last one counts
+        words = [*text.lower().replace(":", " ").split(), "", ""]
+        if words[0] in ("splatrendermode", "antialiased"):
+            antialiased = words[1] in ("mip", "1", "true")
+    if antialiased:
+        notes.append(UNFILTERED)
+    return tuple(notes)
 
 
 def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
@@ -159,11 +211,16 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
             f"{header.path}, element {element.name!r}: missing properties {missing}",
             "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
-    time_terms = sorted(name for name in have if name.startswith("f_dc_") and name not in _REQUIRED)
-    if time_terms:
+    known = {*_REQUIRED, *_SCALES, "filter_3D", "filter_3d"}
+    unknown = sorted(
+        name
+        for name in have - known
+        if not name.startswith("f_rest_") and _HARMLESS.fullmatch(name) is None
+    )
+    if unknown:
         raise InputError(
-            f"{header.path}, element {element.name!r}: colours that change over time (Fourier terms {time_terms[0]}..{time_terms[-1]})",
-            "bake the colours at one time before export: only three f_dc values a Gaussian are supported",
+            f"{header.path}, element {element.name!r}: properties that may change what is drawn: {some_of(unknown)}",
+            "export a plain 3DGS model, of one time and without filters; or leave the properties out if nothing is drawn of them",
         )
     n_rest = sum(name.startswith("f_rest_") for name in have)
     per_channel, left_over = divmod(n_rest, 3)
@@ -174,6 +231,18 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
             "export the file again with whole bands of spherical harmonics",
         )
     return per_channel
+
+
+def _check_elements(header: PlyHeader) -> None:
+    """Refuse elements that may change what is drawn."""
+    for element in header.elements:
+        linear = element.name == "color_space" and read_ply_element(header, element.name)[0][0]
+        if linear or not (element.name.startswith("vertex") or element.name in _BESIDE):
+            found = "linear colours" if linear else f"{element.count} rows of unknown meaning"
+            raise InputError(
+                f"{header.path}, element {element.name!r}: {found}",
+                "export a plain 3DGS model, with colours in sRGB",
+            )
 
 
 def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floating]:
@@ -219,7 +288,7 @@ class PlyElement:
         count: Number of rows.
         dtype: Row layout, or None if the element has list properties (its row size then varies).
         offset: Byte position of its first row in the file, or None if an element before it has list
-            properties.
+            properties; in a text file, how many lines of rows stand before it.
     """
 
     name: str
@@ -235,10 +304,19 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """Hold what a PLY header says: the file and its elements in order."""
+    """Hold what a PLY header says.
+
+    Attributes:
+        path: The file.
+        elements: In the order of the file.
+        comments: Its comments.
+        text: Where the rows begin in a text file; None in a binary one.
+    """
 
     path: Path
     elements: tuple[PlyElement, ...]
+    comments: tuple[str, ...] = ()
+    text: int | None = None
 
     def element(self, name: str) -> PlyElement:
         """Return the element called `name`.
@@ -256,22 +334,25 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path | str) -> PlyHeader:
-    """Read and check the header of a binary PLY file.
+    """Read and check the header of a PLY file.
 
     Raises:
-        InputError: Missing file, not a PLY, ASCII body, malformed header line, or an impossible
-            count.
+        InputError: Missing file, not a PLY, malformed header line, or an impossible count.
     """
     path = Path(path)
     lines, body_offset = _header_lines(path)
-    byte_order = ""
+    byte_order, text = "", False
+    comments = []
     pending: list[tuple[str, int, list[tuple[str, str]] | None]] = []
     for number, line in enumerate(lines, start=1):
         words = line.split()
-        if not words or words[0] in ("ply", "end_header", "obj_info", "comment"):
+        if not words or words[0] in ("ply", "end_header"):
             continue
-        if words[0] == "format" and len(words) == 3:
-            byte_order = _byte_order(path, words[1])
+        if words[0] in ("comment", "obj_info"):
+            comments.append(" ".join(words[1:]))
+        elif words[0] == "format" and len(words) == 3:
+            text = words[1] == "ascii"
+            byte_order = "<" if text else _byte_order(path, words[1])
         elif words[0] == "element" and len(words) == 3:
             pending.append((words[1], _count(path, number, words[2]), []))
         elif words[0] == "property" and pending and len(words) >= 3:
@@ -280,7 +361,9 @@ def read_ply_header(path: Path | str) -> PlyHeader:
             raise _bad_line(path, number, line)
     if not byte_order:
         raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
-    return PlyHeader(path, _place(pending, body_offset))
+    if text:
+        return PlyHeader(path, _place(pending, 0, text), tuple(comments), body_offset)
+    return PlyHeader(path, _place(pending, body_offset), tuple(comments))
 
 
 def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
@@ -298,6 +381,8 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
             f"{header.path}, element {name!r}: {'list properties, so rows have no fixed size' if element.dtype is None else 'it follows list properties'}",
             "give a Gaussian model; meshes with faces are not one",
         )
+    if header.text is not None:
+        return _text_rows(header, element, element.dtype, header.text, element.offset)
     have = header.path.stat().st_size - element.offset
     need = element.count * element.dtype.itemsize
     if need > have:
@@ -307,6 +392,21 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
             _EXPORT_AGAIN,
         )
     return np.fromfile(header.path, dtype=element.dtype, count=element.count, offset=element.offset)
+
+
+def _text_rows(
+    header: PlyHeader, element: PlyElement, dtype: np.dtype[np.void], start: int, first: int
+) -> NDArray[np.void]:
+    lines = read_bytes(header.path)[start:].splitlines()[first : first + element.count]
+    where = f"{header.path}, element {element.name!r}"
+    if len(lines) < element.count:
+        raise InputError(f"{where}: {len(lines)} of {element.count} rows", _EXPORT_AGAIN)
+    with parsing(where, _EXPORT_AGAIN, "rows that are not of numbers"):
+        table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
+        rows = np.empty(element.count, dtype)
+        for name, column in zip(element.properties, table.T, strict=True):
+            rows[name] = column
+    return rows
 
 
 def _header_lines(path: Path) -> tuple[list[str], int]:
@@ -370,15 +470,18 @@ def _with_property(
 
 
 def _place(
-    pending: list[tuple[str, int, list[tuple[str, str]] | None]], body_offset: int
+    pending: list[tuple[str, int, list[tuple[str, str]] | None]],
+    body_offset: int,
+    text: bool = False,
 ) -> tuple[PlyElement, ...]:
-    """Give each element its row layout and byte position."""
+    """Give each element its row layout and the position of its rows."""
     offset: int | None = body_offset
     elements = []
     for name, count, fields in pending:
         dtype = None if fields is None else np.dtype(fields)
         elements.append(PlyElement(name, count, dtype, offset))
-        offset = None if dtype is None or offset is None else offset + count * dtype.itemsize
+        size = 1 if text else None if dtype is None else dtype.itemsize
+        offset = None if size is None or offset is None else offset + count * size
     return tuple(elements)
 
 

@@ -21,10 +21,11 @@ from typing_extensions import TypedDict
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS, PICTURE_PIXELS, SOURCE_BYTES
 from alpasim_plugin.core.reading import parse_json, read_bytes
-from alpasim_plugin.core.reading.files import as_shape, parsing
+from alpasim_plugin.core.reading.files import as_shape, parsing, some_of
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.files.packed import with_largest
+from alpasim_plugin.gaussians.files.ply import UNFILTERED
 
 META = "meta.json"
 DO_THIS = "write it again as SOG of version 2 (splat-transform), or give the PLY"
@@ -55,6 +56,9 @@ class _Meta(TypedDict):
     scales: _Plane
     quats: _Files
     sh0: _Plane
+
+
+KNOWN = {*_Meta.__annotations__, "shN", "asset", "antialias", "model"}  # keys of `META`
 
 
 def is_sog(path: Path) -> bool:
@@ -93,6 +97,14 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     meta = as_shape(_Meta, document, where, DO_THIS)
     if meta["version"] != 2:
         raise InputError(f"{where}: version {meta['version']}", DO_THIS)
+    unknown = sorted(set(document) - KNOWN)
+    if unknown:
+        raise InputError(
+            f"{where}: keys that may change what is drawn: {some_of(unknown)}", DO_THIS
+        )
+    model = document.get("model", "default")
+    if model not in ("default", "antialiased", "2dgs"):
+        raise InputError(f"{where}: a model {model!r}", DO_THIS)
     n = meta["count"]
     GAUSSIANS.check(n, where)
 
@@ -113,9 +125,10 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     constant = np.array(meta["sh0"]["codebook"])[colour[:, :3]]
     rest = _harmonics(document.get("shN"), plane, n) if document.get("shN") else np.zeros((n, 0, 3))
     sh = np.concatenate([constant[:, None], rest], axis=1)
-    return GaussianArrays(
-        means, _rotations(plane(meta["quats"]["files"][0], n)), scales, colour[:, 3] / 255.0, sh
-    )
+    quats = _rotations(plane(meta["quats"]["files"][0], n))
+    antialiased = document.get("antialias") or model == "antialiased"
+    notes = (UNFILTERED,) if antialiased else ()
+    return GaussianArrays(means, quats, scales, colour[:, 3] / 255.0, sh, notes)
 
 
 def _plane(data: bytes, where: str) -> U8:
