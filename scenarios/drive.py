@@ -8,7 +8,6 @@ distortion, each with its time, camera and use.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_array, write_json
-from alpasim_plugin.core.reading import check_regular
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.types import (
@@ -404,8 +403,4 @@ def _note_files(files: SourceFiles, model: Path) -> None:
             "give the same import command again; it goes on where it stopped",
         )
     for path in found:
-        check_regular(path)
-        with path.open("rb") as stream:
-            files.note_bytes(
-                path.relative_to(model).as_posix(), hashlib.file_digest(stream, "sha256").digest()
-            )
+        files.note_bytes(path.relative_to(model).as_posix(), bytes.fromhex(file_sha256(path)))

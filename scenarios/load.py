@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import speeds
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
-from alpasim_plugin.core.reading import check_regular
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -297,9 +297,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
         file = drawn.document.folder_of(("background", "file")) / spec.background.file
-        check_regular(file)
-        with file.open("rb") as stream:
-            scene.update(hashlib.file_digest(stream, "sha256").digest())
+        scene.update(bytes.fromhex(file_sha256(file)))
     return scene.hexdigest()
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
@@ -145,14 +146,13 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
 
     Raises:
         TypeError: A value of another type.
-        OSError: The scenario's background file cannot be read.
+        InputError: The scenario's background file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
     content = [package_digest(), _content(recipe), _content(scenario)]
     digest.update(json.dumps(content, sort_keys=True).encode())
     if scenario.background is not None:
-        with Path(scenario.background.path).open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        digest.update(bytes.fromhex(file_sha256(scenario.background.path)))
     return digest.hexdigest()
 
 

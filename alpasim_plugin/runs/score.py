@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
@@ -78,7 +78,7 @@ def execute_score(
     """
     began = time.perf_counter()
     facts = {
-        "logs": sorted(_digest(log) for log in logs),
+        "logs": sorted(file_sha256(log) for log in logs),
         "scenes": scenes.places,
         "preset": preset.as_dict(),
     }
@@ -247,10 +247,3 @@ def _write_info(
             "left_out": sorted({note for one in used.values() for note in one.notes}),
         },
     )
-
-
-def _digest(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot open: {error.strerror}", "Check the path.") from error

@@ -14,7 +14,8 @@ from safetensors.torch import save_file
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
+from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.dit_cases import SMALL, clip, furthest
 from tests.block_fixers.dit_reference import random_weights, velocity
 

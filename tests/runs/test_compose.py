@@ -14,8 +14,8 @@ from alpasim_plugin.block_fixers.chunk import ChunkRenderer
 from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, resolve_renderer, spec
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import expand

@@ -27,7 +27,8 @@ from alpasim_plugin.alpasim.server.sources import (
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import RendererSpec
-from alpasim_plugin.core.parts.spec import digest, file_digest
+from alpasim_plugin.core.parts.spec import digest
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
@@ -257,10 +258,7 @@ def assemble(settings: Settings) -> Assembled:
     shaping = {
         "device": settings.device,
         "reliability": settings.reliability,
-        "masks": {
-            camera: file_digest(path, f"mask of {camera}")
-            for camera, path in settings.masks.items()
-        },
+        "masks": {camera: file_sha256(path) for camera, path in settings.masks.items()},
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,
         "shutter": settings.shutter,

@@ -12,7 +12,6 @@ holds it to that.
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import os
 import threading
@@ -34,6 +33,7 @@ from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, w
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.printing import warn
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -451,7 +451,4 @@ def _file_digest(factory: Callable[..., Any]) -> str | None:
         file = inspect.getsourcefile(factory)
     except (TypeError, OSError):  # no Python source: a built-in, or typed after -c
         return None
-    if file is None or not os.path.isfile(file):
-        return None
-    with open(file, "rb") as source:
-        return hashlib.file_digest(source, "sha256").hexdigest()
+    return file_sha256(file) if file is not None and os.path.isfile(file) else None

@@ -34,9 +34,9 @@ from alpasim_plugin.core.parts.spec import (
     KindName,
     PartSpec,
     digest,
-    file_digest,
     part_digest,
 )
+from alpasim_plugin.core.reading import file_sha256
 
 
 @dataclass(frozen=True)
@@ -354,7 +354,12 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
     declared = declaration_of(factory, spec.settings)
     folder = module.parent if module else Path()
     paths = {key: folder / path for key, path in declared.files.items()}
-    shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}") for key, path in paths.items()}
+    shas = {
+        key: file_sha256(
+            path, f"correct a path of the {spec.kind} {spec.name!r}, or install it again"
+        )
+        for key, path in paths.items()
+    }
     digest = None
     if not declared.is_remote:
         attribute = spec.target.rpartition(":")[2]

@@ -139,22 +139,6 @@ def digest(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def file_digest(path: Path, what: str) -> str:
-    """Return the SHA-256 of a file that a part names as its own.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"{what}: {path}: {error.strerror or str(error)}",
-            "correct the path, or install the part again with its files",
-        ) from error
-
-
 def part_digest(
     modules: Sequence[Path], attribute: str, settings: BaseModel | None, files: Mapping[str, str]
 ) -> str:

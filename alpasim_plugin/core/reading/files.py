@@ -5,6 +5,7 @@ Packed data are unpacked to a stated size at most: a few bytes can claim to be t
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.limits import (
+    ARCHIVE_BYTES,
     DEPTH,
     FILE_BYTES,
     JSON_BYTES,
@@ -137,6 +139,12 @@ def read_bytes(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK
     """Return a file's bytes; see `open_regular`."""
     with open_regular(path, bound, do_this) as stream:
         return stream.read(os.fstat(stream.fileno()).st_size)
+
+
+def file_sha256(path: Path | str, do_this: str = CHECK_PATH) -> str:
+    """Return the SHA-256 of a file's content in hexadecimal; see `open_regular`."""
+    with open_regular(path, ARCHIVE_BYTES, do_this) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def read_text(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_PATH) -> str:

@@ -5,7 +5,6 @@ Tensors keep their stored precision by default; ``dtype`` converts the floating 
 
 from __future__ import annotations
 
-import hashlib
 import io
 import pickle
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,8 @@ from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import WEIGHT_BYTES
-from alpasim_plugin.core.reading import check_regular, parsing
+from alpasim_plugin.core.reading import check_regular, file_sha256, parsing
+from alpasim_plugin.core.reading.files import open_regular
 
 StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")
@@ -60,7 +60,7 @@ def load_weights(
             f"{path}: sha256 {found}, not {sha256.lower()}",
             "download the file again or correct the expected digest",
         )
-    with path.open("rb") as file:
+    with open_regular(path, WEIGHT_BYTES) as file:
         head = file.read(9)
     # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like
     # the start of a pickle.
@@ -75,12 +75,6 @@ def load_weights(
     if dtype is None:
         return tensors
     return {key: convert(key, value, dtype, str(path)) for key, value in tensors.items()}
-
-
-def file_sha256(path: str | Path) -> str:
-    """Return a file's digest in hexadecimal."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def unwrap(content: object, source: str) -> StateDict:
@@ -227,7 +221,10 @@ def _load_pickle(path: Path, device: str) -> object:
     try:
         # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold
         # transformer-engine states, which are dropped.
-        with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
+        with (
+            open_regular(path, WEIGHT_BYTES) as file,
+            torch.serialization.safe_globals([io.BytesIO]),
+        ):
             return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(

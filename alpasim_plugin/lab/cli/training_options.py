@@ -12,7 +12,7 @@ import torch
 import typer
 from rich.console import Console
 
-from alpasim_plugin.fixers.network.checkpoints import file_sha256
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.recipes.recipe import Stage

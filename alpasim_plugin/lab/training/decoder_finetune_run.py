@@ -15,10 +15,11 @@ from alpasim_plugin.block_fixers.networks import streaming_dit
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
-from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips

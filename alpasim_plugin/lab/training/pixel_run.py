@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, save_bundle
-from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.episode_references import USUAL_REFERENCES

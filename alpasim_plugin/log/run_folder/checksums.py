@@ -6,11 +6,14 @@ would cost more than it finds; any other is read in full.
 
 from __future__ import annotations
 
-import hashlib
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from typing_extensions import TypedDict
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import exists, file_sha256
 
 
 class FileFacts(TypedDict):
@@ -21,23 +24,15 @@ class FileFacts(TypedDict):
     sha256: str
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal digits; OSError if it cannot be
-    read.
-    """
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
     """Return the facts of those of the named files that are there."""
     facts: dict[str, FileFacts] = {}
     for name in names:
         path = folder / name
-        if path.is_file():
+        if os.path.isfile(path):
             state = path.stat()
             facts[name] = FileFacts(
-                bytes=state.st_size, mtime_ns=state.st_mtime_ns, sha256=sha256_of(path)
+                bytes=state.st_size, mtime_ns=state.st_mtime_ns, sha256=file_sha256(path)
             )
     return facts
 
@@ -50,17 +45,17 @@ def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:
         facts: What was stated of it when it was written.
         full: Read its content even if size and time are as stated.
     """
-    if not path.exists():
+    if not exists(path):
         return "missing"
-    if not path.is_file():
+    if not os.path.isfile(path):
         return "not a file"
+    state = path.stat()
+    if state.st_size != facts["bytes"]:
+        return f"{state.st_size} bytes, written with {facts['bytes']}"
+    if state.st_mtime_ns == facts["mtime_ns"] and not full:
+        return None
     try:
-        state = path.stat()
-        if state.st_size != facts["bytes"]:
-            return f"{state.st_size} bytes, written with {facts['bytes']}"
-        if state.st_mtime_ns == facts["mtime_ns"] and not full:
-            return None
-        digest = sha256_of(path)
-    except OSError as error:
-        return f"cannot be read: {error.strerror}"
+        digest = file_sha256(path)
+    except InputError as error:
+        return error.message
     return None if digest == facts["sha256"] else "not the content that was written"

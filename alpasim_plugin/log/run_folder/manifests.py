@@ -7,6 +7,8 @@ command.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +28,8 @@ from alpasim_plugin.log.run_folder.schema import (
 from alpasim_plugin.log.run_folder.shapes import REQUIRED_OF_RUN, ManifestFile, RunInfo
 
 AGAIN = "Give the command of the run again: finished rollouts are kept."
+
+DIGEST = "sha256"  # of the rest of a manifest
 
 Action = Literal["none", "score", "drive"]
 
@@ -77,7 +81,14 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     files: dict[str, FileFacts] = {}
     if manifest.get("status") == "ok":
         files = checksums_of(folder, [*DRIVEN, *DERIVED])
-    write_json(folder / MANIFEST, {**manifest, "files": files})
+    content = {**manifest, "files": files}
+    write_json(folder / MANIFEST, content | {DIGEST: _digest_of(content)})
+
+
+def _digest_of(manifest: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a manifest's content, but for the digest that stands in it."""
+    content = {key: value for key, value in manifest.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -88,6 +99,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     manifest = cast("dict[str, Any]", read_json_as(ManifestFile, path, do_this=AGAIN))
+    if manifest.get(DIGEST, _digest_of(manifest)) != _digest_of(manifest):
+        raise InputError(f"{path}: not the content that was written", AGAIN)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
         raise InputError(f"{path} names {others[0]!r}, which no rollout has.", AGAIN)

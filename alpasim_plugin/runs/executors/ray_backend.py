@@ -8,7 +8,6 @@ a node that differs ends the run with an error that names it.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import signal
@@ -24,10 +23,11 @@ from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.atomic import disk_error
-from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
+from alpasim_plugin.core.reading import exists, file_sha256, read_bytes
 from alpasim_plugin.core.subprocesses import own_path_only
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
@@ -222,9 +222,8 @@ def _code_of(target: str) -> str:
 @cache
 def _sha256_of(path: str) -> str:
     try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:12]
-    except OSError:
+        return file_sha256(path)[:12]
+    except InputError:
         return MISSING
 
 
@@ -246,7 +245,7 @@ def read_rollout(folder: Path, node: str) -> DrivenRollout:
     """Read the folder of a rollout that was just driven; of a failed one what its parts printed."""
     manifest = read_manifest(folder)
     names = [*manifest["files"]] or [OUTPUT_NAME]
-    files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
+    files = {name: read_bytes(folder / name) for name in names if exists(folder / name)}
     return DrivenRollout({"node": node, **manifest}, files)
 
 

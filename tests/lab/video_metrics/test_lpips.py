@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.video_metrics.image_distance import (
     FOLDER_VARIABLE,
     available,
