@@ -18,7 +18,7 @@ from pydantic import Field
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
-from alpasim_plugin.core.reading import exists
+from alpasim_plugin.core.reading import exists, read_text
 from scenarios.schema_parts import Part, within
 from scenarios.sources import import_advice, source_of
 
@@ -49,7 +49,7 @@ def shipped() -> dict[str, str]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     found = {**shipped_names(), **suites()}
     return {
-        name: str(yaml.load(file.read_text(), loader).get("description", ""))
+        name: str(yaml.load(read_text(file), loader).get("description", ""))
         for name, file in found.items()
     }
 

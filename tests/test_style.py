@@ -123,3 +123,43 @@ def test_no_module_binds_a_name_twice() -> None:
         if names:
             twice[module.name] = names
     assert twice == {}
+
+
+# Module -> why it opens files by itself.
+READERS = {
+    "alpasim_plugin.core.reading.files": "it is the reader",
+    "alpasim_plugin.cli.main": "the null device",
+    "alpasim_plugin.core.reading.arrays": "memory maps, after `check_regular`",
+    "alpasim_plugin.core.reading.tables": "parquet, after `check_regular`",
+    "alpasim_plugin.core.atomic": "what it has just written",
+    "alpasim_plugin.core.lock": "a lock file, after a check of its own",
+    "alpasim_plugin.gaussians.files.ply": "large arrays, of a stream from `open_regular`",
+    "alpasim_plugin.cli.new": "templates inside the package",
+    "alpasim_plugin.alpasim.bridge.build": "sources inside the package",
+}
+READING = {"open", "os.open", "np.load", "np.fromfile", "np.memmap", "cv2.imread", "pq.ParquetFile"}
+
+
+def reads_files(module: Module) -> bool:
+    """Tell whether a module opens files for reading other than by `alpasim_plugin.core.reading`."""
+    for node in module.nodes:
+        if not isinstance(node, ast.Call):
+            continue
+        mode = node.args[0].value if node.args and isinstance(node.args[0], ast.Constant) else ""
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        if (
+            dotted(node.func) in READING
+            or (name in ("read_bytes", "read_text") and not node.args)
+            or (name == "open" and mode in ("r", "rb"))
+        ):
+            return True
+    return False
+
+
+def test_files_are_read_in_one_place_which_refuses_pipes_and_devices() -> None:
+    found = {
+        module.name
+        for module in modules()
+        if not module.name.startswith("alpasim_plugin.lab") and reads_files(module)
+    }
+    assert found == set(READERS)

@@ -14,6 +14,7 @@ from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Positional
+from alpasim_plugin.core.reading import read_text
 
 FOLDERS = (
     Path(__file__).resolve().parents[2] / "docs",
@@ -41,7 +42,7 @@ def docs(
             f"{FOLDERS[1]}: this installation has no pages",
             "Install the wheel with pip, or use a checkout.",
         )
-    texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}
+    texts = {path.stem: read_text(path) for path in sorted(folder.glob("*.md"))}
     if page is None:
         titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in texts.items()}
         show(as_json, titles, *(f"{name:<24}{title}" for name, title in titles.items()))

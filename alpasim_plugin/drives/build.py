@@ -5,7 +5,6 @@ Read `import_drive` downwards.
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ import torch
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_bytes, read_json
+from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
@@ -275,8 +274,7 @@ def finished(out: Path, key: str) -> dict[str, Any]:
 def begin(work: Path, key: str) -> None:
     """Make the working folder, or keep that of the same import; another one's is removed."""
     if work.exists() and (
-        not (work / KEY_FILE).is_file()
-        or json.loads((work / KEY_FILE).read_text()).get("key") != key
+        not (work / KEY_FILE).is_file() or read_json_object(work / KEY_FILE).get("key") != key
     ):
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)

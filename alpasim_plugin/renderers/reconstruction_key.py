@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading.arrays import read_npz
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
@@ -226,11 +226,7 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
 
 
 def _read_sky_views(path: Path) -> list[SkyView]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            sizes, Ks, Ts, bits = (file[key] for key in ("size", "K", "T_camera_world", "sky"))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: {error}", DO_THIS) from error
+    sizes, Ks, Ts, bits = read_npz(path, ("size", "K", "T_camera_world", "sky"), DO_THIS)
     views, first = [], 0
     for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
         length = -(-width * height // 8)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +28,9 @@ import yaml
 from alpasim_plugin.core.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.parts import require_installed
+from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.core.types import (
     RolloutLog,
     Scenario,
@@ -161,20 +164,19 @@ def _archive_of(ref: ScenarioRef) -> Path:
 def _copy(path: Path, source: Path, scenario: Scenario) -> None:
     with (
         atomic_file(path) as partial,
-        zipfile.ZipFile(source) as old,
+        open_regular(source, ARCHIVE_BYTES) as stream,
+        zipfile.ZipFile(stream) as old,
         zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
     ):
         for info in old.infolist():
-            data = old.read(info)
             if info.filename == "metadata.yaml":
-                metadata = yaml.safe_load(data)
-                if metadata["scene_id"] != scenario.scene_id:
-                    data = yaml.safe_dump(
-                        metadata | {"scene_id": scenario.scene_id}, sort_keys=False
-                    ).encode()
+                metadata = yaml.safe_load(old.read(info)) | {"scene_id": scenario.scene_id}
+                new.writestr(info, yaml.safe_dump(metadata, sort_keys=False))
             elif info.filename == "rig_trajectories.json":
-                data = _with_vehicle(data, scenario)
-            new.writestr(info, data)
+                new.writestr(info, _with_vehicle(old.read(info), scenario))
+            else:
+                with old.open(info) as member, new.open(info, "w") as copy:
+                    shutil.copyfileobj(member, copy)
 
 
 def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:

@@ -23,6 +23,7 @@ from typing import Any
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
     EgoState,
     Frame,
@@ -352,9 +353,6 @@ def _continuation(
     one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]
 ) -> Mapping[str, Any] | str:
     difference = first_difference(one, other, *where)
-    if (
-        difference is None
-        and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes()
-    ):
+    if difference is None and file_sha256(past.folder / LOG_NAME) != file_sha256(folder / LOG_NAME):
         difference = Difference("log", where[0], None, "an entry that belongs to no component")
     return "equal" if difference is None else difference.as_dict()

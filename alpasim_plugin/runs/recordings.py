@@ -20,6 +20,7 @@ from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
+from alpasim_plugin.core.reading import read_json
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
@@ -32,7 +33,7 @@ Rgb = tuple[float, float, float]
 Message = dict[str, Any]
 Item = tuple[int, str, Message, Message]  # time in microseconds, topic, schema, message
 
-SCHEMAS: dict[str, Message] = json.loads(Path(__file__).with_name("foxglove.json").read_text())
+SCHEMAS: dict[str, Message] = read_json(Path(__file__).with_name("foxglove.json"))
 NUMBER = {"type": "number"}
 RENDERER_COLORS: tuple[Rgb, ...] = (
     (0.04, 0.42, 0.70),

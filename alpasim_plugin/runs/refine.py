@@ -25,6 +25,7 @@ from alpasim_plugin.core.atomic import atomic_folder, write_bytes
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.reading import natural_order
+from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter
@@ -80,9 +81,7 @@ class PictureFolderReader:
             yield TimedFrame(image, index, 1)
 
     def _read(self, name: str) -> U8:
-        image = cv2.imread(str(self.path / name), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise self._refusal(f"{name} is no readable picture", "give complete PNG files")
+        image = read_image(self.path / name, cv2.IMREAD_UNCHANGED)
         if image.dtype != np.uint8:
             raise self._refusal(
                 f"{name} has {8 * image.dtype.itemsize} bits a channel", "give pictures of 8 bits"

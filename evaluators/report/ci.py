@@ -12,6 +12,7 @@ from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.escape import xml as clean
+from alpasim_plugin.core.reading import exists, read_text
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.sides import Row
@@ -339,7 +340,7 @@ def append_job_summary(text: str) -> Path | None:
     if not named:
         return None
     path = Path(named)
-    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    before = read_text(path) if exists(path) else ""
     before = before.rstrip("\n") + "\n\n" if before else ""
     room = MAX_BYTES - len(before.encode())
     if room > len(CUT_NOTE):

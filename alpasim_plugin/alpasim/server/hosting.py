@@ -23,6 +23,7 @@ import grpc
 from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.reading import read_bytes, read_text
 from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, V1ALPHA, Reflection, handlers
 
@@ -68,8 +69,8 @@ class HostPolicy:
             return None
         if self.tls_cert is None or self.tls_key is None:
             raise InputError("TLS: one of certificate and key", "give --tls-cert and --tls-key")
-        ca = None if self.tls_client_ca is None else read_pem(self.tls_client_ca)
-        pair = read_pem(self.tls_key), read_pem(self.tls_cert)
+        ca = None if self.tls_client_ca is None else read_bytes(self.tls_client_ca)
+        pair = read_bytes(self.tls_key), read_bytes(self.tls_cert)
         return grpc.ssl_server_credentials(
             [pair], root_certificates=ca, require_client_auth=ca is not None
         )
@@ -83,14 +84,6 @@ class HostPolicy:
             )
 
 
-def read_pem(path: Path) -> bytes:
-    """Return a file's bytes, or raise `InputError`."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or str(error)}", "name a PEM file") from error
-
-
 def read_token(path: Path | None) -> str | None:
     """Return the token in a file, without the space around it; None without a file.
 
@@ -99,10 +92,7 @@ def read_token(path: Path | None) -> str | None:
     """
     if path is None:
         return None
-    try:
-        token = path.read_text().strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: {error}", "name a readable text file") from error
+    token = read_text(path).strip()
     if not token:
         raise InputError(f"{path}: an empty file", "write the token into it")
     return token

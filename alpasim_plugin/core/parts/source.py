@@ -20,6 +20,7 @@ from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import file_sha256, read_bytes
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
 INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions
@@ -39,7 +40,7 @@ def package_digest() -> str:
     for package in OWN_PACKAGES:
         for path in sorted(Path(OWN_ROOT, package).rglob("*.py")):
             name = path.relative_to(OWN_ROOT).as_posix().encode()
-            hashed.update(name + hashlib.sha256(path.read_bytes()).digest())
+            hashed.update(name + bytes.fromhex(file_sha256(path)))
     return hashed.hexdigest()
 
 
@@ -58,7 +59,7 @@ def code_digest(file: str | Path) -> str:
         return package_digest()
     hashed = hashlib.sha256(package_digest().encode())
     for module in sorted(reached(path)):
-        hashed.update(hashlib.sha256(Path(module).read_bytes()).digest())
+        hashed.update(bytes.fromhex(file_sha256(module)))
     return hashed.hexdigest()
 
 
@@ -105,7 +106,7 @@ def _imports(path: str, root: str) -> Iterator[list[str]]:
     """Yield the dotted name of everything that a module may import, relative ones made absolute."""
     package = list(Path(os.path.relpath(path, root)).parent.parts)
     try:
-        tree = ast.parse(Path(path).read_bytes())
+        tree = ast.parse(read_bytes(path))
     except (SyntaxError, ValueError):  # the import itself will say so
         return
     for node in ast.walk(tree):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from numpy.lib import format as npy_format
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import WEIGHT_BYTES
-from alpasim_plugin.core.reading.files import FETCH_AGAIN, check_regular, parsing
+from alpasim_plugin.core.reading.files import FETCH_AGAIN, check_regular, open_regular, parsing
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,6 +39,13 @@ def open_npy(path: Path | str, do_this: str = FETCH_AGAIN) -> Array:
     check_regular(path, do_this=do_this)
     with parsing(path, do_this, NO_ARRAY):
         return npy_format.open_memmap(path, mode="r")
+
+
+def read_npz(path: Path | str, names: Sequence[str], do_this: str = FETCH_AGAIN) -> list[Array]:
+    """Return the named arrays of a ``.npz`` file; see `parse_npy` for what is refused."""
+    with open_regular(path) as stream, parsing(path, do_this, NO_ARRAY):
+        arrays = np.load(stream, allow_pickle=False)
+        return [arrays[name] for name in names]
 
 
 def read_checkpoint(path: Path, facts: str) -> tuple[dict[str, str], dict[str, Tensor]]:

@@ -391,7 +391,8 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
             f"{header.path}, element {name!r}: the header announces {element.count} rows of {element.dtype.itemsize} bytes, the file ends after {rows}",
             _EXPORT_AGAIN,
         )
-    return np.fromfile(header.path, dtype=element.dtype, count=element.count, offset=element.offset)
+    with open_regular(header.path) as stream:
+        return np.fromfile(stream, element.dtype, element.count, offset=element.offset)
 
 
 def _text_rows(

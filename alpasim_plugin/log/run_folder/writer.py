@@ -21,6 +21,7 @@ from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.printing import warn
+from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
     KEYS,
@@ -182,8 +183,7 @@ def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
         held: list[pa.Table] = []
         rows = 0
         for part in parts:
-            with pq.ParquetFile(part) as file:
-                held.append(file.read(use_threads=False))  # a few kilobytes each
+            held.append(read_parquet(part, {}))  # a few kilobytes each
             rows += len(held[-1])
             if rows >= GROUP_ROWS:
                 writer.write_table(pa.concat_tables(held))
