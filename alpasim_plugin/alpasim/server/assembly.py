@@ -16,7 +16,7 @@ from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, resolve_served
 from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
-from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
+from alpasim_plugin.alpasim.server.hosting import read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
 from alpasim_plugin.alpasim.server.shutters import Shutter
 from alpasim_plugin.alpasim.server.sources import (
@@ -28,7 +28,7 @@ from alpasim_plugin.alpasim.server.sources import (
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading import file_sha256, read_bytes
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
@@ -120,7 +120,7 @@ class Upstream:
                     "give ?ca=FILE as well",
                 )
             return grpc.insecure_channel(self.address, options)
-        credentials = grpc.ssl_channel_credentials(read_pem(self.ca))
+        credentials = grpc.ssl_channel_credentials(read_bytes(self.ca))
         if self.token is not None:
             credentials = grpc.composite_channel_credentials(
                 credentials, grpc.access_token_call_credentials(self.token)
