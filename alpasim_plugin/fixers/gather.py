@@ -15,7 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState
+from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState, sparse_source
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
@@ -397,4 +397,14 @@ def _resize(x: Tensor, factor: float, method: int) -> Tensor:
     return out
 
 
-CPU = Operations(gather_cells, gather_references, likeness, offsets, blend, smaller, larger)
+CPU = Operations(
+    gather_cells,
+    gather_references,
+    likeness,
+    offsets,
+    blend,
+    smaller,
+    larger,
+    sparse_source,
+    asks=True,
+)

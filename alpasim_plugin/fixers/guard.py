@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.image_metrics import is_black
-from alpasim_plugin.core.types import U8
+from alpasim_plugin.core.types import F32, U8
 
 NAN = "fixer-nan"
 RANGE = "fixer-range"
@@ -37,23 +37,30 @@ AROUND = 2 * REACH + 1
 MAPPED = 0.02  # share of a cell's range that drawn map covers
 
 
-def failures(video: Tensor) -> list[str]:
-    """Check a view's decoded frames before they are clipped.
+def measures(video: Tensor) -> Tensor:
+    """Measure decoded frames before they are clipped.
 
     Args:
-        video: ``(3, T, H, W)``, meant to lie in [-1, 1].
+        video: ``(T, ...)`` in any layout, meant to lie in [-1, 1].
 
     Returns:
-        T events, "" where a frame is fine.
+        ``(T, 3)`` float32: lowest and highest value, NaN where one is anywhere in the frame, and
+        the share of values beyond `LIMIT`.
     """
-    low = video.amin((0, 2, 3)).float()  # NaN where one is anywhere in the frame
-    high = video.amax((0, 2, 3)).float()
-    finite = (low.isfinite() & high.isfinite()).tolist()
-    beyond = ((low < -LIMIT) | (high > LIMIT)).tolist()
-    events = ["" if fine else NAN for fine in finite]
-    for t, far in enumerate(beyond):
-        if finite[t] and far and float((video[:, t].abs() > LIMIT).float().mean()) > SHARE:
-            events[t] = RANGE
+    values = video.flatten(1)
+    counts = [torch.count_nonzero(frame.abs() > LIMIT) for frame in values]
+    beyond = torch.stack(counts) / values.shape[1]
+    return torch.stack([values.amin(1).float(), values.amax(1).float(), beyond], dim=1)
+
+
+def failures(measured: F32) -> list[str]:
+    """Return the failure of frames as `measures` gave them, "" where a frame is fine."""
+    events = []
+    for low, high, beyond in measured:
+        if not (np.isfinite(low) and np.isfinite(high)):
+            events.append(NAN)
+        else:
+            events.append(RANGE if beyond > SHARE else "")
     return events
 
 
@@ -71,11 +78,11 @@ def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:
     return float(np.abs(raw.astype(np.int16) - raw_before).mean()) > MOVED
 
 
-def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
+def check_frames(measured: F32, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
     """Return the failure of each frame of one view.
 
     Args:
-        video: ``(3, T, H, W)`` as decoded.
+        measured: ``(T, 3)``, the frames as decoded; see `measures`.
         fixed: ``(T, H, W, 3)`` the same as images.
         raw: ``(T, H, W, 3)`` what the fixer was given.
         before: Last fixed and raw frame of the previous block, if there was one.
@@ -83,7 +90,7 @@ def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     Returns:
         T events, "" where a frame is fine.
     """
-    events = failures(video)
+    events = failures(measured)
     for t, event in enumerate(events):
         last = (fixed[t - 1], raw[t - 1]) if t else before
         if not event and black(fixed[t], raw[t]):
@@ -93,10 +100,16 @@ def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     return events
 
 
-def keep_render(
-    out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor, recorded: Tensor
+def render_share(
+    out: Tensor,
+    render: Tensor,
+    opacity: Tensor,
+    sdmap: Tensor,
+    before: Tensor,
+    asks: bool = False,
 ) -> Tensor | None:
-    """Put the render back where the change is not believable; None where nothing is put back.
+    """Return the weight ``(B, H, W, 1)`` with which the render is put back where the change is not
+    believable: 0 nearly everywhere.
 
     Args:
         out: ``(B, H, W, 3)`` generated frame, in the range from -1 to 1 or a little beyond.
@@ -104,25 +117,12 @@ def keep_render(
         opacity: ``(B, H, W, 1)``.
         sdmap: Like ``out``; black where it shows nothing.
         before: The last output, like ``out``.
-        recorded: ``(B, H, W, 1)`` share of the references, which are evidence of their own: what
-            they show stays.
-    """
-    share = render_share(out, render, opacity, sdmap, before)
-    return None if share is None else torch.lerp(out, render, share * (1 - recorded))
-
-
-def render_share(
-    out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor
-) -> Tensor | None:
-    """Return the weight of the render in the image ``(B, H, W, 1)``, 0 nearly everywhere; None
-    where it is 0 everywhere; arguments as of `keep_render`.
+        asks: Return None as soon as it is known that the weight is 0 everywhere; see `Operations`.
     """
     change = _cells((out - render).abs_()).mean(1, keepdim=True)
-    if float(change.amax()) <= LARGE[0]:
+    if asks and float(change.amax()) <= LARGE[0]:
         return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
-    if not trusted.any():
-        return None
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED
     now, past = _cells(out), _cells(before)
     low, high = -F.max_pool2d(-past, AROUND, 1, REACH), F.max_pool2d(past, AROUND, 1, REACH)
@@ -130,11 +130,10 @@ def render_share(
     below = torch.relu(low - now).amax(1, keepdim=True)
     unseen = _ramp(above + below, LARGE[0] / 2, LARGE[1] / 2)
     share = trusted * unseen * ~mapped
-    if not share.any():
+    if asks and not share.any():
         return None
-    return F.interpolate(share, scale_factor=CELL, mode="bilinear", align_corners=False).permute(
-        0, 2, 3, 1
-    )
+    whole = F.interpolate(share, scale_factor=CELL, mode="bilinear", align_corners=False)
+    return whole.permute(0, 2, 3, 1)
 
 
 def _cells(x: Tensor) -> Tensor:

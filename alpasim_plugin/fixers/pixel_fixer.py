@@ -10,29 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
-from alpasim_plugin.core.types import F32, I64, U8, Frame
+from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.guard import keep_render
+from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import (
     GRID_PX,
     PixelState,
     content_key,
-    pixel_noise,
-    sparse_source,
+    noise_key,
 )
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.trust import trust
+from alpasim_plugin.fixers.trust import trust_facts, trust_sums
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
 
 
@@ -82,9 +81,12 @@ def fix_frame(
         t = render.new_full((len(render),), level.sigma)
         out, after = predict(interpolant(out, source(index), level.sigma), t)
     if settings.keep_render:
-        kept = keep_render(out, render, inputs.opacity, inputs.sdmap, state.output, after.recorded)
-        if kept is not None:
-            out, after = kept, after._replace(output=kept.clamp(-1, 1))
+        share = render_share(
+            out, render, inputs.opacity, inputs.sdmap, state.output, generator.operations.asks
+        )
+        if share is not None:
+            out = torch.lerp(out, render, share * (1 - after.recorded))
+            after = after._replace(output=out.clamp(-1, 1))
     return out, after
 
 
@@ -193,23 +195,18 @@ class PixelFixer(Fixer):
             check_continues(view, pasts)
         out, after = list(block), dict(pasts)
         for view in views:
-            for camera, index, made, event in self._fix(view, pasts):
-                frame = replace(block[index[0]], references=())
-                if event:  # the render is returned, and nothing of the network's
-                    out[index[0]] = replace(frame, events=(*frame.events, event))
+            for fixed in self._fix(view, pasts):
+                frame = replace(block[fixed.index], references=())
+                if fixed.event:  # the render is returned, and nothing of the network's
+                    frame = replace(frame, events=(*frame.events, fixed.event))
                 else:
-                    out[index[0]] = replace(
-                        frame, rgb=made.fixed, facts={**frame.facts, **_trust(made)}
-                    )
-                after[camera] = made
+                    facts = {**frame.facts, **fixed.facts}
+                    frame = replace(frame, rgb=fixed.history.fixed, facts=facts)
+                out[fixed.index] = frame
+                after[fixed.camera] = fixed.history
         return tuple(out), after
 
-    def _fix(
-        self, view: Views, histories: Mapping[str, CameraHistory]
-    ) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
-        """Return per camera its name, the places of its frames in the block, its history after the
-        frame, and the guard's event.
-        """
+    def _fix(self, view: Views, histories: Mapping[str, CameraHistory]) -> list[FixedView]:
         start, device = self.generator.net.start, self.generator.device
         inputs = to_inputs(view, device, self.settings.scale_of(*view.shape))
         pasts = [histories.get(camera) for camera in view.cameras]
@@ -220,24 +217,21 @@ class PixelFixer(Fixer):
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
 
+        frames = [
+            count if self.settings.noise == "rollout" else content_key(t_us[0], rgb[0])
+            for count, t_us, rgb in zip(counts, view.t_us, view.rgb, strict=True)
+        ]
+
         def source(draw: int) -> Tensor:
             everywhere = self.settings.holes == "everywhere"
             if self.settings.holes == "render" or (view.alpha is None and not everywhere):
                 return inputs.render
-
-            def noise(b: int, pixels: I64) -> F32:
-                frame = (
-                    counts[b]
-                    if self.settings.noise == "rollout"
-                    else content_key(view.t_us[b][0], view.rgb[b, 0])
-                )
-                return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, frame, pixels)
-
-            return sparse_source(
-                inputs.render,
-                torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity,
-                noise,
-            )
+            keys = [
+                noise_key(self.scene_id, self.seed, camera, draw, frame)
+                for camera, frame in zip(view.cameras, frames, strict=True)
+            ]
+            opacity = torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity
+            return self.generator.operations.source(inputs.render, opacity, keys)
 
         joined = (
             PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
@@ -245,40 +239,60 @@ class PixelFixer(Fixer):
             else states[0]
         )
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
-        shown = after.output[:, :height, :width].cpu().numpy()
-        images = np.stack([cv2.convertScaleAbs(one, alpha=HALF, beta=HALF) for one in shown])
-        found = []
+        visible = slice(None), slice(height), slice(width)
+        images, measured, sums = download(
+            _grey_levels(after.output[visible]),
+            guard.measures(video[visible]),
+            trust_sums(after.output[visible], after.render[visible], after.recorded[visible]),
+        )
+        fixed = []
         for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
             before = None if past is None else (past.fixed, past.raw)
             raw = view.rgb[b, 0]
-            event = guard.check_frames(
-                video[b, :height, :width].permute(2, 0, 1)[:, None],
-                images[b : b + 1],
-                raw[None],
-                before,
-            )[0]
-            state = PixelState(*(part[b : b + 1] for part in after))
+            at = slice(b, b + 1)
+            event = guard.check_frames(measured[at], images[at], raw[None], before)[0]
+            state = PixelState(*(part[at] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
-                state = start(inputs.render[b : b + 1], inputs.scale)
-            found.append(
-                (
-                    camera,
-                    view.index[b],
-                    CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]),
-                    event,
-                )
-            )
-        return found
+                state = start(inputs.render[at], inputs.scale)
+            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b])
+            facts = {} if event else trust_facts(sums[b], height, width)
+            fixed.append(FixedView(camera, view.index[b][0], history, event, facts))
+        return fixed
 
 
-def _trust(made: CameraHistory) -> dict[str, float | str]:
-    """Return where a camera's last image comes from, without the padding below and to the right
-    of it.
+@dataclass(frozen=True)
+class FixedView:
+    """One camera's frame after the network.
+
+    Attributes:
+        camera: Its name.
+        index: Place of its frame in the block.
+        history: Its past for the next frame.
+        event: What the guard found; empty where the frame is fine.
+        facts: Where the image comes from.
     """
-    height, width = made.fixed.shape[:2]
-    parts = (made.state.output, made.state.render, made.state.recorded)
-    output, render, recorded = (part[0, :height, :width].cpu().float().numpy() for part in parts)
-    return trust(output, render, recorded[..., 0])
+
+    camera: str
+    index: int
+    history: CameraHistory
+    event: str
+    facts: dict[str, float | str]
+
+
+def _grey_levels(images: Tensor) -> Tensor:
+    """Convert images in [-1, 1] to bytes, rounded to nearest; what is no number becomes black."""
+    levels = (images * HALF).add_(HALF).round_().clamp_(0, 255)
+    return levels.nan_to_num_(0.0).to(torch.uint8)
+
+
+def download(*parts: Tensor) -> list[Any]:
+    """Return tensors as arrays, brought to the host in one copy."""
+    data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
+    pieces = data.cpu().split([part.nbytes for part in parts])
+    return [
+        piece.clone().view(part.dtype).view(part.shape).numpy()
+        for piece, part in zip(pieces, parts, strict=True)
+    ]
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:

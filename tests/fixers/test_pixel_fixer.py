@@ -204,10 +204,10 @@ def share(
 ) -> Tensor:
     road = torch.full((1, 64, 64, 3), -0.2)
     before = road if before is None else before
-    found = render_share(
-        out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before
-    )
-    return torch.zeros(1, 64, 64, 1) if found is None else found
+    cover = torch.full((1, 64, 64, 1), opacity)
+    found = render_share(out, road, cover, torch.full_like(road, sdmap), before)
+    assert found is not None
+    return found
 
 
 def invented(level: float = 0.9) -> Tensor:

@@ -2,6 +2,7 @@
 the start.
 """
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -11,7 +12,9 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     PixelGenerator,
     PixelSizes,
     PixelState,
+    dense_source,
     hole_mask,
+    pixel_noise,
     pixel_source,
     sparse_source,
 )
@@ -138,17 +141,13 @@ def test_noise_enters_holes_alone() -> None:
     opacity = torch.tensor([0.0, 0.25, 0.5, 0.9, 1.0])
     assert hole_mask(opacity).tolist() == [0, 0.5, 1, 1, 1]
     ((render, alpha, _),) = frames(1)
-    eps = torch.randn_like(render)
-    dense = pixel_source(render, alpha, eps)
-    asked: list[int] = []
-
-    def draw(b: int, at: object) -> object:
-        asked.append(len(at))  # type: ignore[arg-type]
-        return eps[b].view(-1, 3)[torch.from_numpy(at)].numpy()  # type: ignore[arg-type]
-
-    torch.testing.assert_close(sparse_source(render, alpha, draw), dense)  # type: ignore[arg-type]
-    assert asked == [int((a < 0.5).sum()) for a in alpha]
-    assert sparse_source(render, torch.ones_like(alpha), draw) is render  # type: ignore[arg-type]
+    keys = [2**63 + 5, 7][: len(render)]
+    everywhere = np.arange(render[0, ..., 0].numel())
+    noise = [pixel_noise(key, everywhere).reshape(render.shape[1:]) for key in keys]
+    dense = pixel_source(render, alpha, torch.from_numpy(np.stack(noise)))
+    torch.testing.assert_close(sparse_source(render, alpha, keys), dense)
+    torch.testing.assert_close(dense_source(render, alpha, keys), dense)
+    assert sparse_source(render, torch.ones_like(alpha), keys) is render
 
 
 def test_half_precision_gives_the_same_picture() -> None:

@@ -6,11 +6,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS
-from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MADE_UP, MOST_COLUMNS, trust, trust_cells
+from alpasim_plugin.fixers.trust import (
+    CELL_PX,
+    LEVELS,
+    MADE_UP,
+    MOST_COLUMNS,
+    trust_cells,
+    trust_facts,
+    trust_sums,
+)
 from evaluators.viewer.pictures import seen_before, trust_by_time
+
+
+def trust(output: np.ndarray, render: np.ndarray, recorded: np.ndarray) -> dict[str, float | str]:
+    images = (torch.from_numpy(x)[None] for x in (output, render, recorded[..., None]))
+    return trust_facts(trust_sums(*images)[0].numpy(), *recorded.shape)
 
 
 @pytest.mark.parametrize(

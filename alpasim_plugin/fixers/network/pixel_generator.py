@@ -16,7 +16,7 @@ function of rollout, camera, frame, step and pixel.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import NamedTuple, Self
 
@@ -85,14 +85,13 @@ def pixel_source(render: Tensor, opacity: Tensor, eps: Tensor) -> Tensor:
     return m * render + (1 - m) * eps
 
 
-def sparse_source(render: Tensor, opacity: Tensor, draw: Callable[[int, I64], F32]) -> Tensor:
-    """Return `pixel_source` with noise that is drawn only where it has weight.
+def sparse_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tensor:
+    """Return `pixel_source` with noise that is drawn only where it has weight, on the processor.
 
     Args:
         render: ``(B, H, W, 3)``.
         opacity: ``(B, H, W, 1)``.
-        draw: Called per image that has a hole with its place in the batch and row-major indices
-            ``(N,)``; returns ``(N, 3)``.
+        keys: `noise_key` of each image.
     """
     source = render
     for b, alpha in enumerate(opacity[..., 0].flatten(1)):
@@ -100,36 +99,78 @@ def sparse_source(render: Tensor, opacity: Tensor, draw: Callable[[int, I64], F3
         if not len(holes):
             continue
         source = source.clone() if source is render else source
-        eps = torch.from_numpy(draw(b, holes.cpu().numpy().astype(np.int64))).to(render.device)
+        eps = torch.from_numpy(pixel_noise(keys[b], holes.numpy()))
         pixels = source[b].view(-1, render.shape[-1])
         pixels[holes] = pixel_source(pixels[holes], alpha[holes, None], eps)
     return source
 
 
-def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pixels: I64) -> F32:
+def dense_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tensor:
+    """Return what `sparse_source` does, to rounding, without leaving the device."""
+    height, width = render.shape[1:3]
+    index = torch.arange(height * width * CHANNELS, device=render.device)
+    noise = [_normal_on_device(index, key).view(height, width, CHANNELS) for key in keys]
+    return pixel_source(render, opacity, torch.stack(noise))
+
+
+def _normal_on_device(index: Tensor, key: int) -> Tensor:
+    """Return the values of `pixel_noise` at flat positions ``(N,)``, float32."""
+    u, v = (
+        _uniform_on_device(_signed(key) + (2 * index + i + 1) * _signed(int(ODD))) for i in (0, 1)
+    )
+    return (torch.sqrt(-2 * torch.log(u)) * torch.cos(2 * torch.pi * v)).float()
+
+
+def _uniform_on_device(x: Tensor) -> Tensor:
+    """Return what `_uniform` does; int64 stands for unsigned numbers, modulo 2^64."""
+    for shift, factor in MIX:
+        x = (x ^ _shifted(x, int(shift))) * _signed(int(factor))
+    x = x ^ _shifted(x, int(LAST))
+    return (_shifted(x, 11).double() + 1) * 2.0**-53
+
+
+def _shifted(x: Tensor, bits: int) -> Tensor:
+    """Shift int64 to the right, zeros coming in."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _signed(value: int) -> int:
+    """Return the int64 of the same 64 bits."""
+    return (value + 2**63) % 2**64 - 2**63
+
+
+def noise_key(scene_id: str, seed: int, camera: str, draw: int, frame: int) -> int:
+    """Return the key of a frame's noise.
+
+    Args:
+        scene_id, seed, camera: Of the stream.
+        draw: Flow step.
+        frame: Index in the rollout, or `content_key`.
+    """
+    return derive_seed(scene_id, seed, f"fixer/{camera}/{draw}", frame)
+
+
+def pixel_noise(key: int, pixels: I64) -> F32:
     """Draw standard normal values for some pixels of a frame; a pixel's values do not depend on
     which others are asked for.
 
     Drawing whole frames would take longer than the network: holes are about one pixel in a hundred.
 
     Args:
-        scene_id, seed, camera: Key of the stream.
-        draw: Flow step.
-        frame: Index in the rollout, or `content_key`.
+        key: See `noise_key`.
         pixels: ``(N,)`` row-major indices in the image.
 
     Returns:
         ``(N, 3)``.
 
     Example:
-        >>> few, many = (pixel_noise("s", 0, "front", 0, 3, np.array(p)) for p in ([7], [5, 7]))
+        >>> few, many = (pixel_noise(3, np.array(p)) for p in ([7], [5, 7]))
         >>> bool((few[0] == many[1]).all())
         True
     """
-    key = np.uint64(derive_seed(scene_id, seed, f"fixer/{camera}/{draw}", frame))
     index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
     with np.errstate(over="ignore"):  # arithmetic modulo 2^64
-        u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
+        u, v = (_uniform(np.uint64(key) + (index + np.uint64(i + 1)) * ODD) for i in range(2))
     normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)  # Box and Muller, 1958
     return np.asarray(normal, np.float32)
 
@@ -223,7 +264,17 @@ def gather_cells(
     return GatheredCells(coarse, fine)
 
 
-TORCH = Operations(gather_cells, gather_references, likeness, offsets, blend, smaller, larger)
+TORCH = Operations(
+    gather_cells,
+    gather_references,
+    likeness,
+    offsets,
+    blend,
+    smaller,
+    larger,
+    dense_source,
+    asks=False,
+)
 
 
 class PixelGenerator(nn.Module):

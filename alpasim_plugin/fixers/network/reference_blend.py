@@ -20,7 +20,7 @@ network gives it no weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -87,6 +87,8 @@ class Operations:
         blend: See `blend`.
         smaller: Average images ``(B, H, W, C)`` over squares of a number of pixels.
         larger: Enlarge images ``(B, H, W, C)`` bilinearly by a whole number.
+        source: See `pixel_generator.sparse_source`.
+        asks: Whether work is saved by looking at values in between; on a GPU that would wait.
     """
 
     gather_cells: Callable[[Tensor, Tensor, Tensor, PixelState, Tensor], GatheredCells]
@@ -96,6 +98,8 @@ class Operations:
     blend: Callable[[Tensor, Tensor, BlendHeads, int], tuple[Tensor, Tensor]]
     smaller: Callable[[Tensor, int], Tensor]
     larger: Callable[[Tensor, int], Tensor]
+    source: Callable[[Tensor, Tensor, Sequence[int]], Tensor]
+    asks: bool
 
 
 class ReferenceBlend(nn.Module):

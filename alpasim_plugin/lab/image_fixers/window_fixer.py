@@ -142,9 +142,9 @@ class WindowFixer(MaplessFixer):
             video = self._run(view)
             images = to_images(video, view.size)
             for b, mine in enumerate(view.index):
-                for t, event in enumerate(
-                    guard.check_frames(video[b], images[b], view.rgb[b], None)
-                ):
+                measured = guard.measures(video[b].transpose(0, 1)).cpu().numpy()
+                events = guard.check_frames(measured, images[b], view.rgb[b], None)
+                for t, event in enumerate(events):
                     i = mine[t]
                     out[i] = (
                         replace(block[i], events=(*block[i].events, event))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.network.pixel_generator import pixel_noise
+from alpasim_plugin.fixers.network.pixel_generator import noise_key, pixel_noise
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from tests.examples import first_of
 from tests.fixers.clip_cases import SIZE, pixels
@@ -31,7 +31,7 @@ def test_streaming_equals_the_rollout_of_the_training(tmp_path: Path, holes: str
     everywhere = np.arange(SIZE[0] * SIZE[1])
     eps = np.stack(
         [
-            pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3)
+            pixel_noise(noise_key("scene", 0, "front", 0, i), everywhere).reshape(*SIZE, 3)
             for i in range(len(FRAMES))
         ]
     )
