@@ -61,7 +61,7 @@ Examples:
 
 - `simrun --renderer clean,3dgs --executor 'ray?cores=2' suites/urban`
 
-- `simrun --renderer clean,3dgs --until-decided suites/urban`: stop as soon as it is decided whether 3dgs is worse than clean
+- `simrun --renderer clean,3dgs --until-decided --metric offroad=0.1 suites/all`: stop as soon as it is decided whether 3dgs is worse than clean
 """
 
 
@@ -263,7 +263,7 @@ def question_of(metrics: Sequence[str]) -> Question:
             for name, rule in spec.metrics.items()
             if rule.margin is not None
         )
-        return Question(asked, min_scenes=spec.min_scenes)
+        return Question(asked)
     questions = {}
     for text in metrics:
         name, _, margin = text.partition("=")

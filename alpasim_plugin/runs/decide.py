@@ -33,12 +33,14 @@ from alpasim_plugin.runs.run import (
 )
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.statistics.decision import (
+    MOST_SCENES,
     SCHEMA_VERSION,
     WORDS,
     Decision,
     Question,
     SceneDifferences,
     State,
+    least_scenes,
     look_as_dict,
     outcome_of,
     question_as_dict,
@@ -88,7 +90,7 @@ def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
         question: What is to be decided; its digest goes into the plan.
 
     Raises:
-        InputError: The plan has another number of variants, or fewer scenes than a decision takes.
+        InputError: The plan has another number of variants, or too few scenes for the good answer.
     """
     variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
     named = plan.options.baseline
@@ -105,10 +107,13 @@ def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
             f"--until-decided: {len(variants)} variants",
             "Name two renderers or two policies: the baseline and the one in question.",
         )
-    if len(plan.scenarios) < question.min_scenes:
+    n_scenes = len(plan.scenarios)
+    if least_scenes(question, n_scenes) is None:
+        least = least_scenes(question) or f"more than {MOST_SCENES}"
+        margins = ", ".join(f"{one.metric}={one.margin:g}" for one in question.metrics)
         raise InputError(
-            f"--until-decided: {len(plan.scenarios)} scenes, a decision takes at least {question.min_scenes}",
-            "Name more scenes, or drive these without --until-decided and use simrun gate.",
+            f"--until-decided: {n_scenes} scenes, the margins {margins} take at least {least}",
+            "Name more scenes or wider margins, or use simrun gate, which is about these scenes.",
         )
     kept = {(variant.renderer, variant.policy) for variant in variants}
     cells = tuple(cell for cell in plan.cells if (cell.renderer.name, cell.policy.name) in kept)

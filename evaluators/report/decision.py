@@ -18,10 +18,6 @@ from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.verdicts import WORDS
 
 WORST_CASE = "any bound"
-POPULATIONS = {
-    "scenes": "about the population that the scenes were drawn from",
-    "suite": "about the mean over the {} scenes of this suite with these seeds",
-}
 
 
 def verdict_text(decision: Decision) -> str:
@@ -41,10 +37,10 @@ def verdict_text(decision: Decision) -> str:
 def guarantee(decision: Decision) -> list[str]:
     """Say what is guaranteed, of what, and how far."""
     question = decision["question"]
-    about = POPULATIONS[question["population"]].format(decision["ceiling"]["scenes"])
     share = f"{100 * question['alpha']:g} %"
     return [
-        f"wrong in at most {share} of runs, over all interim analyses; {about}",
+        f"wrong in at most {share} of runs, over all interim analyses; "
+        "about the population that the scenes were drawn from",
         question["rule"],
     ]
 

@@ -13,14 +13,14 @@ ceiling. A bet follows its derivative, as if scenes were normal, from the capita
 and the variance so far; it never risks more than `AT_RISK` of the capital.
 
 Sources: Waudby-Smith and Ramdas, Estimating means of bounded random variables by betting, JRSS B
-    86, 2024 (section 5: without replacement); Siegmund, Sequential Analysis, 1985, equation 3.15
+    86, 2024; Siegmund, Sequential Analysis, 1985, equation 3.15
     (first passage of Brownian motion to a line).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy  # its submodules load on first use
@@ -42,22 +42,15 @@ LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 @dataclass(frozen=True)
 class Draws:
-    """Differences of scenes in the order drawn, with the line on which their conditional mean lies.
-
-    If the mean asked about is m, the expected value of scene i given all scenes before it is
-    ``offset[i] + slope[i] * m``.
+    """Differences of scenes in the order drawn.
 
     Attributes:
         x: ``(..., n)`` differences between ``-reach`` and ``reach``, positive is worse.
         reach: Greatest possible size of a difference.
-        offset: ``(..., n)`` known before the scene is drawn.
-        slope: ``(..., n)`` above 0, known before the scene is drawn.
     """
 
     x: F64
     reach: float
-    offset: F64
-    slope: F64
 
     @property
     def n(self) -> int:
@@ -66,32 +59,7 @@ class Draws:
 
     def mirrored(self) -> Draws:
         """Return the draws of the negated difference."""
-        return replace(self, x=-self.x, offset=-self.offset)
-
-
-def independent(x: F64, reach: float) -> Draws:
-    """Return draws ``(..., n)`` from a population: each scene has the mean asked about, whatever
-    came before.
-    """
-    x = np.asarray(x, dtype=np.float64)
-    return Draws(x, reach, np.zeros_like(x), np.ones_like(x))
-
-
-def without_replacement(x: F64, reach: float, size: int) -> Draws:
-    """Return draws ``(..., n)`` without replacement from a suite, whose own mean is asked about.
-
-    If that mean is m, the scenes left before draw i (from 0) have the mean (size m - sum of the
-    drawn) / (size - i).
-
-    Args:
-        x: Differences as driven.
-        reach: As in `Draws`.
-        size: Scenes of the suite.
-    """
-    x = np.asarray(x, dtype=np.float64)
-    left = size - np.arange(x.shape[-1], dtype=np.float64)
-    before = np.cumsum(x, axis=-1) - x
-    return Draws(x, reach, -before / left, np.broadcast_to(size / left, x.shape))
+        return Draws(-self.x, self.reach)
 
 
 @dataclass(frozen=True)
@@ -175,8 +143,7 @@ def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
     The variance is the mean square about the threshold of the scenes so far, and of `PRIOR_SCENES`
     imagined ones with the standard deviation `PRIOR_WIDTH` times the range.
     """
-    center = draws.offset + draws.slope * threshold
-    gain = draws.x - center
+    gain = draws.x - threshold
     square = gain**2
     scenes_before = np.arange(draws.n)
     imagined = PRIOR_SCENES * (2.0 * PRIOR_WIDTH * draws.reach) ** 2
@@ -188,12 +155,12 @@ def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
     root_left = np.sqrt(np.maximum(plan.horizon - scenes_before, 1) / plan.horizon)
     slope = plan.slope(spread) * root_left
     scale = spread * root_left * math.sqrt(plan.horizon)
-    limit = _largest_bets(-draws.reach - center)
+    limit = _largest_bets(np.array(-draws.reach - threshold))
     capital = np.zeros(draws.x.shape[:-1])
     bets = np.empty_like(gain)
     for i in range(draws.n):
         wanted = relative_slope(capital - plan.log_bar, slope[..., i]) / scale[..., i]
-        bet = np.minimum(growing(wanted, fourth[..., i] / variance[..., i]), limit[..., i])
+        bet = np.minimum(growing(wanted, fourth[..., i] / variance[..., i]), limit)
         bets[..., i] = bet
         capital = capital + np.log1p(bet * gain[..., i])
     return bets
@@ -222,15 +189,15 @@ def growing(wanted: F64, tail: F64) -> F64:
 def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
     """Return the log of the capital ``(..., n)`` of one who bets that the mean is above ``mean``.
 
-    It falls with ``mean``, for every course of the values. A mean that is impossible, since all
-    scenes left could not make up for it, has an infinite capital against it.
+    It falls with ``mean``, for every course of the values. Below ``-reach``, which no mean can be,
+    it is infinite.
 
     Args:
         draws: The scenes.
         mean: ``(...)`` or one number: the hypothesis is that the mean is at most this.
         sizes: From `bet_sizes`.
     """
-    center = draws.offset + draws.slope * np.asarray(mean, dtype=np.float64)[..., None]
+    center = np.asarray(mean, dtype=np.float64)[..., None]
     least_gain = -draws.reach - center
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log1p(np.minimum(sizes, _largest_bets(least_gain)) * (draws.x - center))

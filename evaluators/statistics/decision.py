@@ -15,6 +15,7 @@ Bonferroni does. All metrics are non-inferior if each is (intersection-union tes
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,19 +34,17 @@ from evaluators.statistics.betting import (
     Draws,
     Plan,
     bet_sizes,
-    independent,
     log_capital,
     lower_bound,
-    without_replacement,
 )
 from evaluators.statistics.paired import reach_of
 from evaluators.statistics.verdicts import Cause, Outcome
 
-Population = Literal["scenes", "suite"]
 Answer = Literal["good", "bad", "open"]
 
 DECISION = "decision.json"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
+MOST_SCENES = 4000  # that are asked for
 AGAIN = "give the command of the run again: finished rollouts are kept"
 WORDS: dict[Answer, str] = {"good": "non-inferior", "bad": "worse", "open": "undecided"}
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
@@ -84,15 +83,10 @@ class Question:
     Attributes:
         metrics: One or several.
         alpha: Probability that the decision is wrong, over all interim analyses.
-        population: ``scenes``: scenes are draws from a population, and its mean is asked about;
-            ``suite``: the mean over this suite's scenes.
-        min_scenes: Scenes before any decision.
     """
 
     metrics: tuple[MetricQuestion, ...]
     alpha: float = 0.05
-    population: Population = "scenes"
-    min_scenes: int = 2
 
     @property
     def rule(self) -> str:
@@ -255,9 +249,7 @@ class State:
     metrics: tuple[MetricState, ...]
 
 
-def state_after(
-    question: Question, values: Mapping[str, F64], horizon: int, size: int | None = None
-) -> State:
+def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> State:
     """Return the state after the scenes so far, however often one looked before.
 
     Args:
@@ -265,11 +257,12 @@ def state_after(
         values: METRIC -> ``(n,)`` differences in the order drawn, positive is worse; NaN where a
             scene has none.
         horizon: Most scenes that can be driven: the ceiling that bets are made for.
-        size: Scenes of the suite; None: all can be driven.
     """
     n = len(next(iter(values.values())))
     evidence = [
-        _Evidence.of(asked, question, values[asked.metric], horizon, size or horizon)
+        _Evidence.of(
+            asked, values[asked.metric], Plan(asked.margin or None, horizon, question.alpha)
+        )
         for asked in question.metrics
     ]
     paths = [one_metric.paths(len(question.metrics), n) for one_metric in evidence]
@@ -278,11 +271,9 @@ def state_after(
     bar = -math.log(question.alpha)
     is_good: Bool = log_good >= bar
     is_bad: Bool = log_bad >= bar
-    answer: Answer = "open"
-    if n >= question.min_scenes:
-        binding = [asked.binding for asked in question.metrics]
-        all_good = is_good[binding].all(axis=0) & any(binding)
-        answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
+    binding = [asked.binding for asked in question.metrics]
+    all_good = is_good[binding].all(axis=0) & any(binding)
+    answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
     states = []
     for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
         x = values[asked.metric]
@@ -299,6 +290,21 @@ def state_after(
     return State(n, answer, tuple(states))
 
 
+def least_scenes(question: Question, most: int = MOST_SCENES) -> int | None:
+    """Return how many scenes without a single difference give the good answer; None where ``most``
+    do not.
+    """
+
+    def is_good(n: int) -> bool:
+        values = {asked.metric: np.zeros(n) for asked in question.metrics}
+        return state_after(question, values, n).answer == "good"
+
+    numbers = range(1, most + 1)
+    if not is_good(most):
+        return None
+    return numbers[bisect_left(numbers, True, key=is_good)]
+
+
 @dataclass(frozen=True)
 class _Evidence:
     """The evidence on one metric.
@@ -308,29 +314,18 @@ class _Evidence:
         draws: The differences that are known.
         places: ``(k,)`` scenes to which they belong.
         plan: Of the bets.
-        suite_mean: The mean of a suite all of whose scenes are driven, else None.
     """
 
     question: MetricQuestion
     draws: Draws
     places: I64
     plan: Plan
-    suite_mean: float | None
 
     @classmethod
-    def of(
-        cls, asked: MetricQuestion, question: Question, x: F64, horizon: int, size: int
-    ) -> _Evidence:
+    def of(cls, asked: MetricQuestion, x: F64, plan: Plan) -> _Evidence:
         known = np.flatnonzero(np.isfinite(x))
         reach = asked.reach
-        kept = np.clip(x[known], -reach, reach)
-        draws = independent(kept, reach)
-        if question.population == "suite":
-            # Scenes without a difference are left out of the suite.
-            draws = without_replacement(kept, reach, size - len(x) + len(known))
-        is_whole = question.population == "suite" and len(known) == len(x) == size
-        plan = Plan(asked.margin or None, horizon, question.alpha)
-        return cls(asked, draws, known, plan, float(x.mean()) if is_whole else None)
+        return cls(asked, Draws(np.clip(x[known], -reach, reach), reach), known, plan)
 
     def paths(self, sharing: int, n: int) -> tuple[F64, F64]:
         """Return the log e-processes for the good and for the bad answer after each of n scenes.
@@ -353,11 +348,6 @@ class _Evidence:
         else:
             good = self._above(mirror, -margin)
             bad = self._above(self.draws, margin, sharing)
-        if self.suite_mean is not None:
-            is_two_sided = self.question.facts.direction == "none"
-            harm = abs(self.suite_mean) if is_two_sided else self.suite_mean
-            answered = good if harm <= margin else bad
-            answered[-1] = np.inf
         return self._over_scenes(good, n), self._over_scenes(bad, n)
 
     def _above(self, draws: Draws, mean: float, sharing: int = 1) -> F64:
@@ -376,8 +366,6 @@ class _Evidence:
 
     def interval(self) -> tuple[float | None, float | None]:
         """Return the bounds of the mean, positive is worse."""
-        if self.suite_mean is not None:
-            return self.suite_mean, self.suite_mean
         if self.draws.n == 0:
             return None, None
         return self._bound(self.draws, 1.0), -self._bound(self.draws.mirrored(), -1.0)
@@ -427,10 +415,8 @@ class MetricAsked(TypedDict):
 class AskedRecord(TypedDict):
     """The question."""
 
-    population: str  # scenes or suite
     alpha: float  # probability of a wrong decision over all interim analyses
     rule: str  # how several metrics are joined
-    min_scenes: int
     metrics: dict[str, MetricAsked]
 
 
@@ -476,10 +462,8 @@ class Decision(TypedDict):
 def question_as_dict(question: Question) -> AskedRecord:
     """Return a question for JSON."""
     return {
-        "population": question.population,
         "alpha": question.alpha,
         "rule": question.rule,
-        "min_scenes": question.min_scenes,
         "metrics": {
             asked.metric: {"margin": asked.margin, "binding": asked.binding}
             for asked in question.metrics

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.statistics.decision import Question, metric_question, outcome_of, state_after
+from evaluators.statistics.decision import (
+    Question,
+    least_scenes,
+    metric_question,
+    outcome_of,
+    state_after,
+)
 
 
 def rng(key: int) -> np.random.Generator:
@@ -97,29 +103,23 @@ def test_scenes_without_a_pair_leave_the_evidence_as_it_was():
     assert with_holes.metrics[0] == without.metrics[0]
 
 
-def test_a_suite_that_is_driven_whole_is_decided_by_its_mean():
-    question = asked(("offroad", 0.1), population="suite")
-    for changed, answer in ((1, "good"), (2, "good"), (3, "bad")):  # 5, 10 and 15 % of 20 scenes
-        x = np.zeros(20)
-        x[[3, 9, 19][-changed:]] = 1.0
-        state = state_after(question, {"offroad": x}, 20)
-        assert state.answer == answer
-        assert state.metrics[0].interval == pytest.approx((changed / 20, changed / 20))
-
-
-def test_no_decision_falls_before_the_fewest_scenes_and_none_on_nothing():
-    question = asked(("lateral_distance_m", 0.1), min_scenes=30)
-    x = np.full(40, -1.0)
-    assert [state_after(question, {"lateral_distance_m": x[:n]}, 40).answer for n in (29, 30)] == [
-        "open",
-        "good",
-    ]
+def test_nothing_is_decided_on_nothing():
+    question = asked(("lateral_distance_m", 0.1))
     nothing = state_after(question, {"lateral_distance_m": np.full(4, np.nan)}, 40)
     assert (nothing.answer, nothing.metrics[0].diff, nothing.metrics[0].interval) == (
         "open",
         None,
         (None, None),
     )
+
+
+def test_the_scenes_that_a_good_answer_takes_are_counted_before_any_is_driven():
+    question = asked(("offroad", 0.2), ("progress", 0.1))
+    least = least_scenes(question)
+    for n, answer in ((least - 1, "open"), (least, "good")):
+        values = {"offroad": np.zeros(n), "progress": np.zeros(n)}
+        assert state_after(question, values, n).answer == answer
+    assert least_scenes(question, least - 1) is None
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,7 @@ from evaluators.statistics.betting import (
     USUAL_SLOPE,
     Draws,
     Plan,
-    independent,
     relative_slope,
-    without_replacement,
 )
 from evaluators.statistics.decision import closed
 
@@ -83,7 +81,7 @@ def plain_log_capital(
 
 
 def first(draws: Draws, n: int) -> Draws:
-    return Draws(draws.x[..., :n], draws.reach, draws.offset[..., :n], draws.slope[..., :n])
+    return Draws(draws.x[..., :n], draws.reach)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.33, 1.4, 4.05, 9.7, 25.0])
@@ -121,7 +119,7 @@ def test_the_capital_is_a_martingale_where_the_mean_is_the_hypothesis_by_enumera
     n, mean = 7, float(values @ chances)
     courses = np.array(list(itertools.product(range(len(values)), repeat=n)))
     chance = np.prod(chances[courses], axis=1)
-    found = capital(independent(values[courses], 1.0), mean)
+    found = capital(Draws(values[courses], 1.0), mean)
     assert np.sum(chance[:, None] * found, axis=0) == pytest.approx(np.ones(n), abs=1e-12)
     # given any beginning, too: the mean over what can come next is the capital now
     for t in range(1, n):
@@ -137,19 +135,9 @@ def test_the_capital_is_a_martingale_where_the_mean_is_the_hypothesis_by_enumera
 def test_below_the_hypothesis_the_capital_only_shrinks_on_average():
     values, chances = np.array([-1.0, 0.0, 1.0]), np.array([0.15, 0.8, 0.05])
     courses = np.array(list(itertools.product(range(3), repeat=6)))
-    found = capital(independent(values[courses], 1.0), 0.1)
+    found = capital(Draws(values[courses], 1.0), 0.1)
     means = np.sum(np.prod(chances[courses], axis=1)[:, None] * found, axis=0)
     assert np.all(np.diff(means, prepend=1.0) < 0)
-
-
-SUITE = np.array([0.0, 1.0, 0.0, -0.5, 0.25, 0.1, 0.9])
-
-
-def test_without_replacement_the_capital_is_a_martingale_over_all_orders_of_a_suite():
-    orders = np.array(list(itertools.permutations(range(7))))
-    found = capital(without_replacement(SUITE[orders], 1.0, 7), float(SUITE.mean()))
-    assert found[:, :6].mean(axis=0) == pytest.approx(np.ones(6), rel=1e-9)
-    assert np.mean(found.max(axis=1) >= 5.0) <= 0.2
 
 
 HARD = {
@@ -167,7 +155,7 @@ HARD = {
 def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
     x = HARD[case]
     plan = Plan(distance, max(50, len(x)), 0.05)
-    draws = independent(x, 1.0)
+    draws = Draws(x, 1.0)
     found = betting.log_capital(draws, 0.05, betting.bet_sizes(draws, 0.05, plan))
     assert found == pytest.approx(
         plain_log_capital(list(x), -1.0, 1.0, 0.05, plan), rel=1e-9, abs=1e-9
@@ -177,7 +165,7 @@ def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
 
 @given(st.lists(st.sampled_from([-1.0, -0.2, 0.0, 0.0, 0.4, 1.0]), min_size=1, max_size=25))
 def test_the_capital_falls_with_the_hypothesis_and_bounds_are_nested(values):
-    draws = independent(np.array(values), 1.0)
+    draws = Draws(np.array(values), 1.0)
     sizes = betting.bet_sizes(draws, 0.05, PLAN)
     ladder = np.stack(
         [betting.log_capital(draws, mean, sizes) for mean in np.linspace(-1.0, 1.0, 41)]
@@ -191,13 +179,6 @@ def test_the_capital_falls_with_the_hypothesis_and_bounds_are_nested(values):
     if lows[-1] > -1.0:
         assert betting.log_capital(draws, lows[-1], sizes).max() >= PLAN.log_bar
         assert betting.log_capital(draws, lows[-1] + 1e-6, sizes).max() < PLAN.log_bar
-
-
-def test_a_suite_whose_scenes_left_cannot_make_up_for_it_is_refuted_at_once():
-    draws = without_replacement(np.array([1.0, 1.0, 1.0]), 1.0, 4)
-    assert betting.log_capital(draws, 0.49, np.full(3, 1e-9))[-1] < 1.0  # the mean can still be 0.5
-    late = without_replacement(np.array([1.0, 1.0, 1.0, 0.5]), 1.0, 4)
-    assert betting.log_capital(late, 0.4, np.full(4, 1e-9))[-1] == np.inf
 
 
 # --- several metrics

@@ -149,7 +149,12 @@ def test_a_damaged_record_is_refused(decided_run, tmp_path: Path) -> None:
         read_decision(tmp_path)
 
 
-def test_when_all_scenes_are_driven_the_decision_is_undecided(tmp_path: Path) -> None:
+def test_when_all_scenes_are_driven_the_decision_is_undecided(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError):
+        decide(tmp_path, CLOSER, plan_of(2))
+    monkeypatch.setattr(decide_module, "least_scenes", lambda question, most: most)
     decided, announced = decide(tmp_path, CLOSER, plan_of(2))
     assert (decided.outcome.exit_code, decided.record["rollouts"]) == (3, 4)
     assert announced.looks == [(2, "open")]
@@ -167,11 +172,13 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
     words = ["--renderer", f"{GREY},{DARKER}", "--policy", BY_GREY, "--images", "none"]
     words += ["--until-decided", "--metric", "offroad=0.6", "--no-report", "--workers", "1"]
     words += [word for text in SHORT for word in ("--set", text)]
-    words += ["--quiet", "smoke/straight", "smoke/curve", "--out", str(tmp_path / "run")]
-    assert run_command(words) == 3
+    scenes = ["smoke/straight", "smoke/curve", "hard/sharp_s_curve", "urban/s_bend"]
+    words += ["--quiet", *scenes, "--out", str(tmp_path / "run")]
+    assert run_command(words) == 2  # four scenes do not decide
+    assert run_command([*words, "urban/dusk_street"]) == 0
     assert capsys.readouterr().out.startswith("verdict  ")
-    assert run_command([*words, "--json"]) == 3
-    assert json.loads(capsys.readouterr().out)["decision"]["verdict"] == "undecided"
+    assert run_command([*words, "urban/dusk_street", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["decision"]["verdict"] == "non-inferior"
 
 
 @pytest.mark.parametrize(
@@ -222,7 +229,7 @@ def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path: Path
 )
 def test_any_two_variants_can_be_asked_about(renderers, policies, baseline, variants) -> None:
     options = RunOptions(images="none", baseline=baseline)
-    one = replace(SAME, min_scenes=1)
+    one = replace(SAME, alpha=0.7)  # of which one scene is enough
     plan = make_plan(expand("smoke/straight", SHORT), renderers, policies, (0,), options)
     part = plan_of_two(plan, one)
     assert {f"{cell.renderer.name}/{cell.policy.name}" for cell in part.cells} == variants
@@ -238,4 +245,4 @@ def test_four_variants_without_one_of_them_as_baseline_are_refused() -> None:
             RunOptions(baseline=baseline),
         )
         with pytest.raises(InputError):
-            plan_of_two(plan, replace(SAME, min_scenes=1))
+            plan_of_two(plan, replace(SAME, alpha=0.7))
