@@ -88,12 +88,13 @@ def gate(
             "Score the run with that preset.",
         )
     rows = None
-    repeatable = [is_repeatable(stored_run)]
+    repeatable = is_repeatable(stored_run)
     if baseline_file is not None:
         baseline = read_baseline(baseline_file)
         check_matches(baseline, stored_run, baseline_file)
         rows = baseline.rows
-        repeatable.append(baseline.repeatable)
+        if baseline.repeatable is False:
+            repeatable = False
     verdict = judge(
         table_of_run(stored_run),
         spec,
@@ -101,7 +102,7 @@ def gate(
         str(baseline_file or ""),
         stored_run.table,
         preset,
-        is_noisy=False in repeatable,
+        repeatable,
     )
     files = write_gate_files(verdict, source, stored_run, out or run, rows)
     if out is None and (run / PAGES[0]).is_file():

@@ -148,7 +148,7 @@ def run(
     ] = (),
     repeat: Annotated[
         bool,
-        Flag("Drive one rollout twice and say whether the policy is repeatable.", "--repeat"),
+        Flag("Drive a rollout of each policy twice and say whether it is repeatable.", "--repeat"),
     ] = False,
     dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,

@@ -1,4 +1,4 @@
-"""Drive one rollout of a run a second time, to see whether the policy is repeatable."""
+"""Drive a rollout of each policy a second time, to see whether it is repeatable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.log.trace import Key, first_difference, trace_log
 from alpasim_plugin.runs.cell import run_cell
-from alpasim_plugin.runs.plan import RunPlan
+from alpasim_plugin.runs.plan import Cell, RunPlan
 
 
 def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
@@ -23,7 +23,7 @@ def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
 def repeat_rollout(
     plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
 ) -> dict[str, Any]:
-    """Drive the shortest finished rollout of a run again and compare the two logs.
+    """Drive the shortest finished rollout of each policy again and compare the two logs.
 
     Times that depend on the clock are no part of the comparison. Rollouts whose latency is measured
     depend on the machine, so none of them is repeated.
@@ -35,7 +35,8 @@ def repeat_rollout(
         threads: Threads of the second rollout.
 
     Returns:
-        ``repeatable`` (None where nothing could be compared), ``reason`` for None, ``cell``,
+        Of the first policy that is not repeatable, else of one that could not be compared, else of
+        any: ``repeatable`` (None where nothing could be compared), ``reason`` for None, ``cell``,
         ``digests`` of the two logs, and ``first_difference`` (component, t_us, step, what) or None.
     """
     finished = [
@@ -43,15 +44,21 @@ def repeat_rollout(
         for cell, manifest in zip(plan.cells, manifests, strict=True)
         if manifest["status"] == "ok" and plan.scenarios[cell.scene].latency.kind != "measured"
     ]
-    if not finished:
-        return _not_compared("no rollout with a fixed latency has finished")
-    cell = min(
+    longest_first = sorted(
         finished,
         key=lambda cell: (
-            plan.scenarios[cell.scene].end_us - plan.scenarios[cell.scene].start_us,
+            plan.scenarios[cell.scene].start_us - plan.scenarios[cell.scene].end_us,
             cell.rollout_key,
         ),
     )
+    shortest = {cell.policy.name: cell for cell in longest_first}
+    if not shortest:
+        return _not_compared("no rollout with a fixed latency has finished")
+    found = [_driven_twice(plan, root, cell, threads) for cell in shortest.values()]
+    return min(found, key=lambda result: (False, None, True).index(result["repeatable"]))
+
+
+def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> dict[str, Any]:
     folder = root / cell.folder
     with scratch_folder(root / "repeat") as scratch:
         again = run_cell(cell, plan.options, scratch, threads)

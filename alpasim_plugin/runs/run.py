@@ -115,7 +115,7 @@ def execute_run(
         command: The command line, for ``run.json``.
         progress: Shows the run.
         resume: Continue in the folder of another command.
-        repeat: Drive one rollout a second time to see whether the policy is repeatable.
+        repeat: Drive a rollout of each policy a second time to see whether it is repeatable.
         report: Write ``report.html``; otherwise `write_reports` makes it later.
         wait: Wait for a process that writes the folder; otherwise refuse.
         limit_s: Seconds that one rollout may take.

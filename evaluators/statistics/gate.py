@@ -31,7 +31,6 @@ from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.report.numbers import plural, short
 from evaluators.statistics.baselines import of_policy, policies_of
-from evaluators.statistics.intervals import TAIL
 from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (
@@ -39,8 +38,8 @@ from evaluators.statistics.suite import (
     Change,
     chances,
     change_of,
-    is_within,
     seeds_that_decide,
+    verdict_of,
 )
 from evaluators.statistics.variants import (
     Base,
@@ -183,10 +182,11 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
 Kind = Literal["margin", "limit"]
 Sides = Mapping[Variant, Side]
 UNNAMED = MetricRule(margin=0.0)  # of an event that ends the scored part
-ABOUT = {
-    "suite": "about these scenes and seeds: what changed is a fact",
-    "noise": "about these scenes; the policy is not repeatable: exact tests over seeds",
-    "scenes": "about all scenes that these were drawn from",
+SCENES = "about all scenes that these were drawn from"
+SUITE = {
+    True: "about these scenes and seeds: what changed is a fact",
+    False: "about these scenes; the policy is not repeatable: exact tests over seeds",
+    None: "about these scenes and seeds; run --repeat has not tried whether the policy is repeatable",
 }
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
@@ -239,7 +239,7 @@ def judge(
     stored_name: str = "",
     known: MetricTable = METRICS,
     preset: str = DEFAULT,
-    is_noisy: bool = False,
+    repeatable: bool | None = None,
 ) -> GateVerdict:
     """Judge rollouts.
 
@@ -250,7 +250,8 @@ def judge(
         stored_name: How to call the stored baseline.
         known: What the metrics are.
         preset: With which both sides were scored.
-        is_noisy: ``run --repeat`` found a policy that is not repeatable on either side.
+        repeatable: What ``run --repeat`` found; False if either side's policy is not; None: not
+            tried, and taken as repeatable.
 
     Raises:
         InputError: A renderer that the gate names is not there, nothing is left to judge, or the
@@ -277,7 +278,9 @@ def judge(
             if spec.population == "scenes":
                 checks += _of_scenes(pair, spec, known)
             else:
-                checks += _of_suite(pair, spec, known, find_preset(preset).stop_after, is_noisy)
+                checks += _of_suite(
+                    pair, spec, known, find_preset(preset).stop_after, repeatable is False
+                )
         for name, rule in spec.metrics.items():
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, variant, known.info(name), rule))
@@ -288,8 +291,8 @@ def judge(
     if base is not None and stored is None:
         kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
         name = f"{kind}{base.name} of the same run"
-    about = "noise" if is_noisy and spec.population == "suite" else spec.population
-    return GateVerdict(worst(outcomes), tuple(checks), failures, name, ABOUT[about])
+    about = SCENES if spec.population == "scenes" else SUITE[repeatable]
+    return GateVerdict(worst(outcomes), tuple(checks), failures, name, about)
 
 
 def _sides(rollouts: RolloutTable | Sequence[Row]) -> Sides:
@@ -444,15 +447,7 @@ def _suite_check(
 ) -> Check:
     metric = change.metric
     max_new = spec.max_new if rule.max_new is None else rule.max_new
-    n_new = len(change.new) if metric.is_flag else 0
-    far = [] if metric.is_flag else change.far_scenes
-    if p is None:
-        is_worse = n_new > max_new if metric.is_flag else bool(far) or change.is_beyond
-        is_shown = True
-    else:
-        is_worse = p <= TAIL and (not metric.is_flag or n_new - change.n_gone > max_new)
-        is_shown = not far and is_within(change)
-    verdict = "worse" if is_worse else "non-inferior" if is_shown else "undecided"
+    verdict = verdict_of(change, p, max_new)
     mean = -change.mean if metric.direction == "higher" else change.mean
     n_missing = len(change.missing)
     entry = {
@@ -468,7 +463,7 @@ def _suite_check(
         "n_scenes": len(change.scenes[0]),
         "n_missing": n_missing,
         "n_neither": change.n_neither,
-        "n_far": len(far),
+        "n_far": 0 if metric.is_flag and p is None else len(change.far_scenes),
         "counts": change.counts(),
         "worst": change.worst(),
         "cut": [f"{scene} seed {seed}" for _, scene, seed in change.cut],

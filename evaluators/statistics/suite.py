@@ -4,9 +4,9 @@ compared with its margin.
 
 Only where the policy is not repeatable may a change be chance. Then the sign of a cell's
 difference is a fair coin if the variants are alike, whatever the distribution (sign-flip test).
-All metrics are flipped together and the largest statistic counts, so that one of many metrics is
-wrongly called worse in at most 2.5 % of runs (Westfall and Young, Resampling-based multiple
-testing, 1993).
+All events are flipped together and the largest statistic counts (Westfall and Young,
+Resampling-based multiple testing, 1993), and so are all other metrics; the two share 2.5 %, so
+that six new events and none gone are just enough.
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Cell, Side
 from evaluators.statistics.intervals import TAIL, cluster_means
-from evaluators.statistics.verdicts import scenes_needed
+from evaluators.statistics.verdicts import Verdict, scenes_needed
 
 ROUNDING = 1e-9  # a smaller difference, relative, may come from another processor
 SCENE_MARGINS = 3.0  # that one scene may be worse
 LISTED = 50  # cells named of a check; counts are always whole
 ENUMERATED = 12  # cells that changed up to which all signs are tried
-FLIPS = 9999  # drawn at random beyond
+FLIPS, BLOCKS = 4990, 10  # drawn at random beyond, in blocks that fit the memory
+EVENT_LEVEL = 2.0**-6  # six of six
+LEVEL = TAIL - EVENT_LEVEL  # of the other metrics
 MOST_SEEDS = 200
 
 
@@ -98,7 +100,9 @@ class Change:
 
     @property
     def new(self) -> list[Cell]:
-        """Give the cells of a flag that have the event now and had not before."""
+        """Give the cells of a flag that have the event now and had not before; none of others."""
+        if not self.metric.is_flag:
+            return []
         return [self.cells[i] for i in np.flatnonzero(self.harm > 0).tolist()]
 
     @property
@@ -198,28 +202,30 @@ def _why(cell: Cell, metric: str, side: Side, here: F64, base: Side, there: F64)
 
 
 def chances(changes: Sequence[Change]) -> list[float]:
-    """Return for each metric the chance that any of them looks this much worse if the variants are
-    alike; of a distance: if it is no worse than its margin.
+    """Return for each metric the chance that any of its family (events, or other metrics) looks this
+    much worse if the variants are alike; of a distance: if it is no worse than its margin.
 
     Args:
         changes: Of one variant, in all metrics that are tested.
     """
     numbers = {cell: i for i, cell in enumerate(sorted({c for one in changes for c in one.cells}))}
-    rows, owners = [], []
-    for owner, change in enumerate(changes):
-        accepted = 0.0 if change.metric.is_flag else change.margin
-        is_either = change.metric.direction == "none" and not change.metric.is_flag
-        for sign in (1.0, -1.0) if is_either else (1.0,):
-            row = np.zeros(len(numbers))
-            places = [numbers[cell] for cell in change.cells]
-            row[places] = sign * change.harm - accepted
-            rows.append(row)
-            owners.append(owner)
-    p = flipped(np.array(rows).reshape(len(rows), len(numbers)))
-    return [
-        min(float(p[i]) for i, owner in enumerate(owners) if owner == k)
-        for k in range(len(changes))
-    ]
+    p = [1.0] * len(changes)
+    for is_flag in (True, False):
+        rows, owners = [], []
+        for owner, change in enumerate(changes):
+            if change.metric.is_flag != is_flag:
+                continue
+            is_either = change.metric.direction == "none" and not is_flag
+            for sign in (1.0, -1.0) if is_either else (1.0,):
+                row = np.zeros(len(numbers))
+                places = [numbers[cell] for cell in change.cells]
+                row[places] = sign * change.harm - (0.0 if is_flag else change.margin)
+                rows.append(row)
+                owners.append(owner)
+        found = flipped(np.array(rows).reshape(len(rows), len(numbers)))
+        for owner, chance in zip(owners, found.tolist(), strict=True):
+            p[owner] = min(p[owner], chance)
+    return p
 
 
 def flipped(rows: F64) -> F64:
@@ -247,11 +253,32 @@ def flipped(rows: F64) -> F64:
         largest = np.max(signs @ scaled.T, axis=1)
         out[is_used] = np.mean(largest[:, None] >= seen - ROUNDING, axis=0)
         return out
-    signs = stream("gate", 0, "gate/flips").choice([1.0, -1.0], size=(FLIPS, n))
-    largest = np.max(signs @ scaled.T, axis=1)
-    reached = np.sum(largest[:, None] >= seen - ROUNDING, axis=0)
+    random = stream("gate", 0, "gate/flips")
+    reached = np.zeros(len(seen))
+    for _ in range(BLOCKS):
+        signs = random.choice([1.0, -1.0], size=(FLIPS // BLOCKS, n))
+        largest = np.max(signs @ scaled.T, axis=1)
+        reached += np.sum(largest[:, None] >= seen - ROUNDING, axis=0)
     out[is_used] = (1 + reached) / (1 + FLIPS)
     return out
+
+
+def verdict_of(change: Change, p: float | None, max_new: int) -> Verdict:
+    """Judge a metric on a suite.
+
+    Args:
+        change: What changed.
+        p: From `chances`; None where the policy is repeatable, so that nothing is chance.
+        max_new: New events accepted.
+    """
+    is_flag = change.metric.is_flag
+    if p is None:
+        is_worse = len(change.new) > max_new if is_flag else change.is_beyond or change.far_scenes
+        return "worse" if is_worse else "non-inferior"
+    more = len(change.new) - change.n_gone
+    if p <= EVENT_LEVEL and more > max_new if is_flag else p <= LEVEL:
+        return "worse"
+    return "non-inferior" if is_within(change) and not change.far_scenes else "undecided"
 
 
 def is_within(change: Change) -> bool:
@@ -297,11 +324,11 @@ def seeds_that_decide(change: Change) -> int | None:
             changed = round(more * (new + gone))
             chance = float(scipy.special.bdtr(round(more * gone), changed, 0.5))
             within = rate_bound(more * new, more * gone, more * n) < change.margin
-            if within or (new > gone and chance <= TAIL):
+            if within or (new > gone and chance <= EVENT_LEVEL):
                 return seeds
         return None
     spread = float(np.std(change.harm, ddof=1)) if n > 1 else 0.0
     cells = scenes_needed(abs(change.margin - change.mean), spread)
-    least = math.ceil(math.log2(1 / TAIL))  # signs that can refute anything
+    least = math.ceil(math.log2(1 / LEVEL))  # signs that can refute anything
     seeds = None if cells is None else math.ceil(max(cells, least) / n_scenes)
     return seeds if seeds is not None and seeds <= MOST_SEEDS else None

@@ -1,4 +1,4 @@
-"""`run --repeat`: one rollout is driven twice and the two logs are compared."""
+"""`run --repeat`: a rollout of each policy is driven twice and the two logs are compared."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
 FORGETFUL = "tests.runs.broken_policies:RemembersEarlierRollouts"
 
 
-def plan_of(policy: str, *overrides: str) -> RunPlan:
+def plan_of(policies: str, *overrides: str) -> RunPlan:
     refs = [
         *expand("smoke/lead_car", (LONGER, *BARE, *overrides)),
         *expand("smoke/straight", (SHORT, *BARE, *overrides)),
     ]
-    return make_plan(refs, ("clean",), (policy,), (0,), RunOptions(images="none"))
+    return make_plan(refs, ("clean",), policies.split(","), (0,), RunOptions(images="none"))
 
 
 def repeated(plan: RunPlan, root: Path) -> dict:
@@ -43,7 +43,8 @@ def test_the_shortest_rollout_is_repeatable(tmp_path: Path, policy: str) -> None
 
 
 def test_a_policy_that_remembers_is_not_repeatable(tmp_path: Path) -> None:
-    found = repeated(plan_of(FORGETFUL), tmp_path)
+    found = repeated(plan_of(f"constant-velocity,{FORGETFUL}"), tmp_path)
+    assert found["cell"]["policy"] == FORGETFUL
     assert found["repeatable"] is False
     assert found["first_difference"]["component"] == "plans"
     assert "NOT" in repeat_line(found)

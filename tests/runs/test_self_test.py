@@ -42,7 +42,7 @@ def test_a_blunt_gate_and_a_gate_that_fails_everything_are_both_found_out() -> N
 
 
 def test_the_suite_and_the_faults_are_the_documented_ones() -> None:
-    assert len(load_suite(SUITE)) == 12
+    assert len(load_suite(SUITE)) == 6
     assert sorted(broken_renderers()) == [
         f"broken-{n}" for n in ("black", "blurred", "frozen", "late", "mirrored", "shifted")
     ]
