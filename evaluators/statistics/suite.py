@@ -11,7 +11,6 @@ that six new events and none gone are just enough.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,17 +19,14 @@ from typing import Any
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Cell, Side
 from evaluators.statistics.intervals import TAIL, cluster_means
-from evaluators.statistics.verdicts import Verdict, scenes_needed
+from evaluators.statistics.verdicts import Verdict, flipped_sums, scenes_needed
 
 ROUNDING = 1e-9  # a smaller difference, relative, may come from another processor
 SCENE_MARGINS = 3.0  # that one scene may be worse
 LISTED = 50  # cells named of a check; counts are always whole
-ENUMERATED = 12  # cells that changed up to which all signs are tried
-FLIPS, BLOCKS = 4990, 10  # drawn at random beyond, in blocks that fit the memory
 EVENT_LEVEL = 2.0**-6  # six of six
 LEVEL = TAIL - EVENT_LEVEL  # of the other metrics
 MOST_SEEDS = 200
@@ -245,21 +241,10 @@ def flipped(rows: F64) -> F64:
     scaled = changed[is_used] / norms[is_used, None]
     seen = scaled.sum(axis=1)
     out = np.ones(len(rows))
-    n = changed.shape[1]
-    if not is_used.any():
-        return out
-    if n <= ENUMERATED:
-        signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
-        largest = np.max(signs @ scaled.T, axis=1)
-        out[is_used] = np.mean(largest[:, None] >= seen - ROUNDING, axis=0)
-        return out
-    random = stream("gate", 0, "gate/flips")
-    reached = np.zeros(len(seen))
-    for _ in range(BLOCKS):
-        signs = random.choice([1.0, -1.0], size=(FLIPS // BLOCKS, n))
-        largest = np.max(signs @ scaled.T, axis=1)
-        reached += np.sum(largest[:, None] >= seen - ROUNDING, axis=0)
-    out[is_used] = (1 + reached) / (1 + FLIPS)
+    if is_used.any():
+        sums, first = flipped_sums(scaled)
+        reached = np.sum(np.max(sums, axis=1)[:, None] >= seen - ROUNDING, axis=0)
+        out[is_used] = (first + reached) / (first + len(sums))
     return out
 
 

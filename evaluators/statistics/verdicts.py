@@ -201,19 +201,25 @@ def sign_flip(means: F64) -> tuple[float, str]:
         (0.03125, 'exact sign-flip test on scenes')
     """
     changed = scaled(means[means != 0.0])[0]
-    n = len(changed)
-    if 2**n <= FLIPS:
-        is_flipped = np.arange(2**n)[:, None] >> np.arange(n) & 1
-        first, words = 0, "exact sign-flip test on scenes"
-    else:
-        is_flipped = _drawn_flips(n)
-        first, words = 1, f"sign-flip test on scenes, {len(is_flipped):,} draws"
-    total = float(np.sum(changed))
-    blocks = np.array_split(is_flipped, 10)
-    sums = np.concatenate([total - 2.0 * (block @ changed) for block in blocks])
-    far = abs(total) - ROUNDING * float(np.sum(np.abs(changed)))
+    sums, first = flipped_sums(changed[None])
+    far = abs(float(np.sum(changed))) - ROUNDING * float(np.sum(np.abs(changed)))
     beyond = first + int(np.count_nonzero(np.abs(sums) >= far))
+    words = "exact sign-flip test on scenes"
+    if first:
+        words = f"sign-flip test on scenes, {len(sums):,} draws"
     return beyond / (first + len(sums)), words
+
+
+def flipped_sums(rows: F64) -> tuple[F64, int]:
+    """Return the sums ``(K, M)`` of differences ``(M, N)`` for choices of signs that all M share,
+    and 1 where the choices are drawn, so that the one seen counts among them.
+    """
+    n = rows.shape[1]
+    is_all = 2**n <= FLIPS
+    is_flipped = np.arange(2**n)[:, None] >> np.arange(n) & 1 if is_all else _drawn_flips(n)
+    total = rows.sum(axis=1)
+    blocks = np.array_split(is_flipped, 10)
+    return np.concatenate([total - 2.0 * (block @ rows.T) for block in blocks]), int(not is_all)
 
 
 @lru_cache(maxsize=1)
