@@ -19,9 +19,11 @@ import numpy as np
 from alpasim_plugin.core.geometry import densify, transform_points
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import ASIDE_M
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
 from scenarios.opendrive_road import (
+    JOIN_M,
     MAX_ROAD_M,
     OdrLane,
     OdrMap,
@@ -31,8 +33,10 @@ from scenarios.opendrive_road import (
     beside,
     cubics_at,
     curved,
+    gap_m,
     lane_key,
     reference_line,
+    sided,
 )
 from scenarios.recorded import SourceFiles
 
@@ -65,38 +69,83 @@ KINDS = {
 _SOLID = ("solid", "solid solid", "solid broken", "broken solid")
 
 
-def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
-    """Return the lanes with their successors in driving direction; links to lanes that are not in
-    ``lanes`` are left out.
+def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> tuple[dict[str, Lane], tuple[str, ...]]:
+    """Return the lanes with their successors in driving direction, and notes; links to lanes that
+    are not in ``lanes`` are left out.
     """
     roads = {road.road_id: road for road in odr.roads}
-    turns: dict[tuple[str, int], list[tuple[str, bool, int]]] = {}
-    for connection in odr.connections:
-        for here, there in connection.lanes:
-            turns.setdefault((connection.incoming, here), []).append(
-                (connection.connecting, connection.at_start, there)
-            )
+    turns, n_bare = _turns(odr, roads)
+    notes = []
+    if n_bare:
+        notes.append(
+            f"{n_bare} connections of junctions name no lanes: lanes of the same direction are linked by their number"
+        )
     out = dict(lanes)
+    ends = []
     for road in odr.roads:
         for index, section in enumerate(road.sections):
             for lane in section.lanes:
                 key = lane_key(road, index, lane.lane_id)
-                if key in out:
-                    ahead = _ahead(road, index, lane, roads, turns)
-                    out[key] = replace(
-                        out[key], successors=tuple(dict.fromkeys(k for k in ahead if k in lanes))
-                    )
-    return out
+                if key not in out:
+                    continue
+                ahead = _ahead(road, index, lane, roads, turns)
+                found = tuple(dict.fromkeys(k for k in ahead if k in lanes))
+                out[key] = replace(out[key], successors=found)
+                link = road.successor if _along(road, lane) else road.predecessor
+                if not found and link is not None and out[key].kind == "vehicle":
+                    ends.append(key)
+    if ends:
+        notes.append(
+            f"{len(ends)} lanes end although their road goes on, for want of a link: {some_of(ends)}"
+        )
+    return out, tuple(notes)
+
+
+Turns = Mapping[tuple[str, str, int], list[tuple[str, bool, int]]]
+
+
+def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
+    """Return the lanes that junctions link: from junction, road and lane to road, which of its ends,
+    and lane; and how many connections name no lanes.
+    """
+    turns: dict[tuple[str, str, int], list[tuple[str, bool, int]]] = {}
+    n_bare = 0
+    for one in odr.connections:
+        incoming, connecting = roads.get(one.incoming), roads.get(one.connecting)
+        if incoming is None or connecting is None:
+            continue
+        from_start = _starts_at(incoming, one.junction)
+        links = one.lanes
+        if not links:
+            n_bare += 1
+            # Both roads run the same way unless they meet start to start, or end to end.
+            sign = -1 if from_start == one.at_start else 1
+            here = incoming.sections[0 if from_start else -1 :][:1]
+            links = tuple((lane.lane_id, sign * lane.lane_id) for s in here for lane in s.lanes)
+        for a, b in links:
+            key = one.junction, one.incoming, a
+            turns.setdefault(key, []).append((one.connecting, one.at_start, b))
+            if one.direct:
+                key = one.junction, one.connecting, b
+                turns.setdefault(key, []).append((one.incoming, from_start, a))
+    return turns, n_bare
+
+
+def _starts_at(road: Road, junction: str) -> bool:
+    """Return whether a road meets a junction with its start, rather than with its end."""
+    after = road.successor
+    return after is None or (after.kind, after.target) != ("junction", junction)
+
+
+def _along(road: Road, lane: OdrLane) -> bool:
+    """Return whether a lane is driven in the direction of its road's arc length."""
+    return ((lane.lane_id < 0) != road.left_hand) != lane.reversed
 
 
 def _ahead(
-    road: Road,
-    index: int,
-    lane: OdrLane,
-    roads: Mapping[str, Road],
-    turns: Mapping[tuple[str, int], list[tuple[str, bool, int]]],
+    road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Turns
 ) -> list[str]:
-    along = (lane.lane_id < 0) != road.left_hand
+    along = _along(road, lane)
     linked = lane.successors if along else lane.predecessors
     next_section = index + (1 if along else -1)
     if 0 <= next_section < len(road.sections):
@@ -105,16 +154,29 @@ def _ahead(
     if link is None:
         return []
     if link.kind == "junction":
-        found = [
-            (roads[r], at_start, i)
-            for r, at_start, i in turns.get((road.road_id, lane.lane_id), ())
-            if r in roads
+        found = turns.get((link.target, road.road_id, lane.lane_id), [])
+        return [
+            lane_key(roads[r], 0 if at_start else len(roads[r].sections) - 1, i)
+            for r, at_start, i in found
         ]
-        return [lane_key(r, 0 if at_start else len(r.sections) - 1, i) for r, at_start, i in found]
     target = roads.get(link.target)
-    if target is None:
+    if target is None or not target.sections:
         return []
-    return [lane_key(target, 0 if link.at_start else len(target.sections) - 1, i) for i in linked]
+    entered = 0 if link.at_start else len(target.sections) - 1
+    if not linked:  # the link may stand in the other road alone
+        linked = tuple(
+            one.lane_id
+            for one in target.sections[entered].lanes
+            if lane.lane_id in (one.predecessors if link.at_start else one.successors)
+            and _along(target, one) == link.at_start
+            and _joins(target, link.at_start, road)
+        )
+    return [lane_key(target, entered, i) for i in linked]
+
+
+def _joins(target: Road, at_start: bool, road: Road) -> bool:
+    back = target.predecessor if at_start else target.successor
+    return back is not None and (back.kind, back.target) == ("road", road.road_id)
 
 
 def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
@@ -196,9 +258,12 @@ def lane_map_of(
     """
     lanes: dict[str, Lane] = {}
     left_out: Counter[str] = Counter()
+    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     for road in odr.roads:
         for index, section in enumerate(road.sections):
-            if road.records and section.end_m - section.s_m > 1e-6:
+            if not road.records or section.end_m - section.s_m <= 1e-6:
+                left_out["any, in a section without length or geometry"] += len(section.lanes)
+            else:
                 found = _section(road, index, section, T_local_map, left_out)
                 if found is None:
                     here = f"{where}, road {road.road_id}, section {index}"
@@ -210,7 +275,7 @@ def lane_map_of(
         raise files.fail(
             where, "a map without a lane for vehicles", "use a map with lanes of type driving"
         )
-    linked = following(odr, lanes)
+    linked, link_notes = following(odr, lanes)
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     notes += (
@@ -218,7 +283,12 @@ def lane_map_of(
         if odr.n_signals + odr.n_objects
         else []
     )
-    return LaneMap(linked, border_lines(surface, np.concatenate(lane_edges(lanes)))), tuple(notes)
+    gaps = {road.road_id: gap_m(road) for road in odr.roads}
+    apart = [f"{key} ({gap:.2f} m)" for key, gap in gaps.items() if gap > JOIN_M]
+    if apart:
+        notes.append(f"{len(apart)} reference lines whose records do not join: {some_of(apart)}")
+    lane_map = LaneMap(linked, border_lines(surface, np.concatenate(lane_edges(lanes))))
+    return lane_map, (*notes, *link_notes, *odr.notes)
 
 
 def _section(
@@ -246,7 +316,6 @@ def _section(
             middle,
             next((one.mark for one in section.lanes if one.lane_id == 0), None),
         )
-        along = (sign < 0) != road.left_hand  # runs with s
         side = section.side(sign)
         for k, lane in enumerate(side):
             outer_t = _outer(lane, sign, s, inner_t, middle)
@@ -259,23 +328,21 @@ def _section(
                     lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"
                 ] += 1
             else:
-                # Seen in driving direction the middle of the road is on the left, with left-hand
-                # traffic on the right.
                 near = points(inner_t)
                 far = points(outer_t)
-                turn = 1 if along else -1
-                edges = (far, near) if road.left_hand else (near, far)
-                paints = (
-                    (_paint(lane.mark), _paint(inner_mark))
-                    if road.left_hand
-                    else (_paint(inner_mark), _paint(lane.mark))
-                )
+                turn = 1 if _along(road, lane) else -1
                 beside_ids = [
-                    lane_key(road, index, n.lane_id) if n is not None and n.kind in KINDS else None
+                    lane_key(road, index, n.lane_id)
+                    if n is not None and n.kind in KINDS and n.reversed == lane.reversed
+                    else None
                     for n in _neighbours(side, k)
                 ]
-                if road.left_hand:
-                    beside_ids.reverse()
+                # Seen in driving direction the middle of the road is on the left, with left-hand
+                # traffic on the right.
+                order = -1 if road.left_hand != lane.reversed else 1
+                edges = (near, far)[::order]
+                paints = (_paint(inner_mark), _paint(lane.mark))[::order]
+                beside_ids = beside_ids[::order]
                 left, right = (edge[::turn] for edge in edges)
                 out.append(
                     Lane(

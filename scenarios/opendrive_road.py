@@ -8,8 +8,9 @@ the left.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
@@ -27,6 +28,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _TABLE = 257  # stations at which a cubic's arc length is tabulated before it is inverted
 
 MAX_ROAD_M = MAP_ROAD_M.high
+# Elements of a map that are read, or that change no road; types of junctions that are read.
+KNOWN = {"header", "road", "junction", "controller", "junctionGroup", "station", "userData"}
+JUNCTIONS = ("default", "direct", "")
+JOIN_M = 0.01  # records of a reference line that lie farther apart do not join
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
     "line": (),
@@ -134,6 +139,60 @@ def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
     return out
 
 
+def gap_m(road: Road) -> float:
+    """Return the largest distance, metres, between the end of a record of a road's reference line
+    and the start of the next one.
+    """
+    largest = 0.0
+    for one, following in itertools.pairwise(road.records):
+        end = one.at(np.array([following.s_m - one.s_m]))[0]
+        away = float(np.hypot(end[0] - following.x_m, end[1] - following.y_m))
+        largest = max(largest, away)
+    return largest
+
+
+def sided(road: Road) -> Road:
+    """Return a road whose sections all have the lanes of both sides.
+
+    A section of a single side leaves the other side as it was: its lanes go on.
+    """
+    if not any(one.single_side for one in road.sections):
+        return road
+    starts = sorted({one.s_m for one in road.sections})
+    sections = []
+    for start, end in zip(starts, [*starts[1:], road.length_m], strict=True):
+        lanes = [
+            lane for one in _in_force(road, start, 0) for lane in one.lanes if not lane.lane_id
+        ]
+        for sign in (1, -1):
+            for own in _in_force(road, start, sign):
+                begins, ends = own.s_m == start, own not in _in_force(road, end, sign)
+                lanes += [
+                    replace(
+                        lane,
+                        predecessors=lane.predecessors if begins else (lane.lane_id,),
+                        successors=lane.successors
+                        if ends or end == road.length_m
+                        else (lane.lane_id,),
+                    )
+                    for lane in own.side(sign)
+                ]
+        sections.append(Section(start, end, tuple(lanes)))
+    return replace(road, sections=tuple(sections))
+
+
+def _in_force(road: Road, s_m: float, sign: int) -> tuple[Section, ...]:
+    """Return the section, if any, that says at an arc length which lanes a side has; 0 is the
+    middle.
+    """
+    said = [
+        one
+        for one in road.sections
+        if one.s_m <= s_m and (not sign or not one.single_side or one.side(sign))
+    ]
+    return tuple(said[-1:])
+
+
 def cubics_at(records: Sequence[Cubic], s_m: F64) -> F64:
     """Return ``(N,)`` the value of the record in force at each arc length; before the first record
     that one is extended, none gives 0.
@@ -168,6 +227,7 @@ class OdrLane:
     successors: tuple[int, ...]
     predecessors: tuple[int, ...]
     mark: tuple[str, str] | None  # type and colour of the first road mark of its outer border
+    reversed: bool = False  # driven against the usual direction of its side
 
 
 @dataclass(frozen=True)
@@ -177,6 +237,7 @@ class Section:
     s_m: float
     end_m: float
     lanes: tuple[OdrLane, ...]
+    single_side: bool = False  # says nothing of the side on which it has no lane
 
     def side(self, sign: int) -> tuple[OdrLane, ...]:
         """Return the lanes of one side (1 left, -1 right), from the middle outwards."""
@@ -216,12 +277,16 @@ class Road:
 
 @dataclass(frozen=True)
 class Connection:
-    """A way into a junction: lanes of an incoming road to lanes of a connecting road."""
+    """A way into a junction: lanes of an incoming road to lanes of a connecting road, or, in a
+    direct junction, of a linked road. Without lanes those of one direction are linked.
+    """
 
+    junction: str
     incoming: str
     connecting: str
     at_start: bool
     lanes: tuple[tuple[int, int], ...]
+    direct: bool = False
 
 
 @dataclass(frozen=True)
@@ -233,6 +298,7 @@ class OdrMap:
     geo_reference: str
     n_signals: int
     n_objects: int
+    notes: tuple[str, ...] = ()
 
 
 def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
@@ -252,22 +318,35 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
         raise files.fail(where, "a map without roads", "use a map with at least one road")
     connections = tuple(
         Connection(
+            j.get("id", ""),
             c.get("incomingRoad", ""),
-            c.get("connectingRoad", ""),
+            c.get("connectingRoad", c.get("linkedRoad", "")),
             c.get("contactPoint", "start") == "start",
             tuple(
                 (_integer(files, where, link, "from"), _integer(files, where, link, "to"))
                 for link in c.findall("laneLink")
             ),
+            "linkedRoad" in c.attrib,
         )
         for j in root.findall("junction")
         for c in j.findall("connection")
     )
     reference = root.find(".//geoReference")
-    counts = [len(root.findall(f".//{name}")) for name in ("signal", "object")]
-    return OdrMap(
-        roads, connections, (reference.text or "").strip() if reference is not None else "", *counts
-    )
+    n_signals, n_objects = (len(root.findall(f".//{name}")) for name in ("signal", "object"))
+    notes = [
+        f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
+        for tag in sorted({child.tag for child in root} - KNOWN)
+    ]
+    if root.find("header/offset") is not None:
+        notes.append(
+            "the offset in the map's header is not applied: its coordinates are as written"
+        )
+    kinds = sorted({j.get("type", "default") for j in root.findall("junction")} - {*JUNCTIONS})
+    notes += [f"junctions of type {kind} are not driven through" for kind in kinds]
+    shapes = len(root.findall(".//lateralProfile/shape"))
+    notes += [f"{shapes} cross section shapes of the map are not used"] if shapes else []
+    geo = "" if reference is None else (reference.text or "").strip()
+    return OdrMap(roads, connections, geo, n_signals, n_objects, tuple(notes))
 
 
 def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
@@ -345,6 +424,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             links["successor"],
             links["predecessor"],
             None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
+            one.get("direction") == "reversed",
         )
 
     lanes = element.find("lanes")
@@ -361,6 +441,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
                 for side in ("left", "center", "right")
                 for one in e.findall(f"{side}/lane")
             ),
+            e.get("singleSide") == "true",
         )
         for e, start, end in zip(elements, starts, [*starts[1:], road_m], strict=True)
     )
@@ -371,7 +452,8 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             "start every section on the road",
         )
     view = element.find("planView")
-    records = tuple(geometry(r) for r in (view.findall("geometry") if view is not None else []))
+    unsorted = [geometry(r) for r in (view.findall("geometry") if view is not None else [])]
+    records = tuple(sorted(unsorted, key=lambda record: record.s_m))
     return Road(
         str(element.get("id")),
         road_m,

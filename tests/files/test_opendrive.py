@@ -1,0 +1,206 @@
+"""OpenDRIVE maps as other tools write them: sections of one side, junctions without lanes, records
+out of order.
+
+Every map is made here.
+"""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.types import LaneMap
+from scenarios.opendrive import lane_map_of
+from scenarios.opendrive_road import parse_map
+from scenarios.recorded import SourceFiles
+
+FILES = SourceFiles()
+WIDTH = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
+
+
+def lane(i: int, before: int | None = None, after: int | None = None, more: str = "") -> str:
+    links = "".join(
+        f'<{tag} id="{k}"/>' for tag, k in (("predecessor", before), ("successor", after)) if k
+    )
+    return f'<lane id="{i}" type="driving" {more}><link>{links}</link>{WIDTH}</lane>'
+
+
+def section(s: float, *lanes: str, more: str = "") -> str:
+    sides = {"left": [], "right": []}
+    for one in lanes:
+        sides["right" if 'id="-' in one else "left"].append(one)
+    body = "".join(f"<{side}>{''.join(some)}</{side}>" for side, some in sides.items() if some)
+    return f'<laneSection s="{s}" {more}>{body}</laneSection>'
+
+
+def road(
+    i: str,
+    *sections: str,
+    x: float = 0.0,
+    length: float = 50.0,
+    junction: str = "-1",
+    before: str = "",
+    after: str = "",
+    view: str = "",
+) -> str:
+    """Write a road along x; ``before`` and ``after`` name what joins it: ``road:2:start``."""
+    links = ""
+    for tag, text in (("predecessor", before), ("successor", after)):
+        if text:
+            kind, target, *contact = text.split(":")
+            point = f'contactPoint="{contact[0]}"' if contact else ""
+            links += f'<{tag} elementType="{kind}" elementId="{target}" {point}/>'
+    view = view or f'<geometry s="0" x="{x}" y="0" hdg="0" length="{length}"><line/></geometry>'
+    return f'<road id="{i}" length="{length}" junction="{junction}"><link>{links}</link><planView>{view}</planView><lanes>{"".join(sections)}</lanes></road>'
+
+
+def read(*parts: str) -> tuple[LaneMap, tuple[str, ...]]:
+    root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
+    return lane_map_of(FILES, "map.xodr", parse_map(FILES, "map.xodr", root), np.eye(4))
+
+
+def span(lanes: LaneMap, key: str) -> tuple[float, float]:
+    x = lanes.lanes[key].centre[:, 0]
+    return round(float(x[0]), 6), round(float(x[-1]), 6)
+
+
+def test_a_section_of_one_side_leaves_the_other_side_as_it_was() -> None:
+    lanes, notes = read(
+        road(
+            "1",
+            section(0, lane(1), lane(-1)),
+            section(20, lane(1, 1), lane(2), more='singleSide="true"'),
+            section(30, lane(-1, -1), lane(-2), more='singleSide="true"'),
+        )
+    )
+    assert set(lanes.lanes) == {
+        *("1.0.1", "1.0.-1", "1.1.1", "1.1.2", "1.1.-1"),
+        *("1.2.1", "1.2.2", "1.2.-1", "1.2.-2"),
+    }
+    assert lanes.lanes["1.0.-1"].successors == ("1.1.-1",)
+    assert lanes.lanes["1.1.-1"].successors == ("1.2.-1",)
+    assert lanes.lanes["1.2.2"].successors == ("1.1.2",)
+    assert span(lanes, "1.1.-1") == (20.0, 30.0)
+    assert not notes
+
+
+def test_sections_of_both_sides_may_begin_at_one_place() -> None:
+    lanes, notes = read(
+        road(
+            "1",
+            section(0, lane(1), more='singleSide="true"'),
+            section(0, lane(-1), more='singleSide="true"'),
+        )
+    )
+    assert set(lanes.lanes) == {"1.0.1", "1.0.-1"}
+    assert not notes
+
+
+def test_lanes_that_cannot_be_placed_are_said() -> None:
+    _, notes = read(road("1", section(0, lane(-1)), section(50, lane(-1), lane(-2))))
+    assert any("without length" in note and "2" in note for note in notes)
+
+
+def test_a_direct_junction_links_both_ways() -> None:
+    junction = (
+        '<junction id="9" type="direct">'
+        '<connection id="0" incomingRoad="1" linkedRoad="2" contactPoint="start">'
+        '<laneLink from="-1" to="-1"/><laneLink from="1" to="1"/></connection>'
+        '<connection id="1" incomingRoad="1" linkedRoad="3" contactPoint="start">'
+        '<laneLink from="-2" to="-1"/></connection></junction>'
+    )
+    lanes, notes = read(
+        road("1", section(0, lane(1), lane(-1), lane(-2)), after="junction:9"),
+        road("2", section(0, lane(1), lane(-1)), x=50, before="junction:9"),
+        road("3", section(0, lane(-1)), x=50, before="junction:9"),
+        junction,
+    )
+    assert lanes.lanes["1.0.-1"].successors == ("2.0.-1",)
+    assert lanes.lanes["1.0.-2"].successors == ("3.0.-1",)
+    assert lanes.lanes["2.0.1"].successors == ("1.0.1",)
+    assert not lanes.lanes["2.0.-1"].successors
+    assert not notes
+
+
+@pytest.mark.parametrize("contact", ["start", "end"])
+def test_a_connection_without_lanes_links_those_of_one_direction(contact: str) -> None:
+    ends = {"before": "road:1:end", "after": "road:3:start"}
+    if contact == "end":
+        ends = {"before": "road:3:start", "after": "road:1:end"}
+        turn = road("2", section(0, lane(1, 1, 1)), x=50, junction="9", **ends)
+    else:
+        turn = road("2", section(0, lane(-1, -1, -1)), x=50, junction="9", **ends)
+    connection = f'<connection incomingRoad="1" connectingRoad="2" contactPoint="{contact}"/>'
+    lanes, notes = read(
+        road("1", section(0, lane(-1)), after="junction:9"),
+        turn,
+        road("3", section(0, lane(-1)), x=100, before="junction:9"),
+        f'<junction id="9">{connection}</junction>',
+    )
+    assert lanes.lanes["1.0.-1"].successors == ("2.0.1" if contact == "end" else "2.0.-1",)
+    assert any("name no lanes" in note for note in notes)
+
+
+def test_a_link_that_stands_in_the_next_road_alone_counts() -> None:
+    lanes, _ = read(
+        road("1", section(0, lane(1), lane(-1)), after="road:2:start"),
+        road("2", section(0, lane(1), lane(-1, -1)), x=50, before="road:1:end"),
+    )
+    assert lanes.lanes["1.0.-1"].successors == ("2.0.-1",)
+
+
+def test_a_lane_that_ends_inside_the_map_is_said() -> None:
+    _, notes = read(
+        road("1", section(0, lane(-1, None, -1), lane(-2)), after="road:2:start"),
+        road("2", section(0, lane(-1)), x=50, before="road:1:end"),
+    )
+    assert any("1.0.-2" in note for note in notes)
+
+
+def test_links_of_a_road_between_two_junctions_stay_apart() -> None:
+    def junction(i: int, incoming: str, connecting: str, a: int, b: int) -> str:
+        link = f'<laneLink from="{a}" to="{b}"/>'
+        ends = f'incomingRoad="{incoming}" connectingRoad="{connecting}" contactPoint="start"'
+        return f'<junction id="{i}"><connection {ends}>{link}</connection></junction>'
+
+    lanes, _ = read(
+        road("1", section(0, lane(-1)), before="junction:8", after="junction:9"),
+        road("2", section(0, lane(-1)), x=50, junction="9"),
+        road("3", section(0, lane(-1)), x=-50, junction="8"),
+        junction(8, "1", "3", -1, -1),
+        junction(9, "1", "2", -1, -1),
+    )
+    assert lanes.lanes["1.0.-1"].successors == ("2.0.-1",)
+
+
+def test_records_out_of_order_are_put_in_order() -> None:
+    line = '<geometry s="0" x="0" y="0" hdg="0" length="50"><line/></geometry>'
+    arc = '<geometry s="50" x="50" y="0" hdg="0" length="50"><arc curvature="0.02"/></geometry>'
+    lanes, notes = read(road("1", section(0, lane(-1)), length=100, view=arc + line))
+    end = lanes.lanes["1.0.-1"].left[-1]
+    assert end[:2] == pytest.approx([50 + 50 * np.sin(1.0), 50 * (1 - np.cos(1.0))], abs=1e-6)
+    assert not notes
+    _, notes = read(
+        road("7", section(0, lane(-1)), length=100, view=arc.replace('x="50"', 'x="51"') + line)
+    )
+    assert any("7 (1.00 m)" in note for note in notes)
+
+
+def test_a_reversed_lane_runs_and_sees_the_other_way() -> None:
+    lanes, _ = read(road("1", section(0, lane(-1), lane(-2, more='direction="reversed"'))))
+    assert span(lanes, "1.0.-1") == (0.0, 50.0)
+    assert span(lanes, "1.0.-2") == (50.0, 0.0)
+    assert lanes.lanes["1.0.-2"].left[0, 1] == pytest.approx(-7.0)
+    assert lanes.lanes["1.0.-1"].right_neighbour is None
+
+
+def test_what_is_not_read_of_a_map_is_said() -> None:
+    _, notes = read(
+        '<header><offset x="1" y="2" z="0" hdg="0"/></header>',
+        road("1", section(0, lane(-1))),
+        '<include file="more.xodr"/><junction id="4" type="virtual"/>',
+    )
+    for word in ("include", "virtual", "offset"):
+        assert any(word in note for note in notes)
