@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import Json, run_or_newest
-from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
-from evaluators.report import render_table
+from evaluators.report import metric_lines
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
@@ -87,7 +87,10 @@ def compare(
     lines: list[Any] = []
     if means is not None:
         facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
-        lines.append(render_table(means, headline_only=not every, known=result.metrics))
+        if len(folders) == 1:
+            lines += first_screen(opened[0])
+        if every or len(folders) > 1:
+            lines += metric_lines(means, not every, result.metrics)
         failures = means["failures"]
         if failures["n_failed"]:
             causes = ", ".join(f"{name} {count}" for name, count in failures["by_class"].items())

@@ -20,6 +20,7 @@ from evaluators.report.numbers import plural
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
     from alpasim_plugin.runs.execute import Threads
     from alpasim_plugin.runs.plan import RunPlan
+    from evaluators.opening import Run
     from evaluators.statistics.decision import State
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
@@ -55,6 +56,13 @@ class Escaped:
             lines = segment.text.split("\n")
             text = segment.text if segment.control else "\n".join(map(terminal, lines))
             yield segment._replace(text=text)
+
+
+def first_screen(run: Run) -> list[Any]:
+    """Return the one table of a run as lines for `show`."""
+    from evaluators.report import overview_lines, overview_of  # a listing needs no statistics
+
+    return list(overview_lines(overview_of(run), Console().width))
 
 
 class Progress(progress.Progress):

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,6 +20,7 @@ from alpasim_plugin.cli.options import (
 from alpasim_plugin.cli.output import (
     Progress,
     background_lines,
+    first_screen,
     fixer_labels,
     report_lines,
     show,
@@ -225,7 +226,7 @@ def run(
         facts = {"out": str(root), "exit_code": result.exit_code, "summary": result.summary}
         show(as_json, facts)
     else:
-        _print_result(result, options.video)
+        _print_result(result)
         if plan.undigested:
             names = ", ".join(plan.undigested)
             warn(f"--resume reuses the rollouts of {names}; the same command drives them again.")
@@ -312,32 +313,28 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
     show(as_json, facts, *lines)
 
 
-def _print_result(result: RunResult, video: str) -> None:
+def _print_result(result: RunResult) -> None:
     from evaluators.opening import read_run  # what a run ends with is loaded while it is driven
-    from evaluators.report import ending_lines, fixer_lines, next_line, render_table
+    from evaluators.report import next_line
 
     root = result.root
-    summary = result.summary
     run = read_run(root)
-    lines = [*fixer_lines(summary)]
-    if video != "none":
-        count = len(list(root.glob("rollouts/*/*/*/*/front.mp4")))
-        lines.append(
-            f"videos   {count} of {result.n_rollouts} rollouts have a front.mp4 below {root}/rollouts"
-        )
-    if "repeat" in summary:
-        lines.append(f"repeat   {repeat_line(summary['repeat'])}")
+    lines = []
+    if "repeat" in result.summary:
+        lines.append(f"repeat   {repeat_line(result.summary['repeat'])}")
     following = next_line(run)
     for name, path in shipped_names().items():
         following = following.replace(str(path.absolute()), name)
-    table = render_table(summary, headline_only=True, known=run.table)
-    show(False, {}, table, *lines, *ending_lines(run), *report_lines(root), following)
-    for cell in summary["failures"]["cells"][:SHOWN_FAILURES]:
-        warn(f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}")
-        for line in last_output(root / cell["path"] / OUTPUT_NAME):
+    show(False, {}, *first_screen(run), "", *lines, *report_lines(root), following)
+    failures: dict[str, list[dict[str, Any]]] = {}
+    for cell in result.summary["failures"]["cells"]:
+        failures.setdefault(cell["error"]["message"], []).append(cell)
+    for message, cells in list(failures.items())[:SHOWN_FAILURES]:
+        warn(f"failed in {plural(len(cells), 'rollout')}: {message} -> {cells[0]['error']['hint']}")
+        for line in last_output(root / cells[0]["path"] / OUTPUT_NAME):
             warn(f"        {line}")
     if result.n_failed:
-        by_policy = summary["failures"]["by_class"].get("policy", 0)
+        by_policy = result.summary["failures"]["by_class"].get("policy", 0)
         advice = "the same command runs them again"
         if by_policy:
             advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"

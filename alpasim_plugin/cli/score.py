@@ -9,17 +9,17 @@ from typing import Annotated, Any
 import typer
 
 from alpasim_plugin.cli.options import Evaluators, Json
-from alpasim_plugin.cli.output import Progress, report_lines, show, warn
+from alpasim_plugin.cli.output import Progress, first_screen, report_lines, show, warn
 from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.score import ScoreResult, execute_score
 from alpasim_plugin.runs.score_logs import KnownScenes, find_logs
 from evaluators import preset as find_preset
 from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
-from evaluators.metrics import MetricTable, presets
-from evaluators.report import render_presets, render_table
+from evaluators.metrics import presets
+from evaluators.opening import read_run
+from evaluators.report import render_presets
 
 SHOWN_FAILURES = 5
 
@@ -100,8 +100,7 @@ def score(
     lines: list[Any] = []
     for result in results.values():
         if len(names) == 1:
-            known = MetricTable.of_run(read_run_json(result.root))
-            lines.append(render_table(result.summary, headline_only=True, known=known))
+            lines += first_screen(read_run(result.root))
         lines += report_lines(result.root)
     if len(names) > 1 or any(one.protocol for one in chosen.values()):
         lines.append(render_presets({name: one.summary for name, one in results.items()}))

@@ -17,17 +17,15 @@ from alpasim_plugin.cli.options import (
     run_and_cell,
     run_or_newest,
 )
-from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.metrics import MetricTable
-from evaluators.opening import read_so_far
-from evaluators.report import render_table
+from evaluators.opening import read_run, read_so_far
+from evaluators.report import metric_lines
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import DEFAULT_MB, MB, write_page
 
@@ -142,18 +140,28 @@ def wanted_of(root: Path, cell: str, asked: Wanted) -> Wanted:
     return Wanted((manifest["scene"],), (manifest["policy"],), (manifest["seed"],), asked.renderers)
 
 
-REPORT_EPILOG = "Example: `simrun report runs/us101`"
+REPORT_EPILOG = """
+Examples:
+
+- `simrun report runs/us101`
+
+- `simrun report --all`: every metric of the newest run
+"""
 
 
 def report(
     run: Run = None,
+    every: Annotated[bool, Flag("Print every metric too.", "--all")] = False,
     as_json: Json = False,
 ) -> None:
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
-    run = run_or_newest(run)
-    ensure_tables(run, warn)
-    summary = read_json(table_path(run, SUMMARY))
-    info = read_run_json(run)
-    page = write_reports(run, flips=info.get("kind") != "score")
-    facts = {"report": str(page), "summary": summary}
-    show(as_json, facts, render_table(summary, known=MetricTable.of_run(info)), f"report   {page}")
+    folder = run_or_newest(run)
+    ensure_tables(folder, warn)
+    info = read_run_json(folder)
+    page = write_reports(folder, flips=info.get("kind") != "score")
+    opened = read_run(folder)
+    facts = {"report": str(page), "summary": opened.summary}
+    lines = first_screen(opened)
+    if every:
+        lines += ["", *metric_lines(opened.summary, known=opened.table)]
+    show(as_json, facts, *lines, f"report   {page}")

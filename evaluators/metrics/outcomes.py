@@ -36,12 +36,14 @@ class Outcome:
         words: What sentences call it.
         letter: What the chips of a scene table show.
         implied_by: Outcomes that say more, beside which this one is not named.
+        ending: What tables of endings call it, where that is not its words.
     """
 
     name: str
     words: str
     letter: str
     implied_by: tuple[str, ...] = ()
+    ending: str = ""
 
 
 POLICY_FAULT = "policy"  # the failure class of a rollout that the policy broke
@@ -49,7 +51,7 @@ OUTCOMES = {  # the gravest first
     outcome.name: outcome
     for outcome in (
         Outcome(POLICY_FAULT, "policy fault", "P"),
-        Outcome("collision_at_fault", "at-fault collision", "C"),
+        Outcome("collision_at_fault", "at-fault collision", "C", ending="collision"),
         Outcome("collision_any", "collision", "C", ("collision_at_fault",)),
         Outcome("offroad", "off-road", "O"),
         Outcome("wrong_lane", "wrong lane", "W"),
@@ -135,6 +137,34 @@ def reached_end(rollout: Rollout) -> bool:
         and not outcomes_of(rollout)
         and (rollout.metrics.get("progress") or 0.0) >= REACHED
     )
+
+
+REACHED_END, SHORT_OF_END, NOT_RUN = "reached the end", "short of the end", "not run"
+ENDINGS = tuple(  # the best first, and last what says nothing of the policy
+    dict.fromkeys(
+        (
+            REACHED_END,
+            NO_OUTCOME,
+            SHORT_OF_END,
+            *(outcome.ending or outcome.words for outcome in reversed(OUTCOMES.values())),
+            NOT_RUN,
+        )
+    )
+)
+
+
+def ending_of(rollout: Rollout) -> str:
+    """Name the one way in which a rollout ended: its gravest outcome, else whether it came to the
+    end of the recorded path as far as that is measured.
+    """
+    if not has_ended(rollout):
+        return NOT_RUN
+    failures = told(outcomes_of(rollout))
+    if failures:
+        return failures[0].ending or failures[0].words
+    if rollout.metrics.get("progress") is None:
+        return NO_OUTCOME
+    return REACHED_END if reached_end(rollout) else SHORT_OF_END
 
 
 STAND_MPS, STAND_S = 0.3, 3.0

@@ -10,16 +10,21 @@ from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from evaluators.report.ci import write_junit, write_summary_md
-    from evaluators.report.fixers import fixer_lines
     from evaluators.report.html import write_report
-    from evaluators.report.terminal import ending_lines, next_line, render_presets, render_table
+    from evaluators.report.overview import overview_of
+    from evaluators.report.terminal import (
+        metric_lines,
+        next_line,
+        overview_lines,
+        render_presets,
+    )
 
 __all__ = [
-    "ending_lines",
-    "fixer_lines",
+    "metric_lines",
     "next_line",
+    "overview_lines",
+    "overview_of",
     "render_presets",
-    "render_table",
     "write_junit",
     "write_report",
     "write_summary_md",
@@ -27,8 +32,8 @@ __all__ = [
 
 _HOMES = {
     ".ci": ("write_junit", "write_summary_md"),
-    ".fixers": ("fixer_lines",),
+    ".overview": ("overview_of",),
     ".html": ("write_report",),
-    ".terminal": ("ending_lines", "next_line", "render_presets", "render_table"),
+    ".terminal": ("next_line", "overview_lines", "render_presets", "metric_lines"),
 }
 __getattr__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

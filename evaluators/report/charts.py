@@ -1,6 +1,4 @@
-"""Charts of a report as SVG in the page's colours: drift over time, paired differences, and speed
-against error.
-"""
+"""Charts of a report as SVG in the page's colours: axes, and speed against error."""
 
 from __future__ import annotations
 
@@ -14,33 +12,22 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.log.run_folder.rows import Rollout, Series
-from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import MetricInfo
 from evaluators.opening import Run
 from evaluators.report.numbers import LEAST_SPAN, finite, interval, scale_and_unit
-from evaluators.report.rollouts import events_of
 
 N_COLOURS = 8
 WIDTH_PT, HEIGHT_PT = 331.2, 194.4  # about 440 x 260 CSS pixels: legible on a phone
-FONT_PT, LETTER_PT = 10.0, 6.0  # the page's font: its size, and the width of a letter
+FONT_PT = 10.0  # the page's font
 MOST_TICKS = 7
 DASHES = ("", "9 3.6", "2.7 2.7", "10.8 2.7 2.7 3.6")
 VARIANT = [f"var(--variant-{i})" for i in range(N_COLOURS)]
 INK, MUTED, GRID = "var(--ink)", "var(--muted)", "var(--line)"
 N_BINS = 60  # of the time axis
 ERRORS = ("collision_at_fault", "offroad", "lateral_distance_m")
-TITLES = {"points": "Rates and shares", "m": "Distances"}
-FOREST_NOTE = (
-    "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted."
-)
 SPEED_NOTE = (
     "Across: ms per camera frame, mean, with a line to the 95th percentile. "
     "Paired with the baseline, which lies on the line; 95 % over scenes."
-)
-DISTANCE_NOTE = (
-    "Line: median over rollouts. Band: 10th to 90th percentile. "
-    "Drawn while at least half of the rollouts still run."
 )
 Values = Sequence[float] | F64
 
@@ -204,78 +191,12 @@ def round_ticks(low: float, high: float) -> list[tuple[float, str]]:
     return [(k * step, f"{k * step:.{places}f}".replace("-", "\u2212")) for k in numbers]
 
 
-def drift_charts(
-    rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]
-) -> list[Chart]:
-    """Draw how far from the logged path the ego is over time, and how many rollouts are still
-    without an event.
-
-    Args:
-        rollouts: Those of a run.
-        series: Their steps.
-        variant_of: (renderer, policy) -> (colour, dash).
-    """
-    distance, survival = Axes(), Axes()
-    for variant, (colour, dash) in variant_of.items():
-        members = [
-            r
-            for r in rollouts
-            if r.ok
-            and (r.renderer, r.policy) == variant
-            and "lateral_bias_m" in series.get(r.cell, {})
-        ]
-        if not members:
-            continue
-        times_s, offsets = _offsets([series[r.cell]["lateral_bias_m"] for r in members])
-        # later, the few long scenes would pass for a change over time
-        enough = np.count_nonzero(np.isfinite(offsets), axis=0) * 2 >= len(members)
-        low, middle, high = np.nanpercentile(offsets[:, enough], [10, 50, 90], axis=0)
-        paint = VARIANT[colour % N_COLOURS]
-        stroke = DASHES[dash % len(DASHES)]
-        distance.band(times_s[enough], low, high, paint)
-        distance.line(times_s[enough], middle, paint, dash=stroke)
-        firsts = [
-            min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=math.inf)
-            for r in members
-        ]
-        events_s = np.sort([first for first in firsts if math.isfinite(first)])
-        left = 100.0 * (1.0 - np.arange(len(events_s) + 1) / len(members))
-        edges_s = np.concatenate([[0.0], np.repeat(events_s, 2), times_s[-1:]])
-        survival.line(edges_s, np.repeat(left, 2), paint, dash=stroke)
-    if distance.range(0)[1] <= distance.range(0)[0] or not distance._lines:
-        return []
-    for axes, top in ((distance, max(distance.range(1)[1], LEAST_SPAN["m"])), (survival, 104.0)):
-        axes.limits[1] = 0.0, top
-    distance.labels = ["s since start", "m beside the path"]
-    survival.labels = ["s since start", "% of rollouts"]
-    return [
-        distance.chart("Distance from the logged path over time", DISTANCE_NOTE),
-        survival.chart(
-            "Rollouts without a collision or off-road event so far",
-            "Share of completed rollouts, by time of the first counted event.",
-        ),
-    ]
-
-
-def _offsets(own: Sequence[tuple[Any, F64]]) -> tuple[F64, F64]:
-    """Return common times ``(N_BINS,)`` in seconds and the distance of each rollout from its path
-    ``(rollouts, N_BINS)`` in metres; NaN after a rollout's end.
-    """
-    times_s = np.linspace(0.0, max(float(t_us[-1] - t_us[0]) for t_us, _ in own) * 1e-6, N_BINS)
-    offsets = [
-        np.abs(np.interp(times_s, (t_us - t_us[0]) * 1e-6, offset_m, right=np.nan))
-        for t_us, offset_m in own
-    ]
-    return times_s, np.array(offsets)
-
-
 class Difference(NamedTuple):
     """One paired difference turned so that positive is worse, in printed units."""
 
     centre: float
     low: float
     high: float
-    margin: float
 
 
 def _difference(metric: MetricInfo, entry: Mapping[str, Any]) -> Difference | None:
@@ -287,58 +208,7 @@ def _difference(metric: MetricInfo, entry: Mapping[str, Any]) -> Difference | No
     scale, _ = scale_and_unit(metric, "")
     turned = scale if direction == "lower" else -scale
     low, high = sorted(value * turned for value in bounds)
-    return Difference(centre * turned, low, high, (finite(entry.get("margin")) or 0.0) * scale)
-
-
-def forest(run: Run, variants: Mapping[str, int]) -> list[Chart]:
-    """Draw the paired differences with their intervals, one chart a unit; metrics without a better
-    side are left out.
-
-    Args:
-        run: The run.
-        variants: Key of ``summary.json`` -> colour.
-    """
-    groups: dict[tuple[str, str], list[tuple[MetricInfo, int, Difference]]] = {}
-    for variant, pairs in pair_tables(run.summary):
-        for name in run.table.ordered(pairs):
-            metric, entry = run.table.shown(name), pairs[name] or {}
-            difference = _difference(metric, entry)
-            if difference is not None and metric.is_headline:
-                _, unit = scale_and_unit(metric, str(entry.get("unit") or ""))
-                key = str(entry.get("baseline") or "the baseline"), unit
-                groups.setdefault(key, []).append((metric, variants.get(variant, 0), difference))
-    charts = []
-    for (baseline, unit), rows in groups.items():
-        title = TITLES.get(unit, f"In {unit or 'numbers without unit'}")
-        if len({other for other, _ in groups}) > 1:
-            title += f", against {baseline}"
-        charts.append(_forest_chart(title, unit, baseline, rows))
-    return charts
-
-
-def _forest_chart(
-    title: str, unit: str, baseline: str, rows: Sequence[tuple[MetricInfo, int, Difference]]
-) -> Chart:
-    words = list(dict.fromkeys(metric.words for metric, _, _ in rows))
-    colours = sorted({colour for _, colour, _ in rows})
-    gap = 1.0 / (len(colours) + 1)
-    left_pt = min(11.0 + 0.9 * LETTER_PT * max(map(len, words)), 0.55 * WIDTH_PT)
-    axes = Axes(54.0 + 30.0 * len(words) * max(1.0, 0.6 * len(colours)), left_pt)
-    axes.limits[1] = (len(words) - 0.5, -0.5)
-    axes.ticks = list(enumerate(words))
-    axes.line([0.0, 0.0], [-0.5, len(words) - 0.5], INK, 1.0)
-    for metric, colour, difference in rows:
-        row = words.index(metric.words)
-        y = row + (colours.index(colour) + 1) * gap - 0.5
-        paint = VARIANT[colour % N_COLOURS]
-        axes.line([difference.low, difference.high], [y, y], paint)
-        axes.points([difference.centre], [y], paint, 5.5)
-        if difference.margin > 0.0:
-            axes.line([difference.margin] * 2, [row - 0.42, row + 0.42], MUTED, 1.0, "2 2")
-    axes.widen(0, unit)
-    name = "percentage points" if unit == "points" else unit or "no unit"
-    axes.labels[0] = f"{name} worse than {baseline} \u2192"
-    return axes.chart(title, FOREST_NOTE)
+    return Difference(centre * turned, low, high)
 
 
 def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
@@ -354,7 +224,7 @@ def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
         metric, points = run.table.shown(name), []
         for variant, times in (run.summary.get("speed") or {}).items():
             mean_ms = finite(times.get("ms_per_frame_mean"))
-            baseline = Difference(0.0, 0.0, 0.0, 0.0)
+            baseline = Difference(0.0, 0.0, 0.0)
             entry = (paired.get(variant) or {}).get(name) or {}
             difference = _difference(metric, entry) if variant in paired else baseline
             if mean_ms and difference is not None:

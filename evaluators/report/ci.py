@@ -20,17 +20,16 @@ from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
-from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.gate import worst_of, write_gate
 from evaluators.report.numbers import Cell, plural, short
-from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
-from evaluators.report.verdict import LEADING, find
+from evaluators.report.overview import Overview, overview_of
+from evaluators.report.provenance import provenance
+from evaluators.report.terminal import forest_lines
 from evaluators.statistics.gate import Check, GateVerdict
 
+PLOT_LETTERS = 80  # of a line of the plot
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
-LEDGER_RATES = ("collision_at_fault", "collision_any", "offroad")
-LEDGER_NOTE = "Rates: least and greatest, had every missing rollout and every cut step been without, and with, the event."
 # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
 MAX_WITH_VALUES = 2000
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
@@ -44,7 +43,6 @@ MARKS = {
     "evaluator": "error",
 }
 INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters"
-SPEED_COLUMNS = ("ms per frame, mean", "95th percentile", "frames/s", "first frame, ms")
 CHECK_FACTS = ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes")
 
 
@@ -63,82 +61,56 @@ def write_summary_md(run_dir: Path | str | Run) -> Path:
 
 
 def summary_md(run: Run) -> str:
-    """Render the summary as Markdown, of any length."""
-    finding = find(run)
-    parts = [f"## {escape(finding.head)}\n"]
-    if len(finding.outcomes) > 1:
-        more = finding.outcomes[LEADING:]
-        parts += [f"- **{escape(name)}**: {escape(text)}\n" for name, text in more]
-        parts.append(f"\n**{escape(finding.title)}**\n\n")
-    parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
-    parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
+    """Render the summary as Markdown, of any length: the first screen, all metrics in a fold, and
+    the command.
+    """
     preset = str(run.summary.get("preset"))
-    parts += _section(
-        f"Results, preset {escape(preset)}",
+    heads = [
+        f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})"
+        for c in tables.columns(run)
+    ]
+    body = [
+        [metric_label(row.name, row.unit, row.arrow), *map(cell_text, row.cells)]
+        for row in tables.metric_rows(run.summary, run.invalid_reasons, run.table)
+    ]
+    note = ". ".join(filter(None, (INTERVAL_NOTE, contact_note(preset)))) + "."
+    parts = [overview_md(overview_of(run))]
+    parts += _fold(f"All {len(body)} metrics", ["metric", *heads], body, note)
+    parts += _fold(
+        "All paired differences",
+        ["variant", "baseline", "metric", "difference", "95 % interval", "p", "verdict"],
         [
-            "metric",
-            *(
-                f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})"
-                for c in tables.columns(run)
-            ),
+            [p.variant, p.baseline, p.metric, *_texts((p.diff, p.interval, p.p_value)), p.verdict]
+            for p in tables.pair_rows(run.summary, run.table)
         ],
-        [
-            [metric_label(row.name, row.unit, row.arrow), *map(cell_text, row.cells)]
-            for row in tables.metric_rows(run.summary, run.invalid_reasons, run.table)
-        ],
-        ". ".join(filter(None, (INTERVAL_NOTE, contact_note(preset)))) + ".",
-    )
-    pairs = tables.pair_rows(run.summary, run.table)
-    for base in dict.fromkeys(pair.baseline for pair in pairs):
-        parts += _section(
-            f"Paired differences from {escape(base)}",
-            ["renderer", "metric", "difference", "95 % interval", "p", "verdict"],
-            [
-                [p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict]
-                for p in pairs
-                if p.baseline == base
-            ],
-        )
-    parts += _section(
-        "Fixers",
-        ["renderer", *(name for name, _ in COLUMNS)],
-        [[row["renderer"], *_texts(row["cells"])] for row in fixer_rows(run.summary)],
-    )
-    times = speed(run)
-    parts += _section(
-        "Speed",
-        ["renderer", *SPEED_COLUMNS, *times.stages],
-        [[row["renderer"], *_texts(row["cells"]), *_texts(row["stages"])] for row in times.rows],
-        escape(times.pool),
-    )
-    parts += _section(
-        "What the numbers leave out",
-        ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES],
-        [
-            [row["renderer"], *map(cell_text, row["counts"]), *_texts(row["bounds"])]
-            for row in ledger(run, LEDGER_RATES)
-        ],
-        LEDGER_NOTE,
-    )
-    failures, n_more = failure_rows(run)
-    body = []
-    for failure in failures:
-        one = failure["rollout"]
-        text = "; ".join(f"{label}: {text}" for label, text in failure["parts"])
-        body.append([one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), text])
-    parts += _section(
-        "Failures",
-        ["class", "renderer", "policy", "scene", "seed", "what happened"],
-        body,
-        f"{n_more} more in rollouts.parquet." if n_more else "",
     )
     command = terminal(provenance(run)["command"]).replace("```", "")
     return "".join([*parts, f"\n### Made with\n\n```\n{command}\n```\n"])
 
 
-def _section(title: str, head: list[str], rows: list[list[str]], note: str = "") -> list[str]:
-    """Render a heading with its table; nothing without rows."""
-    return [f"\n### {title}\n\n{table(head, rows)}", f"\n{note}\n" if note else ""] if rows else []
+def overview_md(shown: Overview, heading: str = "##") -> str:
+    """Render the first screen of a run as Markdown."""
+    badge, _ = shown.badge
+    parts = [f"{heading} {badge}: {escape(shown.title)}\n\n{escape(shown.context)}\n\n"]
+    if shown.rows:
+        parts += [table(shown.heads, map(shown.cells, shown.rows)), "\n"]
+        parts.append(f"{escape('; '.join(shown.notes))}\n\n")
+    parts += [f"- **{escape(row.name)}**: {escape(row.where)}\n" for row in shown.failing]
+    forest = "\n".join(line.plain.rstrip() for line in forest_lines(shown, PLOT_LETTERS))
+    if forest:
+        parts.append(f"\n{escape(shown.axis)}\n\n```\n{forest.replace('`', '')}\n```\n")
+    if shown.decision:
+        parts.append(f"\n**{escape(shown.decision)}**\n")
+    parts += [f"\n> {escape(caution)}\n" for caution in shown.cautions]
+    return "".join(parts)
+
+
+def _fold(title: str, head: list[str], rows: list[list[str]], note: str = "") -> list[str]:
+    """Render a table that opens by a click; nothing without rows."""
+    if not rows:
+        return []
+    text = f"{table(head, rows)}\n{note}\n" if note else table(head, rows)
+    return [f"\n<details><summary>{title}</summary>\n\n{text}\n</details>\n"]
 
 
 def _texts(cells: Iterable[Cell]) -> list[str]:
@@ -322,6 +294,7 @@ def write_gate_files(
     """
     worst = worst_of(run, verdict, stored)
     text = gate_md(verdict, gate, str(run.folder), worst)
+    text += "\n" + overview_md(overview_of(run), "###")
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text))

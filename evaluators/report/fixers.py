@@ -64,20 +64,6 @@ def _kinds(events: Mapping[str, int]) -> str:
     return ", ".join(f"{kind.removeprefix(GUARD)} {n}" for kind, n in sorted(events.items()))
 
 
-def fixer_lines(summary: Mapping[str, Any]) -> list[str]:
-    """Say in one line each what the fixers of a run were; whatever is untrained says so."""
-    lines = []
-    for name, entry in (summary.get("fixers") or {}).items():
-        parts = [str(entry.get("label")), str(entry.get("mode"))]
-        rate, frames = finite(entry.get("hit_rate")), sum(refused(summary, name).values())
-        if rate is not None:
-            parts.append(f"hit rate {fixed(100 * rate, 1)} %")
-        if frames:
-            parts.append(f"{plural(frames, 'frame')} refused by its guard")
-        lines.append(f"{name}: {', '.join(parts)}")
-    return lines
-
-
 def fixer_cautions(summary: Mapping[str, Any]) -> list[str]:
     """Say what a reader must know of the fixers before using the numbers."""
     cautions = []

@@ -1,12 +1,10 @@
-"""Variants side by side: strips of one cell at the same times, and the cells whose outcome differs
-from the baseline's.
-"""
+"""The cells whose outcome differs from the baseline's, with both images when the plans part."""
 
 from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired
@@ -19,7 +17,7 @@ from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import inside, read_bytes, read_json_as
 from alpasim_plugin.core.reading.images import decode_image
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import AGAIN, STRIP_NAME
+from alpasim_plugin.log.run_folder.schema import AGAIN
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short
@@ -43,80 +41,6 @@ def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
         (renderer, policy): (i, j)
         for i, renderer in enumerate(run.renderers)
         for j, policy in enumerate(run.policies)
-    }
-
-
-def comparisons(
-    run: Run, scenes: Sequence[str], limit: int, budget_bytes: int
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Pick one cell per scene, the one that most variants finished, and inline its strips.
-
-    Args:
-        run: The run; renderers stand side by side, or policies where there is one renderer.
-        scenes: Candidate scenes, the most telling first.
-        limit: Most scenes to inline.
-        budget_bytes: Most bytes of pictures to inline; the first scene is always shown.
-
-    Returns:
-        The comparisons (as `_comparison` gives them), and the scenes that have strips but were left
-        out.
-    """
-    shown: list[dict[str, Any]] = []
-    left_out = []
-    spent = 0
-    for scene in scenes:
-        cells: dict[tuple[str, int], list[Rollout]] = {}
-        for rollout in run.by_scene.get(scene, ()):
-            if run.file_of(rollout, STRIP_NAME) is not None:
-                fixed_side = rollout.renderer if len(run.renderers) == 1 else rollout.policy
-                cells.setdefault((fixed_side, rollout.seed), []).append(rollout)
-        if not cells:
-            continue
-        if shown and (len(shown) >= limit or spent >= budget_bytes):
-            left_out.append(scene)
-            continue
-        comparison = _comparison(run, max(cells.values(), key=len))
-        size = sum(len(strip["src"]) for strip in comparison["strips"])
-        if shown and spent + size > budget_bytes:
-            left_out.append(scene)
-        elif comparison["strips"]:
-            shown.append(comparison)
-            spent += size
-    return shown, left_out
-
-
-def _comparison(run: Run, members: Sequence[Rollout]) -> dict[str, Any]:
-    """Return what the report shows of one cell: ``scene``, ``of`` (what all strips share), ``seed``,
-    ``times`` in words, ``strips``, and ``absent`` (variants without a strip).
-    """
-    by_policy = len(run.renderers) == 1
-    by_name = {r.policy if by_policy else r.renderer: r for r in members}
-    first = members[0]
-    strips, absent, times = [], [], []
-    for name in run.policies if by_policy else run.renderers:
-        rollout = by_name.get(name)
-        path = run.file_of(rollout, STRIP_NAME) if rollout else None
-        encoded = inline_jpeg(path) if path else None
-        if rollout is None or encoded is None:
-            absent.append(name)
-            continue
-        src, width, height = encoded
-        links = {"clip": run.href(rollout, "front.mp4"), "folder": run.href(rollout)}
-        colour = colours_of(run)[rollout.renderer, rollout.policy][0]
-        picture = {"src": src, "width": width, "height": height}
-        strips.append({"name": name, "colour": colour} | picture | links)
-        times.append(tuple(int(t_us) for t_us in run.manifest(rollout).get("strip_t_us") or ()))
-    differing = len(set(times)) > 1
-    zero_us = int((run.scene_data(first.scene) or {}).get("start_us") or 0)
-    printed = [] if differing or not times else times[0]
-    return {
-        "scene": first.scene,
-        "of": first.renderer if by_policy and len(run.policies) > 1 else first.policy,
-        "seed": first.seed,
-        "times": [f"t = {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s" for t_us in printed],
-        "strips": strips,
-        "absent": absent,
-        "differing_times": differing,
     }
 
 

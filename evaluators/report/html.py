@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 from jinja2 import (
     ChoiceLoader,
     Environment,
@@ -21,23 +20,21 @@ from jinja2 import (
 from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import parsing, read_bytes
-from alpasim_plugin.core.reading.images import decode_image
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.log.run_folder.reader import reporting
-from alpasim_plugin.log.run_folder.rows import Rollout, Series
-from alpasim_plugin.log.run_folder.schema import AGAIN, STRIP_NAME, WHY_NAME
-from evaluators.metrics.outcomes import OUTCOMES, first_failure, has_ended, in_words, outcomes_of
+from alpasim_plugin.log.run_folder.rows import Series
+from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
+from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.charts import drift_charts, forest, speed_against_error
+from evaluators.report.charts import speed_against_error
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
+from evaluators.report.flips import FlipKey, colours_of, flip_bases, flip_rows
 from evaluators.report.gate import gate_section
-from evaluators.report.numbers import DASH, duration, fixed, plural
+from evaluators.report.numbers import DASH, plural
+from evaluators.report.overview import TONES, overview_of
 from evaluators.report.provenance import (
     LEDGER_COLUMNS,
     failure_rows,
@@ -46,19 +43,13 @@ from evaluators.report.provenance import (
     provenance,
 )
 from evaluators.report.rollouts import read_series, rollout_block
-from evaluators.report.verdict import find, variant_name
+from evaluators.viewer.worst import worst_change
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
-MAX_STRIP_SCENES = 8
-SERIES_ROLLOUTS = 4000  # whose steps are read at once
 LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
-STRIP_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
-SHOTS = 3
-USUAL_FRAME = 2  # of a strip, where nothing happened
-SHOT_WIDTH_PX = 420
 NO_REPLAYS: Mapping[FlipKey, str] = {}
 STYLES = ("theme.css", "report.css")
 SCRIPTS = ("theme.js", "report.js", "rollouts.js")
@@ -132,22 +123,14 @@ def asset(environment: Environment, name: str) -> str:
 
 def context(run: Run) -> dict[str, Any]:
     """Collect everything that the template prints."""
-    sample = sampled_scenes(run)
-    series = read_series(run, sample)
     interesting = by_interest(run)
     variant_of = colours_of(run)
-    looked_at = None if sample is None else interesting[: 2 * MAX_SCENE_PLOTS]
-    views, no_view = scene_views(
-        run,
-        series if looked_at is None else read_series(run, looked_at),
-        looked_at or interesting,
-        variant_of,
-    )
-    strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
+    looked_at = interesting[: 2 * MAX_SCENE_PLOTS]
+    series = read_series(run, looked_at) if looked_at else {}
+    views, no_view = scene_views(run, series, looked_at, variant_of)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary, run.table)
     failures, more_failures = failure_rows(run)
-    headline = [row for row in rows if row.is_headline] or rows
     # every column has the colour of its renderer, or of its policy where there is one renderer
     colours = {}
     for i, variant in enumerate(run.variants):
@@ -155,23 +138,17 @@ def context(run: Run) -> dict[str, Any]:
         colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
-    of_sample = (
-        ""
-        if sample is None
-        else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
-    )
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
         "when": str(run.info.get("started_at") or "")[:16].replace("T", " "),
-        "finding": find(run),
-        "shots": shots(run, interesting),
+        "overview": overview_of(run),
+        "ending_tones": TONES,
+        "shots": worst_change(run),
         "decision": decision_section(run),
         "gate": gate_section(run),
-        "facts": _facts(run),
         "columns": tables.columns(run),
         "variant_colour": colours,
-        "forest": forest(run, colours),
         "flips": flips,
         "whys": {
             one.path: page
@@ -181,29 +158,20 @@ def context(run: Run) -> dict[str, Any]:
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
-        "baselines": [base.name for base in flip_bases(run)],
         "speed_charts": speed_against_error(run, colours),
         "invalid": invalid_rows(run),
-        "headline_rows": headline,
-        "other_rows": [row for row in rows if row not in headline],
-        "headline_pairs": [p for p in pairs if p.metric in {row.name for row in headline}] or pairs,
-        "other_pairs": [
-            p for p in pairs if headline and p.metric not in {row.name for row in headline}
-        ],
+        "metric_rows": rows,
+        "pair_rows": pairs,
         "coloured": run.policies if by_policy else run.renderers,
         "dashed": len(run.policies) > 1 and not by_policy,
         "policies": run.policies,
-        "charts": drift_charts(run.rollouts, series, variant_of),
         "views": views,
         "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
-        "strips": strips,
-        "strips_left_out": no_strip,
         "fixers": fixer_rows(run.summary),
         "fixer_columns": COLUMNS,
         "speed": speed(run),
         "every_rollout": rollout_block(run),
-        "of_sample": of_sample,
         "failures": failures,
         "more_failures": more_failures,
         "ledger": ledger(run, LEDGER_RATES),
@@ -211,16 +179,6 @@ def context(run: Run) -> dict[str, Any]:
         "ledger_rates": LEDGER_RATES,
         "provenance": provenance(run),
     }
-
-
-def sampled_scenes(run: Run) -> list[str] | None:
-    """Return the scenes whose steps are read for charts of the whole run; None where all are:
-    `SERIES_ROLLOUTS` fit into memory.
-    """
-    if len(run.rollouts) <= SERIES_ROLLOUTS:
-        return None
-    scenes, wanted = run.scenes, max(1, SERIES_ROLLOUTS * len(run.scenes) // len(run.rollouts))
-    return [scenes[i * len(scenes) // wanted] for i in range(wanted)]
 
 
 def by_interest(run: Run) -> list[str]:
@@ -270,78 +228,3 @@ def scene_views(
             )
     order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
-
-
-def _facts(run: Run) -> list[tuple[str, str]]:
-    done = sum(rollout.ok for rollout in run.rollouts)
-    wall_s = (run.summary.get("pool") or {}).get("wall_s")
-    facts = [
-        ("rollouts", f"{done} of {len(run.rollouts)} completed"),
-        ("scenes", str(len(run.scenes))),
-        ("seeds", str(len({rollout.seed for rollout in run.rollouts}))),
-        ("renderers", ", ".join(run.renderers) or DASH),
-        ("policy" if len(run.policies) == 1 else "policies", ", ".join(run.policies) or DASH),
-        ("preset", str(run.summary.get("preset") or run.info.get("preset") or DASH)),
-    ]
-    if isinstance(wall_s, int | float):
-        facts.append(("wall time", duration(wall_s)))
-    return facts
-
-
-def shots(run: Run, interesting: Sequence[str]) -> list[dict[str, Any]]:
-    """Pick at most three images: of rollouts that failed, one a variant first; else of the variants
-    in the most telling scene.
-
-    Args:
-        run: The run.
-        interesting: Its scenes, the most telling first.
-    """
-    gravity, rank = list(OUTCOMES), {scene: i for i, scene in enumerate(interesting)}
-    done = [rollout for rollout in run.rollouts if rollout.ok]
-    failed = sorted(
-        (rollout for rollout in done if outcomes_of(rollout)),
-        key=lambda r: (min(map(gravity.index, outcomes_of(r))), rank[r.scene]),
-    )
-    firsts = {rollout.variant: rollout for rollout in reversed(failed)}
-    chosen = [*reversed(firsts.values()), *failed]
-    chosen = chosen or [rollout for rollout in done if rollout.scene in interesting[:1]]
-    found: list[dict[str, Any]] = []
-    for rollout in {rollout.cell: rollout for rollout in chosen}.values():
-        shot = _shot(run, rollout) if len(found) < SHOTS else None
-        if shot is not None:
-            found.append(shot)
-    return found
-
-
-def _shot(run: Run, rollout: Rollout) -> dict[str, Any] | None:
-    """Return one image of a rollout: ``variant``, ``scene``, ``outcome`` and when, ``src`` (a data:
-    address), and ``link`` to where the rollout is shown.
-    """
-    path = run.file_of(rollout, STRIP_NAME)
-    manifest = run.manifest(rollout)
-    times_us = [int(t_us) for t_us in manifest.get("strip_t_us") or ()]
-    if path is None or not times_us:
-        return None
-    outcome = in_words(outcomes_of(rollout))
-    frame = min(USUAL_FRAME, len(times_us) - 1)
-    first = first_failure(manifest)
-    if first is not None:
-        # what led to it: after a contact the camera may be inside the other vehicle
-        before = [i for i, t_us in enumerate(times_us) if t_us <= int(first["t_us"])]
-        frame = max(before, default=0)
-        outcome += f" at {fixed(float(first['t_s']), 1)}\u00a0s"
-    try:
-        strip = decode_image(read_bytes(path, SOURCE_BYTES), path)
-    except InputError:
-        return None  # the report says elsewhere that the image is absent
-    width = strip.shape[1] // len(times_us)
-    size = (SHOT_WIDTH_PX, round(strip.shape[0] * SHOT_WIDTH_PX / width))
-    image = cv2.resize(strip[:, frame * width :][:, :width], size, interpolation=cv2.INTER_AREA)
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return {
-        "variant": variant_name(run, rollout.variant),
-        "scene": rollout.scene,
-        "outcome": outcome,
-        "src": "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(),
-        "link": run.href(rollout, WHY_NAME) or run.href(rollout),
-    }

@@ -22,6 +22,9 @@ ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
 
 
+LABEL = 9  # width of the labels at the end of a command
+
+
 @dataclass(frozen=True)
 class Cell:
     """One printed number.
@@ -122,3 +125,8 @@ def duration(seconds: float | None) -> str:
 def plural(n: int, noun: str, many: str = "") -> str:
     """Print a count with its noun; ``many`` is the plural where an s does not make it."""
     return f"{n}\u00a0{noun}" if n == 1 else f"{n}\u00a0{many or noun + 's'}"
+
+
+def labelled(label: str, text: str) -> str:
+    """Print a line of the end of a command."""
+    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")

@@ -25,8 +25,7 @@ from evaluators.report.numbers import (
     scale_and_unit,
     short,
 )
-from evaluators.report.verdict import tone_of
-from evaluators.statistics.sentences import more_scenes_text
+from evaluators.report.overview import tone_of
 
 # verdict on other scenes against the margin, and the difference on these scenes -> words
 VERDICT_WORDS = {
@@ -63,7 +62,7 @@ class PairRow:
     p_value: Cell
     verdict: str
     tone: str
-    hint: str = ""  # the margin, and how many more scenes would decide
+    margin: str = ""
 
 
 def metric_rows(
@@ -175,10 +174,8 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
         p_cell = Cell(text, str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, str(entry.get("direction", "none")))
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
-    hints = [more_scenes_text(entry.get("more_scenes"))]
     margin = finite(entry.get("margin"))
-    if margin is not None and entry.get("direction") != "none":
-        hints.insert(0, f"margin {short(margin * scale, unit)}")
+    has_margin = margin is not None and entry.get("direction") != "none"
     return PairRow(
         variant,
         str(entry.get("baseline") or DASH),
@@ -189,7 +186,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
         p_cell,
         VERDICT_WORDS.get((verdict, str(entry.get("difference"))), verdict),
         tone,
-        "; ".join(filter(None, hints)),
+        f"margin {short(margin * scale, unit)}" if has_margin else "",
     )
 
 

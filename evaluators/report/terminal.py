@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from textwrap import wrap
 from typing import Any
 
 from rich import box
@@ -21,21 +22,20 @@ from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips
-from evaluators.report.numbers import Cell, finite, fixed, plural
+from evaluators.report.numbers import labelled
+from evaluators.report.overview import TONES, Overview, overview_of
 from evaluators.report.tables import metric_rows
-from evaluators.report.verdict import Finding, find
 from evaluators.scores.table import SCORES
 
-LABEL = 9  # width of the labels
-MOST_VARIANTS = 12  # named at the end of a run
+STYLES = {"worse": "red", "better": "green", "mixed": "yellow", "unclear": "yellow", "neutral": ""}
+MOST_NAMED = 6  # variants whose failures are named
+HEAD_WIDTH = 9
+LEAST_PLOT = 20  # letters
 MORE_SCENES = "suites/urban"
 SEEING = "lane-camera"  # a shipped policy with a camera
 KEPT = ("--set", "--preset", "--controller")  # options of a command that the next one has too
 OF_A_SCENE = r"(road|ego|actors)\b"  # settings that another scene cannot have
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
-GAP_NOTE = (
-    "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
-)
 
 
 def render_presets(
@@ -84,98 +84,141 @@ def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent:
     return Text(f"{number} ").append(escape(note), style="dim")
 
 
-def render_table(
+def metric_lines(
     summary: Mapping[str, Any], headline_only: bool = False, known: MetricTable = METRICS
-) -> Table:
-    """Lay out metrics x renderers with mean and 95 % interval.
+) -> list[str]:
+    """Print the mean and 95 % interval of each metric, a line a variant.
 
     Args:
         summary: Content of ``summary.json``.
         headline_only: Leave out all but the headline metrics, where any of them is there.
         known: What the metrics are.
-
-    Returns:
-        A rich table; print it with ``rich.print`` or a Console (80 columns fit two renderers).
     """
     rows = metric_rows(summary, known=known)
     if headline_only and any(row.is_headline for row in rows):
         rows = [row for row in rows if row.is_headline]
-    gaps = any("\u2014" in cell.text + cell.detail for row in rows for cell in row.cells)
-    touch = (
-        contact_note(str(summary.get("preset")))
-        if any(row.name.startswith("collision") for row in rows)
-        else ""
-    )
-    note = (
-        MARGIN_NOTE + (GAP_NOTE if gaps else "") + (f"\n{touch}" if touch else "") if rows else None
-    )
-    table = Table(box=box.SIMPLE_HEAD, caption=note, caption_justify="left", pad_edge=False)
-    table.add_column(
-        Text(escape(f"preset {summary.get('preset', '?')}"), style="dim"), overflow="fold"
-    )
-    for variant, entries in (summary.get("metrics") or {}).items():
-        counts = [
-            (int(e.get("n_rollouts") or 0), int(e.get("n_scenes") or 0)) for e in entries.values()
-        ]
-        n_rollouts, n_scenes = max(counts, default=(0, 0))
-        head = Text(escape(variant), style="bold") + Text(
-            f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim"
-        )
-        table.add_column(head, justify="right", overflow="fold")
+    names = [escape(name) for name in summary.get("metrics") or {}]
+    width = max(map(len, names), default=0)
+    lines = []
     for row in rows:
-        label = Text(escape(row.name), style="bold" if row.is_headline else "")
-        facts = " ".join(part for part in (row.unit, row.arrow) if part)
-        label.append(f" {facts}" if facts else "", style="not bold dim")
-        table.add_row(label, *(_cell(cell) for cell in row.cells))
-    return table
+        unit = "" if row.name.endswith(f"_{row.unit}") else row.unit
+        facts = ", ".join(part for part in (unit, row.arrow_word) if part)
+        lines.append(escape(row.name) + (f" ({facts})" if facts else ""))
+        for name, cell in zip(names, row.cells, strict=True):
+            text = f"  {name.ljust(width)}  {cell.text}"
+            lines.append(
+                f"{text}  {cell.detail or cell.note}" if cell.detail or cell.missing else text
+            )
+    if rows:
+        lines.append(MARGIN_NOTE)
+        if any(row.name.startswith("collision") for row in rows):
+            lines.append(contact_note(str(summary.get("preset"))))
+    return [line.replace("\u00a0", " ").rstrip() for line in lines if line]
 
 
-def _cell(cell: Cell) -> Text:
-    if cell.missing:
-        return Text(cell.text, style="dim")
-    return Text(cell.text, style="bold").append(
-        f"\n{cell.detail}" if cell.detail else "", style="not bold dim"
+def overview_lines(shown: Overview, width: int) -> list[Text]:
+    """Print the first screen of a run within a width: table, failures, differences, decision.
+
+    A name that is too long for its column stands on a line of its own.
+    """
+    badge, tone = shown.badge
+    lines = [Text(badge, f"{STYLES[tone]} bold")]
+    lines += [*(Text(line, "dim") for line in _wrapped(shown.context, width)), Text()]
+    lines += _grid(shown, width)
+    lines += [Text(line, "dim") for line in _wrapped("; ".join(shown.notes), width)]
+    for row in shown.failing[:MOST_NAMED]:
+        lines += [Text(line) for line in _wrapped(f"{row.name}: {row.where}", width)]
+    if len(shown.failing) > MOST_NAMED:
+        lines.append(Text(f"and {len(shown.failing) - MOST_NAMED} more variants: report.html"))
+    if shown.axis:
+        lines += [Text(), *(Text(line, "dim") for line in _wrapped(shown.axis, width))]
+        lines += forest_lines(shown, width)
+    if shown.decision:
+        lines += [Text(line, "bold") for line in _wrapped(shown.decision, width)]
+    for caution in shown.cautions:
+        lines += [Text(line, "yellow") for line in _wrapped(f"caution: {caution}", width)]
+    for line in lines:
+        line.no_wrap, line.overflow = True, "ignore"
+    return lines
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Break between words only, further lines indented."""
+    plain = escape(text.replace("\u00a0", " "))
+    return wrap(
+        plain, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
 
 
-def ending_lines(run: Run) -> list[str]:
-    """Return the last lines of a finished run's terminal output, without the path of its report."""
-    finding = find(run)
-    outcomes = [f"{name}: {text}" for name, text in finding.outcomes]
-    if len(outcomes) > MOST_VARIANTS:
-        more = f"and {len(outcomes) - MOST_VARIANTS} more variants: report.html"
-        outcomes = [*outcomes[:MOST_VARIANTS], more]
-    lines = [labelled("" if row else "outcome", text) for row, text in enumerate(outcomes)]
-    if len(lines) != 1:
-        lines.append(labelled("verdict", finding.title))
-    lines += [
-        labelled("", f"{finding.name_of(point)}: {point.lead}")
-        for point in finding.points
-        if point.lead
+def _grid(shown: Overview, width: int) -> list[Text]:
+    heads = [wrap(head, HEAD_WIDTH, break_long_words=False) for head in shown.heads]
+    body = [
+        [escape(cell.replace("\u00a0", " ")) for cell in shown.cells(row)] for row in shown.rows
     ]
-    cost = cost_text(run.summary)
-    return [*lines, labelled("cost", cost)] if cost else lines
+    columns = list(zip(*body, strict=True)) or [()] * len(heads)
+    widths = [max(map(len, [*head, *column])) for head, column in zip(heads, columns, strict=True)]
+    room = width - sum(widths[1:]) - len(widths[1:])
+    names = [len(name) for name in (*columns[0], "variant") if len(name) <= room]
+    widths[0] = max(names, default=0)
+    tall = max(map(len, heads))
+    lines = []
+    for number in range(tall):
+        texts = [([""] * (tall - len(head)) + head)[number] for head in heads]
+        lines.append(_line(texts, widths, ["dim"] * len(heads)))
+    styles = [STYLES[TONES.get(names[0], "mixed")] for _, names in shown.endings]
+    for cells in body:
+        if len(cells[0]) > widths[0]:
+            lines.append(Text(cells[0], "bold"))
+            cells = ["", *cells[1:]]
+        counted = zip(styles, cells[1:], strict=False)
+        shades = ["dim" if count == "0" else style for style, count in counted]
+        lines.append(_line(cells, widths, ["bold", *shades, "", "", ""]))
+    return lines
+
+
+def _line(cells: Sequence[str], widths: Sequence[int], styles: Sequence[str]) -> Text:
+    line = Text(cells[0].ljust(widths[0]), styles[0], end="")
+    for cell, width, style in zip(cells[1:], widths[1:], styles[1:], strict=True):
+        line.append(f" {cell.rjust(width)}", style)
+    return line
+
+
+def forest_lines(shown: Overview, width: int) -> list[Text]:
+    """Draw the differences with letters: dot, interval, margin band, and the numbers beside."""
+    found = [(escape(row.name), row.difference) for row in shown.rows if row.difference is not None]
+    beside = max((len(one.text) for _, one in found), default=0)
+    names = [len(name) for name, _ in found if len(name) <= width - beside - LEAST_PLOT]
+    name_width = max(names, default=0)
+    last = width - name_width - beside - 3
+
+    def place(value: float) -> int:
+        return round(last * shown.share(value))
+
+    lines = []
+    for name, one in found:
+        letters = [" "] * (last + 1)
+        for column in range(place(-one.margin), place(one.margin) + 1):
+            letters[column] = "\u2591"
+        low, high = one.bounds or (one.centre, one.centre)
+        for column in range(place(low), place(high) + 1):
+            letters[column] = "\u2500"
+        letters[place(0.0)] = "\u2502"
+        letters[place(one.centre)] = "\u25cf"
+        if len(name) > name_width:
+            lines.append(Text(name))
+            name = ""
+        line = Text(f"{name.ljust(name_width)} ").append("".join(letters), STYLES[one.tone])
+        lines.append(line.append(f" {one.text.rjust(beside)}"))
+    return lines
 
 
 def next_line(run: Run) -> str:
     """Return the line that names the next command worth trying, and why."""
-    command, why = next_command(run, find(run))
+    command, why = next_command(run, overview_of(run))
     return labelled("next", f"{shlex.join(command)}   # {why}")
 
 
-def cost_text(summary: Mapping[str, Any]) -> str:
-    """Say what a camera frame costs behind each renderer: the mean, which is what a rollout pays;
-    empty where nothing was timed.
-    """
-    parts = []
-    for name, times in (summary.get("speed") or {}).items():
-        mean_ms = finite(times.get("ms_per_frame_mean"))
-        if mean_ms is not None:
-            parts.append(f"{name} {fixed(mean_ms, 0 if mean_ms >= 10 else 1)} ms")
-    return f"{', '.join(parts)} a frame, the whole loop (mean)" if parts else ""
-
-
-def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
+def next_command(run: Run, shown: Overview) -> tuple[list[str], str]:
     """Choose the command that most helps with what was found.
 
     Returns:
@@ -201,9 +244,9 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
         if outcomes_of(rollout):
             words = ["simrun", "why", f"{run.folder}/{cell_name(*rollout.cell)}"]
             return words, "what the policy saw and planned there"
-    if not finding.points or len(run.variants) == 1:
+    if len(shown.rows) == 1:
         return _again(run, [*run.renderers, other], scenes), f"compares with {other}, pair by pair"
-    if finding.tone == "unclear":
+    if any(row.difference and row.difference.tone == "unclear" for row in shown.rows):
         why = "more scenes: the interval is too wide to decide"
         return _again(run, run.renderers, [MORE_SCENES]), why
     return ["simrun", "view", str(run.folder)], "replays the rollouts side by side in a browser"
@@ -232,8 +275,3 @@ def _again(
         *settings,
         *scenes,
     ]
-
-
-def labelled(label: str, text: str) -> str:
-    """Print a line of the end of a command."""
-    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")

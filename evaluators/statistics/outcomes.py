@@ -1,14 +1,19 @@
-"""How the drives of a run end, counted by arm, with where and when; and the same in sentences."""
+"""How the rollouts of a run ended, counted by variant, with where and when."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import (
     CONTACT_SIDES,
+    ENDINGS,
     OUTCOMES,
+    ending_of,
     has_ended,
     outcomes_of,
     reached_end,
@@ -19,7 +24,7 @@ Times = Mapping[
     tuple[str, str, str, int], Mapping[str, float]
 ]  # cell -> outcome -> seconds after the first frame
 LISTED = 20  # cells named per outcome in summary.json
-NAMED = 2  # in a sentence
+DISTANCE = "lateral_distance_m"
 
 
 def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], Times]:
@@ -73,7 +78,8 @@ def outcome_table(
         RENDERER/POLICY -> ``n_rollouts``; ``n_ended`` (ran to their end, or were broken by the
         policy); ``n_failed`` (of these: with an outcome); ``n_reached_end`` (without one, at the
         end of the path); ``outcomes``: NAME -> ``n`` and ``cells`` (the first `LISTED`: ``scene``,
-        ``seed``, ``t_s`` or None).
+        ``seed``, ``t_s`` or None); ``endings``: the one way in which each rollout ended, counted;
+        ``lateral_distance_m_median`` over rollouts, None without a value.
     """
     arms: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
@@ -83,6 +89,8 @@ def outcome_table(
 
 def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
     ended = [r for r in rollouts if has_ended(r)]
+    known = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
+    endings = Counter(map(ending_of, rollouts))
     cells: dict[str, list[dict[str, Any]]] = {}
     for rollout in ended:
         began = times.get(rollout.cell, {})
@@ -95,60 +103,11 @@ def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
         "n_ended": len(ended),
         "n_failed": sum(bool(outcomes_of(r)) for r in ended),
         "n_reached_end": sum(reached_end(r) for r in ended),
+        "endings": {name: endings[name] for name in ENDINGS if name in endings},
+        f"{DISTANCE}_median": float(np.median(known)) if known else None,
         "outcomes": {
             name: {"n": len(cells[name]), "cells": cells[name][:LISTED]}
             for name in OUTCOMES
             if name in cells
         },
     }
-
-
-def sentence(entry: Mapping[str, Any]) -> str:
-    """Say how the drives of an arm end.
-
-    Args:
-        entry: One of `outcome_table`.
-
-    Example:
-        >>> cells = [{"scene": "bend", "seed": 0, "t_s": 3.12}]
-        >>> sentence({"n_ended": 3, "n_reached_end": 2, "outcomes": {"offroad": {"n": 1, "cells": cells}}})
-        'off-road in 1 of 3 (bend at 3.1 s); 2 of 3 reach the end'
-    """
-    n, reached = int(entry["n_ended"]), int(entry["n_reached_end"])
-    if n == 0:
-        return "no drive has ended"
-    parts = [_counted(name, facts, n) for name, facts in entry["outcomes"].items()]
-    if n == 1:
-        ends = (
-            "reaches the end"
-            if reached
-            else ""
-            if parts
-            else "no event, but the end is not reached"
-        )
-        return "; ".join([*parts, *([ends] if ends else [])])
-    all_of = "both" if n == 2 else f"all {n}"
-    ends = (
-        f"{all_of} reach the end"
-        if reached == n
-        else f"{reached} of {n} reach{'es' if reached == 1 else ''} the end"
-    )
-    return "; ".join([*parts, ends] if parts or reached == n else ["no event", ends])
-
-
-def _counted(name: str, facts: Mapping[str, Any], n: int) -> str:
-    cells, k = list(facts["cells"]), int(facts["n"])
-    several_seeds = len({cell["scene"] for cell in cells}) < len(cells)
-    where = [_place(cell, several_seeds) for cell in cells[:NAMED]]
-    if n == 1:
-        t_s = cells[0]["t_s"] if cells else None
-        return OUTCOMES[name].words + (f" at {t_s:.1f} s" if t_s is not None else "")
-    more = f" and {k - len(where)} more" if k > len(where) else ""
-    return f"{OUTCOMES[name].words} in {k} of {n} ({', '.join(where)}{more})"
-
-
-def _place(cell: Mapping[str, Any], with_seed: bool) -> str:
-    seed = f" seed {cell['seed']}" if with_seed else ""
-    return f"{cell['scene']}{seed}" + (
-        f" at {cell['t_s']:.1f} s" if cell["t_s"] is not None else ""
-    )

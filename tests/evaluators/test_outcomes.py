@@ -22,7 +22,7 @@ from evaluators.metrics.outcomes import (
 )
 from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
-from evaluators.statistics.outcomes import outcome_table, rollouts_of, sentence
+from evaluators.statistics.outcomes import outcome_table, rollouts_of
 
 DT_S, V = 0.1, 8.0
 T = np.arange(0.0, 12.0, DT_S)
@@ -212,11 +212,10 @@ def test_outcomes_are_counted_by_arm_with_place_and_time() -> None:
     table = outcome_table(
         *rollouts_of([manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost])
     )
-    assert sentence(table["clean/a"]) == "reaches the end"
-    assert (
-        sentence(table["clean/b"])
-        == "policy fault in 1 of 2 (two); off-road in 1 of 2 (one at 3.1 s); 0 of 2 reach the end"
-    )
+    assert table["clean/a"]["endings"] == {"reached the end": 1}
+    assert table["clean/b"]["endings"] == {"off-road": 1, "policy fault": 1, "not run": 1}
+    (cell,) = table["clean/b"]["outcomes"]["offroad"]["cells"]
+    assert (cell["scene"], cell["t_s"]) == ("one", 3.1)
     assert (
         table["clean/b"]["n_rollouts"],
         table["clean/b"]["n_ended"],

@@ -17,11 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.opening import read_run
 from evaluators.report.flips import find_flips
-from evaluators.statistics.paired import paired
-from evaluators.statistics.summary import aggregate, censoring
-from tests.evaluators.eval_build import base_pairs
+from evaluators.statistics.summary import by_policy, censoring, numbers
 
 METRICS = (
     "collision_any",
@@ -95,7 +94,10 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
     _write_rows(folder, rows)
     _write_steps(folder, steps)
     _json(folder / "run.json", _run_json(plan, maps))
-    _json(folder / "summary.json", summary_of(rows, plan))
+    _json(
+        folder / "summary.json",
+        summary_of(rows, plan, RolloutTable.of_files([folder / "rollouts.parquet"])),
+    )
     if plan.flip_frames:
         _write_flips(folder, plan)
     return folder
@@ -422,10 +424,9 @@ def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
     )
 
 
-def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
+def summary_of(rows: list[dict[str, Any]], plan: Plan, table: RolloutTable) -> dict[str, Any]:
     """Aggregate as the runtime does."""
-    baseline = plan.renderers[0] if plan.renderers else ""
-    ran = {r["renderer"] for r in rows}
+    own = {policy: [r for r in rows if r["policy"] == policy] for policy in plan.policies}
     failed = [r for r in rows if r["status"] != "ok"]
     speed = {
         renderer: {
@@ -449,17 +450,15 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
     }
     return {
         "preset": "paper",
-        "metrics": aggregate(rows),
-        "paired": paired(rows, baseline) if len(ran) > 1 else {},
-        "paired_with_base": base_pairs(rows, baseline, {"onefixer": "3dgs"}),
-        "censoring": censoring(rows),
+        **(numbers(table, bases={"onefixer": "3dgs"}) if rows else {"metrics": {}}),
+        "censoring": by_policy(own, censoring),
         "failures": {
             "n_failed": len(failed),
             "n_rollouts": len(rows),
             "by_class": {"renderer": len(failed)},
             "cells": [_failed(r) for r in failed],
         },
-        "speed": speed,
+        "speed": by_policy(dict.fromkeys(own), lambda _: speed),
         "pool": {
             "workers": 2,
             "threads_per_worker": 1,

@@ -3,57 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 
 import pytest
 
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.opening import Run, read_run
-from evaluators.report.terminal import cost_text, ending_lines, next_command, next_line
-from evaluators.report.verdict import find
+from evaluators.report.overview import overview_of
+from evaluators.report.terminal import next_command
 from tests.docs.test_commands import parse
 from tests.report.make_run import Plan, make_run
 
 
 def words_of(run: Run) -> list[str]:
     """Return the next command; it is one that the command line understands."""
-    words, why = next_command(run, find(run))
+    words, why = next_command(run, overview_of(run))
     assert why
     assert words[0] == "simrun"
     parse(words[1:])
     return words
-
-
-def test_a_run_ends_with_verdict_differences_cost_and_the_next_command(usual_run: Path) -> None:
-    run = read_run(usual_run)
-    lines = ending_lines(run)
-    at = next(i for i, line in enumerate(lines) if line.startswith("verdict"))
-    assert [line[:9].strip() for line in lines[:at]] == ["outcome", *[""] * (at - 1)]
-    assert at == len(find(run).outcomes) == 6
-    verdict, *pairs, cost = lines[at:]
-    assert verdict == f"verdict  {find(run).title}"
-    heads = [re.match(r" {9}(\S+ \u2212 \S+): ", line) for line in pairs]
-    assert [head[1] for head in heads if head] == [
-        "3dgs \u2212 clean",
-        "onefixer \u2212 clean",
-        "onefixer \u2212 3dgs",
-    ]
-    assert all("95 % interval" in line for line in pairs)
-    assert re.fullmatch(
-        r"cost     clean [\d.]+ ms, 3dgs [\d.]+ ms, onefixer [\d.]+ ms a frame, the whole loop \(mean\)",
-        cost,
-    )
-    assert next_line(run).startswith("next     simrun ")
-
-
-def test_the_cost_is_the_mean_and_not_the_median() -> None:
-    speed = {
-        "onefixer": {"ms_per_frame_p50": 1.0, "ms_per_frame_mean": 176.2},
-        "clean": {"ms_per_frame_mean": None},
-    }
-    assert cost_text({"speed": speed}) == "onefixer 176 ms a frame, the whole loop (mean)"
-    assert cost_text({}) == ""
 
 
 def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run: Path) -> None:
@@ -143,7 +111,7 @@ def test_what_is_undecided_leads_to_more_scenes(tmp_path: Path, renderers: tuple
     run = dataclasses.replace(
         run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one))
     )
-    if run.rollouts and find(run).tone == "unclear":
+    if run.rollouts:
         assert words_of(run)[-1] == "suites/urban"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evaluators.report.fixers import COLUMNS, fixer_cautions, fixer_lines, fixer_rows
+from evaluators.report.fixers import COLUMNS, fixer_cautions, fixer_rows
 from evaluators.report.numbers import DASH
 
 DRAFTED = {
@@ -60,14 +60,5 @@ def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
     assert len(drafted["cells"]) == len(COLUMNS)
 
 
-def test_the_terminal_line_says_label_mode_and_rate() -> None:
-    first, second = fixer_lines(SUMMARY)
-    assert first == "onefixer: onefixer-tiny, untrained (identity), speculative, hit rate 75.0 %"
-    assert (
-        second.replace("\u00a0", " ")
-        == "onefixer-s: onefixer-s, trained, chunk, 4 frames refused by its guard"
-    )
-
-
 def test_a_run_without_fixers_says_nothing() -> None:
-    assert fixer_rows({}) == fixer_lines({}) == fixer_cautions({}) == []
+    assert fixer_rows({}) == fixer_cautions({}) == []

@@ -9,8 +9,9 @@ import pyarrow.parquet as pq
 
 from evaluators.opening import read_run
 from evaluators.report import html
-from evaluators.report.ci import write_gate_files
+from evaluators.report.ci import overview_md, write_gate_files
 from evaluators.report.gate import gate_section, worst_of
+from evaluators.report.overview import overview_of
 from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import judge, load_gate
 
@@ -35,7 +36,9 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
     page = html.render_report(run)
     assert page.index('id="gate"') < page.index('id="results"')
     assert section["worst"][0]["scene"] in page[page.index('id="table-gate-worst"') :]
-    assert section["worst"][0]["scene"] in (root / "gate.md").read_text()
+    text = (root / "gate.md").read_text()
+    assert section["worst"][0]["scene"] in text
+    assert text.endswith(overview_md(overview_of(run), "###"))
     table = pq.read_table(root / "rollouts.parquet")
     pq.write_table(table.slice(0, table.num_rows - 1), root / "rollouts.parquet")
     assert gate_section(read_run(root)) is None
@@ -63,10 +66,3 @@ def test_what_breaks_a_limit_stands_before_what_is_undecided_and_once(
     assert all(
         " of before.json" in check.text for check in verdict.checks if check.kind == "margin"
     )
-
-
-def test_three_pictures_stand_under_the_verdict(usual_run: Path) -> None:
-    page = html.render_report(read_run(usual_run))
-    head = page[page.index('class="verdict"') : page.index('class="facts"')]
-    assert 1 <= head.count("<img") <= 3
-    assert page.index("<h1") < page.index('class="shots"')

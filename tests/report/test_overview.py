@@ -1,0 +1,264 @@
+"""The first screen of a run: one table, printed in the terminal, report.html, summary.md and
+gate.md.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.log import encode_image
+from evaluators.metrics import METRICS
+from evaluators.opening import Run, read_run
+from evaluators.report import write_report
+from evaluators.report.ci import overview_md
+from evaluators.report.numbers import DASH
+from evaluators.report.overview import Overview, decided, overview_of, tone_of
+from evaluators.report.terminal import overview_lines
+from evaluators.statistics.paired import paired
+from evaluators.viewer import worst
+from tests.evaluators.test_tables_over_rollouts import rows_of
+from tests.report.make_run import Plan, make_run
+
+PRIMARY = METRICS.primary
+
+
+def pair(diff: float, low: float, high: float, verdict: str, **more: Any) -> dict[str, Any]:
+    entry = {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01}
+    return entry | {"verdict": verdict, "margin": 0.02, "n_scenes": 3} | more
+
+
+def with_pairs(folder: Path, **tables: Any) -> Run:
+    """Return a run of one policy with these tables of primary differences."""
+    run = read_run(folder)
+    shown = {
+        name: {variant: {PRIMARY: entry} for variant, entry in table.items()}
+        for name, table in tables.items()
+    }
+    rest = {key: value for key, value in run.summary.items() if not key.startswith("paired")}
+    return dataclasses.replace(run, summary=rest | shown)
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("three"), Plan(steps=40, clips=False))
+
+
+def test_every_rollout_is_counted_once_under_its_variant(usual_run: Path) -> None:
+    shown = overview_of(read_run(usual_run))
+    assert [row.n_rollouts for row in shown.rows] == [12] * 6
+    for row in shown.rows:
+        name, *cells = shown.cells(row)
+        counts = [int(cell) for cell in cells[: len(shown.endings)]]
+        assert name == row.name
+        assert sum(counts) == row.n_rollouts
+    assert [row.name for row in shown.rows if row.difference is None] == [
+        "clean/lane-camera",
+        "clean/pure-pursuit",
+    ]
+    lost = [row.endings.get("not run", 0) for row in shown.rows]
+    assert sum(lost) == 4
+    assert all(row.where.endswith("not run") for row in shown.rows if row.endings.get("not run"))
+
+
+def test_terminal_markdown_and_page_print_the_same_cells(three: Path) -> None:
+    shown = overview_of(read_run(three))
+    terminal = "\n".join(line.plain for line in overview_lines(shown, 100))
+    markdown = overview_md(shown)
+    page = re.sub(r"<[^>]*>", " ", write_report(three).read_text())
+    for row in shown.rows:
+        numbers = [cell.replace("\u00a0", " ") for cell in shown.cells(row)]
+        assert re.search(r"\s+".join(map(re.escape, numbers)), terminal)
+        assert " | ".join(numbers).replace("*", "\\*") in markdown
+        assert row.primary in page
+        for name, n in row.endings.items():
+            assert (
+                f"{n} {'end' if name == 'reached the end' and len(row.endings) > 1 else name}"
+                in page
+            )
+    for text in (shown.decision, shown.title):
+        assert text.replace("\u00a0", " ") in " ".join(page.replace("\u00a0", " ").split())
+    assert terminal.count("would decide") <= 1
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
+    tmp_path: Path, width: int
+) -> None:
+    names = [f"drivers.py:PurePursuitWithALongName{letter * 12}" for letter in "abcd"]
+    plan = Plan(("clean",), ("log-replay", *names), seeds=(0,), steps=30, pictures=False)
+    shown = overview_of(read_run(make_run(tmp_path, plan)))
+    lines = [line.plain for line in overview_lines(shown, width)]
+    assert all(len(line) <= width for line in lines)
+    assert all(any(name in line for line in lines) for name in names)
+
+
+@pytest.mark.parametrize("renderers", [(), ("clean",), ("clean", "3dgs", "onefixer")])
+def test_any_number_of_variants_has_a_first_screen(
+    tmp_path: Path, renderers: tuple[str, ...]
+) -> None:
+    run = read_run(make_run(tmp_path, Plan(renderers, seeds=(0,), steps=20, pictures=False)))
+    shown = overview_of(run)
+    assert len(shown.rows) == len(renderers)
+    assert bool(shown.axis) == (len(renderers) > 1)
+    assert overview_lines(shown, 80)
+    assert overview_md(shown).startswith("## ")
+
+
+def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
+    three: Path,
+) -> None:
+    entry = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
+    run = with_pairs(three, paired={"3dgs": entry, "onefixer": entry | {"more_scenes": 180}})
+    shown = overview_of(run)
+    assert [row.difference and row.difference.tone for row in shown.rows] == [
+        None,
+        "unclear",
+        "unclear",
+    ]
+    assert shown.decision.replace("\u00a0", " ").count("with 3 scenes") == 1
+    assert "183" in shown.decision
+    assert "29" not in shown.decision
+
+
+def test_what_is_decided_is_named_beside_what_is_not(three: Path) -> None:
+    run = with_pairs(
+        three,
+        paired={
+            "3dgs": pair(0.25, 0.1, 0.4, "worse"),
+            "onefixer": pair(0.0, -0.1, 0.1, "undecided", p_value=1.0),
+        },
+    )
+    shown = overview_of(run)
+    assert [row.difference and row.difference.tone for row in shown.rows] == [
+        None,
+        "worse",
+        "unclear",
+    ]
+    first, second = shown.decision.split(". ")
+    assert first.startswith("3dgs drives worse than clean")
+    assert "onefixer" in second
+    assert decided(()) == ""
+
+
+def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_own_policy(
+    usual_run: Path,
+) -> None:
+    shown = overview_of(read_run(usual_run))
+    assert shown.baselines == "clean"
+    assert {row.name for row in shown.rows if row.difference} == {
+        f"{renderer}/{policy}"
+        for renderer in ("3dgs", "onefixer")
+        for policy in ("lane-camera", "pure-pursuit")
+    }
+
+
+def test_a_distance_that_an_event_cut_short_says_so(three: Path) -> None:
+    run = read_run(three)
+    ledger = {name: {"steps_after_event": 5 * (name == "3dgs")} for name in run.renderers}
+    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"censoring": ledger}))
+    assert [row.is_cut_short for row in shown.rows] == [False, True, False]
+    assert [shown.cells(row)[-2].endswith("*") for row in shown.rows] == [False, True, False]
+
+
+def test_a_missing_number_is_a_dash_and_never_zero(tmp_path: Path) -> None:
+    plan = Plan(("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])
+    (row,) = overview_of(read_run(make_run(tmp_path, plan))).rows
+    assert (row.primary, row.distance) == (DASH, DASH)
+    assert row.endings == {"not run": 1}
+
+
+@pytest.mark.parametrize(
+    ("entry", "direction", "tone"),
+    [
+        ({"diff": 0.2, "ci95": [0.1, 0.3], "verdict": "undecided"}, "lower", "unclear"),
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "lower", "worse"),
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "higher", "better"),
+        ({"diff": 0.2, "ci95": [0.0, 0.4]}, "lower", "unclear"),
+        ({"diff": 0.2, "ci95": 0.1}, "lower", "worse"),  # a half-width
+        ({"diff": 0.2, "ci95": None}, "lower", "unclear"),
+        ({"diff": None, "ci95": None}, "lower", "unclear"),
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "none", "neutral"),
+        ({"verdict": "non-inferior"}, "lower", "neutral"),
+    ],
+)
+def test_tone_of_a_difference(entry: dict[str, Any], direction: str, tone: str) -> None:
+    assert tone_of(entry, direction) == tone
+
+
+def test_identical_variants_are_called_better_or_worse_in_no_more_runs_than_one_question_allows(
+    three: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    drawn = (rng.random((2, 300, 40, 1)) < 0.3).astype(float)  # variant, comparison, scene, seed
+    pool = [
+        paired(rows_of(a, PRIMARY, "clean") + rows_of(b, PRIMARY), "clean")["3dgs"][PRIMARY]
+        for a, b in zip(*drawn, strict=True)
+    ]
+    said, uncorrected, runs = 0, 0, 100
+    names = [f"renderer-{k}" for k in range(15)]
+    for _ in range(runs):
+        chosen = [pool[k] for k in rng.choice(len(pool), 15, replace=False)]
+        run = with_pairs(three, paired=dict(zip(names, chosen, strict=True)))
+        entry = {"n_rollouts": 1, "outcomes": {}, "endings": {"reached the end": 1}}
+        table = {f"{name}/lane-camera": entry for name in names}
+        rows = overview_of(dataclasses.replace(run, summary=run.summary | {"outcomes": table})).rows
+        said += any(row.difference and row.difference.tone in ("worse", "better") for row in rows)
+        uncorrected += any(one["difference"] != "none shown" for one in chosen)
+    assert said <= 0.05 * runs
+    assert uncorrected > 0.2 * runs  # what the rule is for
+
+
+def test_an_evaluator_declares_no_second_primary_question() -> None:
+    with pytest.raises(EvaluatorError, match=f"'{PRIMARY}' is primary"):
+        METRICS.adding({"mine": dataclasses.replace(METRICS.info(PRIMARY), name="mine")})
+
+
+def grey(value: int) -> bytes:
+    return encode_image(np.full((9, 16, 3), value, np.uint8), "jpeg", 95)
+
+
+def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(
+    three: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = read_run(three)
+    first, scene = run.rollouts[0], run.scenes[0]
+    rollouts = []
+    for one in run.rollouts:
+        if (one.scene, one.seed) == (scene, first.seed):
+            hit = float(one.renderer == "3dgs")
+            flags = {"collision_any": hit, "collision_at_fault": hit, "offroad": 0.0}
+            rollouts.append(dataclasses.replace(one, metrics={**one.metrics, **flags}))
+    run = dataclasses.replace(
+        run, rollouts=tuple(rollouts), info=run.info | {"bases": {"onefixer": "3dgs"}}
+    )
+    for one in rollouts:
+        (run.folder / one.path / "rollout.asl").touch()
+        manifest = {"events": [{"metric": "collision_front", "t_us": 3_300_000}]}
+        (run.folder / one.path / "manifest.json").write_text(json.dumps(manifest))
+    images = [
+        SimpleNamespace(camera="front", end_us=1_000_000 * k, data=grey(50 * k)) for k in range(6)
+    ]
+    log = SimpleNamespace(images=images, render_start_us=500_000)
+    monkeypatch.setattr(worst, "read_log", lambda path: log)
+    shots = worst.worst_change(run)
+    assert [shot.variant for shot in shots] == ["clean", "3dgs", "onefixer"]
+    assert {(shot.scene, round(shot.t_s, 3)) for shot in shots} == {(scene, 2.8)}
+    for shot in shots:
+        data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
+        assert abs(float(np.mean(cv2.imdecode(data, cv2.IMREAD_COLOR))) - 150.0) < 3
+
+
+def test_a_run_without_frames_has_no_images(usual_run: Path) -> None:
+    assert worst.worst_change(read_run(usual_run)) == []
+    assert isinstance(overview_of(read_run(usual_run)), Overview)
