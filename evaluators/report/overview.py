@@ -61,6 +61,7 @@ class Difference:
 
     Attributes:
         bounds: 95 % interval over scenes; None with one scene.
+        verdict: What a sentence about the variant says, unless it is undecided.
         more_scenes: How many more would decide; None where it is decided, or not known.
     """
 
@@ -69,6 +70,7 @@ class Difference:
     bounds: tuple[float, float] | None
     margin: float
     tone: Tone
+    verdict: str
     text: str
     n_scenes: int
     more_scenes: int | None
@@ -322,12 +324,17 @@ def differences_of(run: Run) -> dict[str, Difference]:
         values = [scale * value for value in (float(entry["diff"]), *(bounds or ()))]
         places = 1 if metric.in_percent else decimals(*values)
         texts = [fixed(value, places, sign=True) for value in values]
+        baseline = variant_name(run, str(entry.get("baseline") or "the baseline"))
+        verdict = f"{VERDICTS.get(tone, '')} {baseline}"
+        if tone in ("worse", "better") and entry.get("verdict") != "worse":
+            verdict += " on these scenes"
         found[key] = Difference(
-            variant_name(run, str(entry.get("baseline") or "the baseline")),
+            baseline,
             values[0],
             (values[1], values[2]) if bounds else None,
             scale * (finite(entry.get("margin")) or 0.0),
             tone,
+            verdict,
             f"{texts[0]} ({' to '.join(texts[1:])})" if bounds else texts[0],
             int(entry.get("n_scenes") or 0),
             entry.get("more_scenes") if tone == "unclear" else None,
@@ -339,14 +346,13 @@ def decided(rows: Sequence[VariantRow]) -> str:
     """Say once what is decided about the differences, and about how many scenes would decide the
     rest; empty without any.
     """
-    parts = []
-    for tone, words in VERDICTS.items():
-        names: dict[str, list[str]] = {}
-        for row in rows:
-            if row.difference is not None and row.difference.tone == tone:
-                names.setdefault(row.difference.baseline, []).append(row.name)
-        parts += [f"{' and '.join(who)} {words} {base}" for base, who in names.items()]
     found = {row.name: row.difference for row in rows if row.difference is not None}
+    said: dict[str, list[str]] = {}
+    for tone in VERDICTS:
+        for name, one in found.items():
+            if one.tone == tone:
+                said.setdefault(one.verdict, []).append(name)
+    parts = [f"{', '.join(names)} {verdict}" for verdict, names in said.items()]
     still_open = {name: one for name, one in found.items() if one.tone == "unclear"}
     if still_open:
         text = (
