@@ -40,6 +40,7 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators import preset as find_preset
+from evaluators.opening import read_run
 from evaluators.report.decision import decision_lines
 from evaluators.report.numbers import plural
 from evaluators.statistics.decision import Question, metric_question
@@ -284,7 +285,8 @@ def _print_decision(decided: Decided, as_json: bool) -> None:
     record = decided.record
     root = decided.run.root
     facts = {"out": str(root), "exit_code": decided.outcome.exit_code, "decision": record}
-    show(as_json, facts, *decision_lines(record), *report_lines(root))
+    lines = [] if as_json else first_screen(read_run(root))
+    show(as_json, facts, *decision_lines(record), "", *lines, "", *report_lines(root))
 
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
@@ -314,8 +316,7 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
 
 
 def _print_result(result: RunResult) -> None:
-    from evaluators.opening import read_run  # what a run ends with is loaded while it is driven
-    from evaluators.report import next_line
+    from evaluators.report import next_line  # what a run ends with is loaded while it is driven
 
     root = result.root
     run = read_run(root)

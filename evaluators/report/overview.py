@@ -180,7 +180,7 @@ class Overview:
         for all others that occur.
         """
         known = dict.fromkeys(name for row in self.rows for name in row.endings)
-        columns = [(name, (name,)) for name in COLUMNS]
+        columns: list[tuple[str, tuple[str, ...]]] = [(name, (name,)) for name in COLUMNS]
         others = tuple(name for name in known if name not in COLUMNS)
         if others:
             columns.append((others[0] if len(others) == 1 else "other", others))
@@ -368,7 +368,7 @@ def decided(rows: Sequence[VariantRow]) -> str:
         if needed:
             most = max(needed)
             text += f"; {'more than' if most > MANY_SCENES else 'at least'} "
-            text += f"{min(most, MANY_SCENES)} scenes would decide"
+            text += f"{min(most, MANY_SCENES)} scenes are needed"
         parts.append(text)
     return ". ".join(parts)
 

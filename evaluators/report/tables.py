@@ -175,7 +175,9 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
     tone = tone_of(entry, str(entry.get("direction", "none")))
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
     margin = finite(entry.get("margin"))
-    has_margin = margin is not None and entry.get("direction") != "none"
+    hint = ""
+    if margin is not None and entry.get("direction") != "none":
+        hint = f"margin {short(margin * scale, unit)}"
     return PairRow(
         variant,
         str(entry.get("baseline") or DASH),
@@ -186,7 +188,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
         p_cell,
         VERDICT_WORDS.get((verdict, str(entry.get("difference"))), verdict),
         tone,
-        f"margin {short(margin * scale, unit)}" if has_margin else "",
+        hint,
     )
 
 

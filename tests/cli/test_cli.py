@@ -164,7 +164,7 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(
     ]
     assert run_command(command) == 0
     captured = capsys.readouterr()
-    assert "lateral_distance_m" in captured.out
+    assert "primary" in captured.out
     assert captured.out.splitlines()[-1].startswith(
         "next     simrun --renderer clean,3dgs --policy lane-camera --seeds 1 smoke/straight "
     )
