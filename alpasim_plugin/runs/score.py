@@ -123,12 +123,13 @@ def _aggregate(
     An error of the scene score leaves the values of the rollouts.
     """
     good = [one.manifest for one in scores if one.scored is not None]
+    has_images = any(manifest["frames"] for manifest in good)
     failed = [one.manifest for one in scores if one.scored is None]
     reduced: Sequence[Any] = []
     marks: dict[int, SceneScore] | None = {}
     error: EvaluatorError | None = None
     try:
-        if good:
+        if has_images:
             reduced = reduce_run([one.scored for one in scores if one.scored is not None], preset)
         marks = {
             number: scene_score(one.values, settings.scene_score)
@@ -159,6 +160,8 @@ def _aggregate(
             f"{len(failed)} of {len(scores)} rollouts failed, and "
             "allow_aggregation_with_failed_rollouts is false"
         )
+    elif good and not has_images:
+        facts["skipped"] = "no log has an image, and its aggregation asks whether images are black"
     elif reduced:
         facts["files"] = _write_aggregate(folder, reduced, marks, failed, settings)
     return facts, error

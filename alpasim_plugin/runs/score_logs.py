@@ -148,6 +148,9 @@ def _score(
     }
     # A wrong --scene is an error of the command, not of the log.
     scene = scenes.of(rollout.scene_id).scene
+    cameras = {image.camera for image in rollout.images}
+    if (log.parent / MANIFEST).exists() and preset.image_camera not in cameras:
+        preset = replace(preset, image_camera=None)  # our runs name their cameras as they like
     try:
         check_complete(log, rollout)
         series = tuple(score(rollout, scene, preset, evaluators))

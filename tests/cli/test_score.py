@@ -157,6 +157,17 @@ def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_pa
     assert "holds other results" in capsys.readouterr().err
 
 
+def test_a_log_of_ours_without_images_has_alpasims_values_and_no_aggregation(
+    our_run, tmp_path, capsys
+):
+    out = tmp_path / "scored"
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", "alpasim"]
+    assert run_command([*command, "--out", str(out)]) == 0
+    assert "aggregation was not written" in capsys.readouterr().err
+    assert not (out / "aggregate").exists()
+    assert [row["progress_valid"] for row in rows(out)] == [True, True]
+
+
 def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
     out = tmp_path / "scored"
     pattern = str(golden / "rollouts" / "synthetic-c*-in-a" / "*" / "rollout.asl")
