@@ -39,6 +39,10 @@ def lane_polygon(
         xy = np.ascontiguousarray(lane.centre[:, :2] - origin[:2])
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
         return shapely.buffer(line, half_width_m, quad_segs=16)
+    edges = lane.left, lane.right
+    if not even_odd and all(len(e) > 3 and np.allclose(e[0], e[-1], 0, 1e-6) for e in edges):
+        # A lane that leads into itself: what lies between its two closed edges.
+        return shapely.symmetric_difference(*(ring_area(e - origin) for e in edges))
     ring = np.concatenate([lane.left[:, :2], lane.right[::-1, :2]])
     return ring_area(ring - origin[:2], even_odd)
 

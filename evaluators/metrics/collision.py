@@ -1,7 +1,7 @@
 """Contact with other actors: flags by side, the least gap, and where contact is searched between
 steps, time and place.
 
-At fault is front or lateral. By the paper's protocol only logged instants are looked at
+At fault is front or lateral, or what nuPlan calls so. By the paper's protocol only logged instants are looked at
 (`evaluators.metrics.contact`); preset ``strict`` searches the motion between them as well
 (`evaluators.metrics.contact`), and a row then says what happened since the row before.
 """
@@ -17,6 +17,7 @@ from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries,
 from evaluators.metrics.contact import (
     FRONT,
     LATERAL,
+    NOT_LOOKED_FOR,
     REAR,
     SweptContacts,
     find_contacts,
@@ -27,10 +28,11 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import handover_us, series, with_preset
+from evaluators.scores import nuplan
+from evaluators.scores.judged import Judged
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"
-NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,12 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     lateral = touched[LATERAL]
     is_present = np.isfinite(gap_m)
 
+    at_fault = front | lateral
+    if preset.fault == "nuplan" and len(step):
+        guilty = _at_fault(Judged(rollout, scene, preset, rollout.ego), actor, side, step)
+        at_fault = np.zeros_like(front)
+        at_fault[step[guilty]] = True
+
     def flag(name: str, fired: Bool) -> MetricSeries:
         return series(name, t_us, fired, fired | (scene.standing != "unknown"), NOT_LOOKED_FOR)
 
@@ -127,7 +135,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     )
     return [
         flag("collision_any", front | rear | lateral),
-        *([] if preset.hits == "last" else [flag("collision_at_fault", front | lateral)]),
+        *([] if preset.hits == "last" else [flag("collision_at_fault", at_fault)]),
         flag("collision_front", front),
         flag("collision_lateral", lateral),
         flag("collision_rear", rear),
@@ -146,6 +154,17 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
         ),
         *first,
     ]
+
+
+def _at_fault(drive: Judged, actor: I64, side: I64, step: I64) -> Bool:
+    """Return of which contacts ``(M,)`` the ego is at fault by nuPlan's rules: it moves, and it
+    touches what stands, or somebody with its front, or at its side while no lane holds it.
+    """
+    tracks = drive.tracks
+    stands = tracks.there[actor, step] & (tracks.speed[actor, step] <= nuplan.STOPPED_MPS)
+    between = (side == LATERAL) & (False if drive.astray is None else drive.astray[step])
+    guilty = stands | (side == FRONT) | between
+    return np.asarray(guilty & (drive.ego.speed[step] > nuplan.STOPPED_MPS))
 
 
 def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:

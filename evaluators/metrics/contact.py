@@ -37,6 +37,7 @@ LATERAL = 2
 _SLACK_M = 1e-6
 _SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
 _STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
+NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 # Where two bodies touch is read off their overlap when the ego is this much larger on every side.
 PLACE_M = 1e-6
 

@@ -45,6 +45,18 @@ def safe_distance_m(v_mps: F64, ahead_mps: F64) -> F64:
     return np.maximum(own - np.maximum(ahead_mps, 0.0) ** 2 / (2 * RSS_MOST_BRAKE_MPS2), 0.0)
 
 
+def time_to_collision_s(ego: EgoStates, tracks: Tracks) -> F64:
+    """Return ``(T,)`` seconds until the ego's box touches that of any road user, from whatever
+    side, if all go straight on at their velocity; 0 while it does, infinite where it never will.
+    """
+    out = np.full(len(ego.t_us), np.inf)
+    actor, step = np.nonzero(tracks.there)
+    first_s, last_s = nuplan.touching_s(ego, tracks, actor, step)
+    meets = (first_s <= last_s) & (last_s >= 0.0)
+    np.minimum.at(out, step[meets], np.maximum(first_s[meets], 0.0))
+    return out
+
+
 def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     """Return ``(T,)`` by how much the gap to who is ahead exceeds the safe one, the least of all;
     infinite where nobody is ahead.
@@ -102,7 +114,11 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
             enough,
             FEW,
         ),
-        series("time_to_collision_s", t_us, np.minimum(drive.ttc_s, nuplan.TTC_HORIZON_S)),
+        series(
+            "time_to_collision_s",
+            t_us,
+            np.minimum(time_to_collision_s(drive.ego, drive.tracks), nuplan.TTC_HORIZON_S),
+        ),
         series("rss_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_ONE_AHEAD),
         series("impact_speed_mps", t_us, impact_mps, np.isfinite(impact_mps), NO_CONTACT),
         series("wrong_way", t_us, against, drive.has_map, NO_LANES),

@@ -194,7 +194,7 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     aside_m = on_route(line, path.t_us, t_us, ego.xy).aside_m
     s = followed(
         line,
-        to_path(line, ego.xy)[1],
+        *to_path(line, ego.xy),
         ego.xy,
         float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
     )

@@ -36,6 +36,9 @@ class Preset:
     hits: Literal["every", "last"] = "every"
     # "at_steps": logged instants only. "between_steps": the motion between them too.
     contact: Literal["at_steps", "between_steps"] = "at_steps"
+    # At fault. "by_side": contact at the front or the side, as AlpaSim has it. "nuplan": what nuPlan
+    # says of who moves, which side is touched, and whether the ego is between lanes.
+    fault: Literal["by_side", "nuplan"] = "by_side"
     # Road. Lanes whose centre passes within lane_radius_m (3-D) of the ego box centre: its line, or
     # only its stored vertices.
     lane_radius_m: float = 6.0
@@ -163,6 +166,7 @@ PRESETS: dict[str, Preset] = {
     "strict": Preset(
         name="strict",
         contact="between_steps",
+        fault="nuplan",
         seam_m=0.1,
         offroad_rule="margin",
         missing_road="error",
@@ -170,7 +174,7 @@ PRESETS: dict[str, Preset] = {
     # Other benchmarks go on after an event, and have no score where a part of it cannot be
     # measured.
     **{
-        name: Preset(name=name, protocol=name, seam_m=0.1, stop_after=())
+        name: Preset(name=name, protocol=name, fault="nuplan", seam_m=0.1, stop_after=())
         for name in ("nuplan", "navsim")
     },
 }

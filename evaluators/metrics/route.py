@@ -23,10 +23,12 @@ from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scene,
 from evaluators.metrics.footprint import ego_footprints, held, origin_of
 from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.score import relevant, series, with_preset
+from evaluators.metrics.table import LEFT_ROUTE_M
 
 DIRECTION_M = 1.0
 # what a recording does within this distance of its first or last position is standing there
 STAND_M = 0.5
+FOUND_M = 2.0  # a path that was left is found again where it is this near
 _ROWS = (
     32  # points handled at once, so that what is computed of them stays in the processor's cache
 )
@@ -67,36 +69,35 @@ def moving(path: F64) -> I64:
     return np.concatenate([[0], np.arange(first, last + 1), [len(path) - 1]])
 
 
-def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
+def followed(path: F64, distance_m: F64, s: F64, points: F64, first_m: float) -> F64:
     """Return ``(T,)`` arc lengths on a path that move no farther from step to step than points that
     move beside it.
 
     Args:
         path: ``(N, 2)`` vertices.
-        s: ``(T,)`` arc length of the nearest point of the whole path.
+        distance_m, s: ``(T,)`` distance and arc length of the nearest point of the whole path.
         points: ``(T, 2)``.
         first_m: Arc length about which the first one is sought.
 
     Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one
-    before.
+    before. A point that has left the path there by `LEFT_ROUTE_M` finds it again wherever it comes
+    within `FOUND_M` of it and moves its way: it has skipped what lies between.
     """
     lengths = arc_lengths(path)
-    out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
+    moved = np.diff(points, axis=0, prepend=points[:1])
+    out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*moved.T)
     reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, lengths, first_m))))
     leaps = np.flatnonzero(np.abs(np.diff(s, prepend=first_m)) > reach_m)
     for k in range(int(leaps[0]), len(s)) if len(leaps) else ():
         before = float(out[k - 1]) if k else first_m
         low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(lengths[-1]))
         inner = path[np.searchsorted(lengths, low, "right") : np.searchsorted(lengths, high)]
-        out[k] = (
-            low
-            + to_path(
-                np.concatenate(
-                    [_at(path, lengths, low)[None], inner, _at(path, lengths, high)[None]]
-                ),
-                points[[k]],
-            )[1][0]
-        )
+        ends = _at(path, lengths, low)[None], _at(path, lengths, high)[None]
+        away_m, within_m = to_path(np.concatenate([ends[0], inner, ends[1]]), points[[k]])
+        out[k] = low + within_m[0]
+        if away_m[0] >= LEFT_ROUTE_M and distance_m[k] <= FOUND_M:
+            along = _at(path, lengths, s[k] + FOUND_M) - _at(path, lengths, s[k] - FOUND_M)
+            out[k] = s[k] if along @ moved[k] > 0.0 else out[k]
     return out
 
 
@@ -237,7 +238,9 @@ def on_route(path: F64, recorded_us: I64, t_us: I64, points: F64) -> OnRoute:
     line = path[keep]
     along = arc_lengths(line)
     distance_m, s = to_path(line, points)
-    followed_m = followed(line, s, points, float(np.interp(t_us[0], recorded_us[keep], along)))
+    followed_m = followed(
+        line, distance_m, s, points, float(np.interp(t_us[0], recorded_us[keep], along))
+    )
     return OnRoute(
         float(along[-1]), followed_m, beside(line, s, points, distance_m), left_of(line, s, points)
     )

@@ -255,11 +255,11 @@ _BEGAN = "where on `F` the contact that touches now began; `strict` only"
 METRICS = MetricTable(
     {  # in the order in which reports show them, after the headline ones
         "collision_at_fault": _flag(
-            "front or lateral contact",
+            "contact at fault: strict by nuPlan's rules, else also where the ego is hit at its side",
             is_headline=True,
             label="at-fault collisions",
             reference=FOOTPRINT,
-            formula="`collision_front` or `collision_lateral`",
+            formula="`collision_front` or `collision_lateral`; `strict`: [at fault](metrics.md#contact-in-preset-strict)",
             invalid=_NOT_LOOKED_FOR,
         ),
         "collision_any": _flag(
@@ -460,10 +460,10 @@ METRICS = MetricTable(
             "s",
             "higher",
             "min",
-            "time until the ego touches somebody ahead if all go on as they are; at most 3 s",
+            "time until the ego and a road user touch if all go straight on; at most 3 s",
             limits=(0.0, 3.0),
             reference=FOOTPRINT,
-            formula="least of 0.1, 0.2, ... s after which `F` and a rectangle ahead, both going straight on, touch; 3 if none",
+            formula="least time after which `F` and another's rectangle, from whatever side, touch if both keep velocity and heading; 3 if none",
         ),
         "rss_margin_m": _metres(
             "gap to who is ahead, less the distance that responsibility-sensitive safety asks for",

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Scene, Trajectory
-from evaluators.metrics.collision import NOT_LOOKED_FOR
+from evaluators.metrics.contact import NOT_LOOKED_FOR
 from evaluators.metrics.footprint import Footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.road import Road, road_of
@@ -65,14 +65,24 @@ class Judged:
 
     @cached_property
     def astray(self) -> Bool | None:
-        """Where ``(T,)`` no single lane holds the ego: it is in several, or off the road; None
-        without a map.
+        """Where ``(T,)`` no lane holds the ego, nor one with a lane that leads into it and one that
+        it leads to: it is in several lanes that are not connected, or off the road; None without a
+        map.
         """
         if not self.has_map:
             return None
         step, lane = self._in_lanes
+        boxes = self.boxes.shapes()
         out = np.ones(len(self._xyz), dtype=np.bool_)
-        out[step[shapely.covers(self.road.areas(lane), self.boxes.shapes()[step])]] = False
+        out[step[shapely.covers(self.road.areas(lane), boxes[step])]] = False
+        across = np.flatnonzero(out)
+        row, lane = np.nonzero(self.road.lanes_near(self._xyz[across]))
+        touches = shapely.intersects(self.road.areas(lane), boxes[across[row]])
+        row, lane = row[touches], lane[touches]
+        for k in np.unique(lane).tolist():
+            for chain in self.road.chains(k):
+                steps = across[row[lane == k]]
+                out[steps[shapely.covers(chain, boxes[steps])]] = False
         return out
 
     @cached_property

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import LoggedPlan
-from evaluators import reduce_rollout, score
+from evaluators import PRESETS, reduce_rollout, score
 from evaluators.scores.protocols import MEASURES, RULES
 from evaluators.scores.table import PARTS, SCORES
-from tests.evaluators.eval_build import TWO_LANES, car, road_map, rollout, scene, track
+from tests.evaluators.eval_build import TWO_LANES, car, lane, road_map, rollout, scene, track
 
 N = 80
 CRUISE = np.linspace(0.0, 63.2, N)  # 8 m/s
@@ -23,6 +23,10 @@ def values(log, preset, where=TWO_LANES, **more):
     one = replace(scene(where, log), **more)
     found = reduce_rollout(score(log, one, preset), preset).values
     return {name: value.value if value.valid else value.reason for name, value in found.items()}
+
+
+def values_per_step(log, name):
+    return next(one.value for one in score(log, scene(TWO_LANES, log)) if one.name == name)
 
 
 def braking(at=40.0, to=20.0):
@@ -80,6 +84,50 @@ def test_an_object_costs_a_half_and_an_actor_that_runs_into_the_ego_nothing():
         values(rollout(track(CRUISE, 0.0), [chaser]), "nuplan")["nuplan_no_at_fault_collision"]
         == 1.0
     )
+
+
+def cut(road, x, connected=True):
+    """The same lanes, each cut in two at some place along it."""
+    parts = []
+    for one in road.lanes.values():
+        halves = [
+            lane(name, one.centre[0, 1], x0=x0, x1=x1)
+            for name, x0, x1 in ((f"{one.lane_id} a", -50.0, x), (f"{one.lane_id} b", x, 200.0))
+        ]
+        ahead = (halves[1].lane_id,) if connected else ()
+        parts += [replace(halves[0], successors=ahead), halves[1]]
+    return road_map(*parts, edges=road.road_edges)
+
+
+def test_a_seam_between_connected_lanes_is_not_several_lanes():
+    """A car drives into the ego's side while the ego crosses the end of its lane."""
+    hit = car("hits", track(CRUISE, np.maximum(9.0 - 0.2 * np.arange(N), 1.0)))
+    log = rollout(track(CRUISE, 0.0), [hit])
+    seam = float(CRUISE[np.argmax(values_per_step(log, "collision_lateral") > 0)])
+    gap = replace(PRESETS["nuplan"], seam_m=0.0)
+    for where, wanted in (
+        (TWO_LANES, 1.0),
+        (cut(TWO_LANES, seam), 1.0),
+        (cut(TWO_LANES, seam, connected=False), 0.0),
+    ):
+        for preset in (PRESETS["nuplan"], gap):
+            assert values(log, preset, where)["nuplan_no_at_fault_collision"] == wanted
+
+
+def test_strict_blames_the_ego_by_nuplans_rules_and_paper_by_the_side_alone():
+    """Who is hit at its side while it keeps its lane is not at fault; who changes lanes is."""
+    t = np.arange(N)
+    hit = car("hits", track(CRUISE + 1.0, np.maximum(9.0 - 0.2 * t, 1.0)))
+    for y, guilty in ((0.0, 0.0), (1.0, 1.0)):
+        log = rollout(track(CRUISE, y), [hit])
+        strict, paper = (values(log, preset) for preset in ("strict", "paper"))
+        assert (strict["collision_lateral"], strict["collision_at_fault"]) == (1.0, guilty)
+        assert paper["collision_at_fault"] == 1.0
+        assert strict["offroad_or_collision_at_fault"] == guilty
+    stands = rollout(track(np.full(N, 20.0), 1.0), [car("hits", track(CRUISE, 1.0))])
+    assert values(stands, "strict")["collision_at_fault"] == 0.0
+    parked = rollout(track(CRUISE, 0.0), [car("stands", track(np.full(N, 30.0), 0.0))])
+    assert values(parked, "strict")["collision_at_fault"] == 1.0
 
 
 def test_driving_against_the_lane_costs_the_direction_and_a_short_way_back_does_not():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Lane
-from evaluators import PRESETS
+from evaluators import PRESETS, score
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
 from evaluators.metrics.road import Road
-from tests.evaluators.eval_build import lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference_rules import road_by_step
 from tests.examples import examples
 
@@ -180,3 +180,27 @@ def test_random_arrangements_far_from_neat():
         checked(
             road_map(*lanes), rollout(track(*at, yaw=rng.choice([0.0, np.pi / 2, 0.3, np.pi], n)))
         )
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_a_closed_ring_is_one_lane_without_a_border_where_it_begins(clockwise):
+    """Driven once round as one lane and as two halves."""
+    turn = np.linspace(0.0, 2 * np.pi, 201)
+    turn = -turn if clockwise else turn
+
+    def arc(radius, part=slice(None)):
+        angle = turn[part]
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
+
+    def ring(name, part=slice(None)):
+        left, right = (31.75, 28.25) if clockwise else (28.25, 31.75)
+        return Lane(name, arc(30.0, part), arc(left, part), arc(right, part))
+
+    way = arc(30.0)
+    log = rollout(track(way[:, 0], way[:, 1], turn + np.sign(turn[-1]) * np.pi / 2))
+    one, two = (
+        by_name(score(log, scene(road_map(*lanes), log)))["offroad_margin_m"].value
+        for lanes in ([ring("a")], [ring("a", slice(0, 101)), ring("b", slice(100, 201))])
+    )
+    assert one.min() > 0.7
+    assert one == pytest.approx(two, abs=1e-3)

@@ -41,6 +41,19 @@ def test_time_to_collision_and_impact_speed_of_a_drive_into_a_standing_car():
     assert impact.value[impact.valid] == pytest.approx(8.0)
 
 
+def test_who_crosses_at_speed_is_seen_from_the_side_however_far_off_the_nose():
+    """A car comes from the left at 23 m/s and meets the ego at 40 m; nuPlan's cone is blind to it."""
+    t = np.arange(N) * 0.1
+    crossing = car("crosses", track(40.0, 23.0 * (5.0 - t), yaw=-np.pi / 2))
+    found = scored(rollout(track(CRUISE, 0.0), [crossing]))["time_to_collision_s"].value
+    for k in (22, 30, 40, 45):
+        x, y = CRUISE[k] + CRUISE[1] * 10 * (s := np.arange(0, 3, 0.001)), 23.0 * (5.0 - t[k] - s)
+        box = rollout(track(CRUISE, 0.0)).ego_box
+        touch = (np.abs(x - 40.0) <= box.length_m / 2 + 0.9) & (np.abs(y) <= 2.25 + box.width_m / 2)
+        assert found[k] == pytest.approx(s[np.argmax(touch)] if touch.any() else 3.0, abs=0.002)
+    assert found[30] < 2.0
+
+
 def test_the_safe_distance_is_that_of_the_definition_and_nobody_beside_counts():
     assert safe_distance_m(np.array([8.0]), np.array([0.0]))[0] == pytest.approx(
         8 + 1.75 + 11.5**2 / 8

@@ -295,3 +295,27 @@ def test_a_closed_loop_starts_at_its_start_and_ends_at_its_end():
     assert scored(rollout(beside_m, log=path))["progress"].value[[0, -1]] == pytest.approx(
         [0, 1], abs=1e-3
     )
+
+
+def test_a_drive_that_skips_a_loop_finds_the_path_again_behind_it():
+    """The recording drives a full circle to its left in the middle of a straight road."""
+    turn = np.linspace(-np.pi / 2, 1.5 * np.pi, 158)[1:-1]
+    circle = np.column_stack([25 * np.cos(turn), 25 + 25 * np.sin(turn)])
+    straight = np.arange(-40.0, 0.0)
+    ahead = np.arange(0.0, 91.0)
+    path = np.concatenate(
+        [np.column_stack([straight, 0 * straight]), circle, np.column_stack([ahead, 0 * ahead])]
+    )
+    x = np.arange(-40.0, 91.0)
+    log = rollout(track(x, 0.0), log=track(path[:, 0], path[:, 1]))
+    found = scored(log)["progress"].value
+    assert found[-1] == pytest.approx(1.0)
+    assert found[30] < 0.12 < 0.8 < found[80]
+    assert np.all(np.diff(found) > -0.02)
+    # The way back of a U-turn runs the other way: who leaves the way out towards it is not on it.
+    there = np.arange(0.0, 80.0)
+    out_and_back = np.concatenate(
+        [np.column_stack([there, 0 * there]), np.column_stack([there[::-1], 0 * there + 6.0])]
+    )
+    aside = rollout(track(there, 5.0), log=track(out_and_back[:, 0], out_and_back[:, 1]))
+    assert scored(aside)["progress"].value.max() < 0.55

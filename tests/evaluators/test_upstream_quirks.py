@@ -110,7 +110,7 @@ def test_d01_of_several_contacts_only_the_last_named_one_is_classified():
         alpasim, strict = both(log)
         found[shift] = (alpasim["collision_front"].value[1], alpasim["collision_rear"].value[1])
         assert (strict["collision_front"].value[1], strict["collision_rear"].value[1]) == (1.0, 1.0)
-        assert values(log, "strict")["collision_at_fault"] == 1.0
+        assert values(log, "paper")["collision_at_fault"] == 1.0
     assert found == {0.0: (1.0, 0.0), 0.2: (0.0, 1.0)}
     assert (
         values(log, "alpasim")["collision_at_fault"] == 0.0
