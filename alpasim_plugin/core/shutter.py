@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp, transform_points
-from alpasim_plugin.core.types import F32, F64, Bool, RenderRequest
+from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Exposure, RenderRequest
 
 Along = Literal["rows", "columns"]
 # two neighbouring bands show a thing so far apart, so that none is off by more than half of it ...
@@ -52,6 +52,26 @@ class Band:
             window[...] = part
         else:
             window[self.exposed] = part[self.exposed]
+
+
+def rolling_exposure(
+    camera: CameraSpec, before: Mapping[str, F64], now: Mapping[str, F64], period_us: int
+) -> Exposure | None:
+    """Return when the rows of a camera's frame are exposed: the first at shutter start, the last at
+    its end; None where its shutter is global.
+
+    Args:
+        camera: Its shutter is open no longer than the period.
+        before: ``T_world_box`` of the road users one period before the shutter's end; who was not
+            there stood still.
+        now: At the shutter's end.
+        period_us: Between the two.
+    """
+    if not camera.shutter_us:
+        return None
+    share = 1 - camera.shutter_us / period_us
+    start = {name: between(before.get(name, T)[None], T[None], share)[0] for name, T in now.items()}
+    return Exposure(rolling(camera.width, camera.height, "rows", backwards=False), start)
 
 
 def bands(request: RenderRequest, apart_px: float = APART_PX) -> list[Band]:

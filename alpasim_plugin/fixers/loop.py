@@ -20,8 +20,8 @@ from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.fixers.references import ReferenceSession
-from alpasim_plugin.fixers.semantic_map.draw import draw_map
-from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, actor_boxes, prepare_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 
@@ -72,14 +72,7 @@ class BlockRunner:
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
         with self._timed("map"):
-            boxes = actor_boxes(request.actors, self.actors)
-            image = draw_map(
-                self.scene_map,
-                request.camera,
-                request.T_world_camera[-1],
-                boxes,
-                threads=self.threads,
-            )
+            image = draw_exposed_map(self.scene_map, request, self.actors, self.threads)
         return ConditionedFrame(request, frame, image)
 
     def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:

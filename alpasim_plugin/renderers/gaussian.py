@@ -1,8 +1,7 @@
 """Render Gaussian scenes: ``clean``, the scene as built.
 
 A frame is drawn at the shutter's end, unless its request says when its pixels are exposed
-(`renderers.rolling`). Runs of this project do not say so, and no policy here uses more than the
-pose at the frame's time; a request of AlpaSim does.
+(`renderers.rolling`).
 """
 
 from __future__ import annotations

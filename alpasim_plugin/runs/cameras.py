@@ -12,6 +12,7 @@ from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.interfaces import BlockRule
+from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -134,6 +135,7 @@ class CameraRig:
         self._clock = clock
         self._cadence = cadence or make_cadence(clock, scenario, sensors)
         self._forecaster, self._lookahead = forecaster, lookahead
+        self._before: Mapping[str, F64] = {}  # the road users one control period ago
         for sensor in sensors:
             if sensor.camera not in known:
                 raise InputError(
@@ -171,11 +173,14 @@ class CameraRig:
                     if forecast
                     else ()
                 )
-                self._held.append(
-                    RenderRequest(
-                        tick.t_us, camera, shutter_poses(history, camera, tick.t_us), shown, ahead
-                    )
+                T_world_camera = shutter_poses(history, camera, tick.t_us)
+                exposure = rolling_exposure(
+                    camera, self._before, shown, self._clock.rates.control_us
                 )
+                self._held.append(
+                    RenderRequest(tick.t_us, camera, T_world_camera, shown, ahead, exposure)
+                )
+        self._before = shown
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
         ready, self._held = self._held, []

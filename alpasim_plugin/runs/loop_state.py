@@ -25,6 +25,7 @@ from alpasim_plugin.core.geometry import (
     wrap_angle,
     yaw_of,
 )
+from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -296,9 +297,12 @@ class Forecast:
         past = Trajectory(
             self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto]
         )
-        return RenderRequest(
-            t_us, camera, shutter_poses(past, camera, t_us), drawn(self.actors.at(t_us))
-        )
+        period_us = self.scenario.rates.control_us
+        shown = drawn(self.actors.at(t_us))
+        before = drawn(self.actors.at(t_us - period_us)) if camera.shutter_us else {}
+        exposure = rolling_exposure(camera, before, shown, period_us)
+        T_world_camera = shutter_poses(past, camera, t_us)
+        return RenderRequest(t_us, camera, T_world_camera, shown, exposure=exposure)
 
     def _extend(self, to_us: int) -> None:
         states = []

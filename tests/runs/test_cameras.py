@@ -9,6 +9,7 @@ import pytest
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Rates, Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig
 from alpasim_plugin.runs.loop_state import LoopState
@@ -67,3 +68,25 @@ def test_shutter_start_and_end_poses_follow_the_motion(straight_road: Scenario) 
     (request,) = rig.requests(tick, replace_end(LoopState.at_start(scenario, 30), tick.t_us), {})
     moved = request.T_world_camera[1, :3, 3] - request.T_world_camera[0, :3, 3]
     np.testing.assert_allclose(moved, [0.5, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_rolling_shutter_exposes_rows_and_road_users_at_their_own_times(
+    straight_road: Scenario,
+) -> None:
+    camera = replace(straight_road.cameras[0], shutter_us=30_000)
+    scenario = replace(straight_road, cameras=(camera,))
+    clock = Clock(scenario.start_us, scenario.end_us, Rates())
+    rig = CameraRig(scenario, [SensorSpec("front")], clock)
+    history = replace_end(LoopState.at_start(scenario, 30), clock.start_us + 1_000_000)
+    first, second = list(clock.ticks())[:2]
+    (begun,) = rig.requests(first, history, {"car": se2(20.0, 0.0, 0.0)})
+    (request,) = rig.requests(
+        second, history, {"car": se2(21.0, 0.0, 0.0), "new": se2(5.0, 0.0, 0.0)}
+    )
+    assert begun.exposure is not None
+    assert request.exposure is not None
+    assert begun.exposure.actors_start["car"][0, 3] == 20.0
+    assert request.exposure.actors_start["car"][0, 3] == pytest.approx(20.7)
+    assert request.exposure.actors_start["new"][0, 3] == 5.0
+    assert request.exposure.share.shape == (camera.height, 1)
+    assert request.exposure.share[[0, -1], 0].tolist() == [0.0, 1.0]

@@ -31,9 +31,9 @@ from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, straight_
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
 from alpasim_plugin.core.reading.images import read_image
-from alpasim_plugin.core.shutter import at_share, bands
+from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
-from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
@@ -155,19 +155,7 @@ def drawn_map(
     """Return the semantic map as the lens sees it; None where the fixer takes none."""
     if entry.scene_map is None:
         return None
-    out: U8 = np.zeros((asked.camera.height, asked.camera.width, 3), np.uint8)
-    for band in bands(asked):
-        boxes = actor_boxes(band.actors, entry.scenario.actors)
-        part = draw_map(
-            entry.scene_map,
-            asked.camera,
-            band.T_world_camera,
-            boxes,
-            threads=threads,
-            rows=band.rows,
-        )
-        band.put(out, part[:, band.columns])
-    return lens.image(out)
+    return lens.image(draw_exposed_map(entry.scene_map, asked, entry.scenario.actors, threads))
 
 
 def gated(

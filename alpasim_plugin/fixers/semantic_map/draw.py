@@ -18,7 +18,8 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64, U8, CameraSpec
+from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
 from alpasim_plugin.fixers.semantic_map import kernels
 from alpasim_plugin.fixers.semantic_map.prepare import (
     CORNERS,
@@ -28,6 +29,7 @@ from alpasim_plugin.fixers.semantic_map.prepare import (
     PreparedMap,
     Segments,
     Triangles,
+    actor_boxes,
     require_box,
 )
 from alpasim_plugin.fixers.semantic_map.raster import BAND, draw_bands, rows_of
@@ -107,6 +109,28 @@ def draw_map(
         image,
     )
     return image[rows]
+
+
+def draw_exposed_map(
+    scene: PreparedMap, request: RenderRequest, actors: Sequence[Actor], threads: int | None = None
+) -> U8:
+    """Draw the map of a requested frame ``(H, W, 3)``: each band of a rolling shutter at its
+    instant; see `draw_map`.
+
+    Args:
+        scene: Prepared map.
+        request: Camera, poses, road users and when rows are exposed.
+        actors: The scenario's, for the sizes of their boxes.
+        threads: As many CPU threads; None leaves numba's number.
+    """
+    out: U8 = np.zeros((request.camera.height, request.camera.width, 3), np.uint8)
+    for band in bands(request):
+        boxes = actor_boxes(band.actors, actors)
+        part = draw_map(
+            scene, request.camera, band.T_world_camera, boxes, threads=threads, rows=band.rows
+        )
+        band.put(out, part[:, band.columns])
+    return out
 
 
 def view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
