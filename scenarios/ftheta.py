@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.types import F64, CameraSpec, FTheta
+from alpasim_plugin.core.types import F64, CameraSpec
 from scenarios.usdz_archive import Archive
 
 FRONT_WIDE = "camera_front_wide_120fov"
@@ -27,6 +27,17 @@ TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt",
 # Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
 FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
+
+
+@dataclass(frozen=True)
+class FTheta:
+    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and
+    radians.
+    """
+
+    pixel_to_angle: tuple[float, ...]
+    angle_to_pixel: tuple[float, ...]
+    max_angle_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +113,7 @@ def front_camera(lens: RecordedLens, T_rig_camera: F64) -> CameraSpec:
     focal = WIDTH / 2 / np.tan(HORIZONTAL_FOV_RAD / 2)
     cx, cy = lens.cx * WIDTH / lens.width, lens.cy * HEIGHT / lens.height
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_rig_camera), ftheta=lens.lens)
+    return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_rig_camera))
 
 
 def orthonormal(transform: F64) -> F64:

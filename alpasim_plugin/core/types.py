@@ -109,34 +109,35 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class FTheta:
-    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and
-    radians.
-    """
+class LensModel:
+    """What a lens does to rays, beside the ``K`` of its camera; equations in `core.lens`."""
 
-    pixel_to_angle: tuple[float, ...]
-    angle_to_pixel: tuple[float, ...]
-    max_angle_rad: float = 0.0
+    kind: Literal["opencv", "fisheye", "ftheta"]
+    # opencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. fisheye: k1 to k4. ftheta: the distance from the
+    # middle, pixels, as a polynomial of the angle from the axis, radians, from the constant upwards
+    coefficients: tuple[float, ...] = ()
+    pixel_to_angle: tuple[float, ...] = ()  # ftheta: the other way round; goes before coefficients
+    linear: tuple[float, float, float] = (1.0, 0.0, 0.0)  # ftheta: c, d, e of [[c, d], [e, 1]]
+    max_angle_rad: float = 0.0  # sees nothing beyond it; 0: as far as the distance grows
 
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A camera on the rig. With ``ftheta`` set, ``K`` is the pinhole that is really rendered and
-    ``ftheta`` the recorded lens.
-    """
+    """A camera on the rig, a pinhole unless it has a ``lens``."""
 
     name: str
     width: int
     height: int
-    K: F64  # (3, 3) pixels
+    K: F64  # (3, 3) pixels; of an ftheta lens only the middle counts
     T_rig_camera: F64  # (4, 4)
-    shutter_us: int = 0
-    ftheta: FTheta | None = None
+    shutter_us: int = 0  # rows are exposed one after another, top to bottom, within it; 0: at once
+    lens: LensModel | None = None
+    interval_us: int = 0  # between frames; 0: the scenario's camera period
 
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """What a policy asks for: a camera by name, every ``interval_us`` (0: the scenario's camera
+    """What a policy asks for: a camera by name, every ``interval_us`` (0: at the camera's own
     rate).
     """
 

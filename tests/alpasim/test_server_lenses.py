@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.views import Lens, read_lens, straight_of
+from alpasim_plugin.alpasim.server.views import read_lens, straight_of
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import Lens
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import pinhole
@@ -201,7 +202,7 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
         ),
         (
             lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, float("nan")),
-            "does not grow",
+            "not finite",
         ),
         (lambda s: s.bivariate_windshield_model_param.horizontal_poly.append(1.0), "windshield"),
     ],

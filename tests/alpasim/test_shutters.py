@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
-from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of, place_in_lens
+from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
-from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.alpasim.server.views import camera_of, read_lens, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.lens import lens_shares
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import U8, Exposure, RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
@@ -107,7 +108,8 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
 
 def test_what_the_lens_does_not_see_is_exposed_never() -> None:
     lens = read_lens(ftheta(False), 320, 180)
-    _, sees = place_in_lens(lens)
+    share = lens_shares(camera_of(ftheta(False), 320, 180), lens, "rows", backwards=False)
+    sees = ~np.isnan(share)
     used = np.zeros(lens.cover[::-1], bool)
     assert lens.resample is not None
     column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T

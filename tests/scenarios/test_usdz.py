@@ -271,7 +271,6 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path: Path) -> None:
     content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
     (camera,) = read_usdz(write(tmp_path / "a.usdz", content)).cameras
     assert camera.name == "camera_front_wide_120fov"
-    assert camera.ftheta is not None
     np.testing.assert_allclose(camera.T_rig_camera[:3, 3], [1.7, 0.1, 1.4])
     np.testing.assert_allclose(
         camera.T_rig_camera[:3, 2], [0.0, 1.0, 0.0], atol=1e-12

@@ -27,9 +27,10 @@ from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
 from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import Lens, View, read_lens, straight_of
+from alpasim_plugin.alpasim.server.views import View, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
+from alpasim_plugin.core.lens import Lens
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
