@@ -64,18 +64,22 @@ def seconds(times_us: I64) -> F64:
 
 
 def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
-    """Return the camera to look through: the first one with "front" in its name, else the first one
-    that looks ahead.
+    """Return the camera to look through: the first pinhole with "front" in its name, else the first
+    one that looks ahead.
 
     Raises:
-        InputError: No camera looks ahead.
+        InputError: No pinhole looks ahead.
     """
-    ahead = [camera for camera in scenario.cameras if camera.T_rig_camera[0, 2] > 0.7]
+    ahead = [
+        camera
+        for camera in scenario.cameras
+        if camera.T_rig_camera[0, 2] > 0.7 and camera.lens is None
+    ]
     for camera in sorted(ahead, key=lambda c: "front" not in c.name):
         return camera
     raise InputError(
-        f"scene {scenario.scene_id!r}: no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
-        "add a front camera to the scenario or choose another policy",
+        f"scene {scenario.scene_id!r}: no pinhole camera looks ahead among {[camera.name for camera in scenario.cameras]}",
+        "add a front camera without a lens to the scenario or choose another policy",
     )
 
 

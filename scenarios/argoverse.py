@@ -32,6 +32,7 @@ from alpasim_plugin.core.types import (
     HeightField,
     Lane,
     LaneMap,
+    LensModel,
     Paint,
     Trajectory,
     Vehicle,
@@ -456,8 +457,7 @@ def read_actors(
 
 
 def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
-    """Read the pinhole part of a log's camera calibration at full resolution; radial distortion is
-    left out.
+    """Read a log's camera calibration at full resolution, with its radial distortion.
 
     Raises:
         InputError: The log has no ``calibration`` folder, or a file in it is damaged.
@@ -467,7 +467,7 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
     outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
     lens: dict[str, Kind] = dict.fromkeys(
-        ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"), "number"
+        ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"), "number"
     )
     inner = files.read_feather(inner_path, {"sensor_name": "text", **lens})
     outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS})
@@ -488,11 +488,10 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
         T_rig_camera = mounts[name].copy()
         T_rig_camera[2, 3] += WHEEL_RADIUS_M  # the rig's origin is on the ground
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        cameras.append(
-            CameraSpec(
-                str(name), int(inner["width_px"][i]), int(inner["height_px"][i]), K, T_rig_camera
-            )
-        )
+        k1, k2, k3 = (float(inner[k][i]) for k in ("k1", "k2", "k3"))
+        lens = LensModel("opencv", (k1, k2, 0.0, 0.0, k3))
+        size = int(inner["width_px"][i]), int(inner["height_px"][i])
+        cameras.append(CameraSpec(str(name), *size, K, T_rig_camera, lens=lens))
     return tuple(cameras)
 
 

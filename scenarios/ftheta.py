@@ -10,13 +10,17 @@ import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.types import F64, CameraSpec
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import rays_of
+from alpasim_plugin.core.types import F64, CameraSpec, LensModel
+from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
 
 FRONT_WIDE = "camera_front_wide_120fov"
@@ -124,6 +128,58 @@ def orthonormal(transform: F64) -> F64:
     return out
 
 
+def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
+    """Return the f-theta cameras of a scene as they were calibrated.
+
+    Raises:
+        InputError: The scene has no calibration, or it is damaged.
+    """
+    with Archive(SourceFiles(), path) as archive:
+        where, sensors = _sensors(archive)
+    cameras = []
+    for name, sensor in sensors.items():
+        if not (sensor.get("properties") or {}).get("Model"):
+            continue  # a radar or a lidar
+        try:
+            numbers = _lens_numbers(sensor["properties"])
+            T_rig_camera = orthonormal(mount(sensor))
+        except (KeyError, TypeError, ValueError) as error:
+            raise _no_ftheta(archive, f"{where}, {name}", error) from error
+        cx, cy, width, height = numbers[:4].tolist()
+        given = tuple(numbers[4:10].tolist())
+        goes_back = numbers[10] == 1.0
+        lens = LensModel("ftheta", () if goes_back else given, given if goes_back else ())
+        focal = 1 / given[1] if goes_back else given[1]
+        K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+        cameras.append(CameraSpec(name, int(width), int(height), K, T_rig_camera, lens=lens))
+    if not cameras:
+        raise archive.files.fail(where, "no calibrated camera", "use a scene with its calibration")
+    return tuple(cameras)
+
+
+def _sensors(archive: Archive) -> tuple[str, dict[str, Any]]:
+    """Return where a scene's calibration stands, and its sensors by name; none where it has none."""
+    member = next((name for name in TABLES if name in archive), None)
+    if member is None:
+        return str(archive.path), {}
+    where = f"{archive.path}, {member}"
+    rows = archive.table(member)
+    try:
+        rig = archive.files.parse_json(
+            str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where
+        )
+        return where, {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
+    except (IndexError, KeyError, TypeError) as error:
+        raise archive.files.fail(
+            where, f"{type(error).__name__}: {error}", "give one row with rig_json"
+        ) from error
+
+
+def _no_ftheta(archive: Archive, where: str, error: Exception) -> InputError:
+    found = f"{type(error).__name__}: {error}"
+    return archive.files.fail(where, found, "give an f-theta calibration")
+
+
 def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
     """Return the front wide camera where the scene holds its calibration, with notes.
 
@@ -131,20 +187,9 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
         InputError: The table is there, but damaged or its front wide camera is not an f-theta
             camera.
     """
-    member = next((name for name in TABLES if name in archive), None)
-    if member is None:
+    where, sensors = _sensors(archive)
+    if not sensors:
         return (), ("no camera calibration in this scene: the default front camera is used",)
-    where = f"{archive.path}, {member}"
-    rows = archive.table(member)
-    try:
-        rig = archive.files.parse_json(
-            str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where
-        )
-        sensors = {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
-    except (IndexError, KeyError, TypeError) as error:
-        raise archive.files.fail(
-            where, f"{type(error).__name__}: {error}", "give one row with rig_json"
-        ) from error
     sensor = sensors.get(FRONT_WIDE)
     if sensor is None:
         return (), (
@@ -153,11 +198,7 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
     try:
         camera = front_camera(lens_of(_lens_numbers(sensor["properties"])), mount(sensor))
     except (KeyError, TypeError, ValueError) as error:
-        raise archive.files.fail(
-            f"{where}, {FRONT_WIDE}",
-            f"{type(error).__name__}: {error}",
-            "give an f-theta calibration",
-        ) from error
+        raise _no_ftheta(archive, f"{where}, {FRONT_WIDE}", error) from error
     return (camera,), (
         "rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",
     )
@@ -230,15 +271,30 @@ def pixel_to_angle(camera: CameraSpec) -> F64:
 
     A pinhole has theta = atan(r / f). Least squares over the image, with the constant zero; f is
     the mean of both focal lengths.
+
+    Raises:
+        InputError: Its lens is not the same in all directions.
     """
+    if camera.lens is not None and camera.lens.kind == "opencv":
+        raise InputError(
+            f"camera {camera.name!r}: an opencv lens, which AlpaSim's calibration cannot hold",
+            "export a scene of pinhole, fisheye or ftheta cameras",
+        )
     corners = (
         np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
         - camera.K[:2, 2]
     )
     reach = float(np.linalg.norm(corners, axis=1).max())
     radius = np.linspace(0.0, 1.0, 1000)
-    powers = np.stack([radius**k for k in range(1, DEGREE + 1)], axis=1)
     angle = np.arctan(radius * reach / float(np.mean(np.diag(camera.K)[:2])))
+    if camera.lens is not None:
+        rays = rays_of(camera)
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        away = np.hypot(x - camera.K[0, 2], y - camera.K[1, 2]).ravel() / reach
+        radius = away[rays.seen]
+        across = np.linalg.norm(rays.ray[rays.seen, :2], axis=1)
+        angle = np.arctan2(across, rays.ray[rays.seen, 2])
+    powers = np.stack([radius**k for k in range(1, DEGREE + 1)], axis=1)
     scaled = np.linalg.lstsq(powers, angle, rcond=None)[0]
     return np.concatenate([[0.0], scaled / reach ** np.arange(1, DEGREE + 1)])
 

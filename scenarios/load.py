@@ -19,7 +19,6 @@ from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
-    F64,
     Actor,
     BackgroundFile,
     Behaviour,
@@ -36,17 +35,16 @@ from alpasim_plugin.world.paint import with_default_paint
 from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_scenario
 from scenarios.build import built_drive
+from scenarios.cameras import camera_spec, check_mounts, given_cameras
 from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
-from scenarios.schema import CameraModel, VehicleSpec
+from scenarios.schema import VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
 from scenarios.suite import find
 from scenarios.variation import Drawn, draw
 
 RECORDED_STREETS = ("usdz", "drive")  # sources whose street is recorded, whatever renders it
 ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
-# Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).
-_RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def load_scenario(
@@ -75,13 +73,16 @@ def load_scenario(
     """
     document = open_document(find(path_or_name), source)
     drawn = draw(document, seed, overrides)
+    cameras = given_cameras(drawn)
     default = drawn.spec.vehicle or VehicleSpec()
     drive = (
         built_drive(drawn, _vehicle(default))
         if drawn.spec.log is None
         else recorded_drive(drawn, source)
     )
-    scenario = _scenario(drawn, drive)
+    scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))
+    if cameras is not None:
+        check_mounts(drawn, cameras, scenario.vehicle)
     check_scenario(scenario, drawn.document.path)
     if scenario.source != "usdz":  # the map of an AlpaSim scene is in its form already
         scenario = replace(scenario, alpasim_map=alpasim_view(scenario.lane_map))
@@ -100,7 +101,7 @@ def code_digest_of(scenario: Scenario) -> str | None:
     return None if source is None else digest([own, source])
 
 
-def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
+def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...]) -> Scenario:
     """Put the settings of the specification beside a map, a drive and its traffic."""
     spec = drawn.spec
     timing = drawn.spec.timing
@@ -109,11 +110,6 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
     scene_id = spec.scene_id or (
         drawn.scene_id if is_file else drive.scene_id
     )  # a bare log keeps its id whatever is overridden
-    cameras = (
-        tuple(camera_spec(camera) for camera in spec.cameras or ())
-        or drive.cameras
-        or (camera_spec(),)
-    )
     start, end = _window(drawn, drive)
     background = _background(drawn)
     # Where the street itself is built its paint is chosen; paint that nobody knows of a recorded
@@ -234,30 +230,6 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
         )
 
 
-def camera_spec(model: CameraModel | None = None) -> CameraSpec:
-    """Return the camera of a section; None gives the default front camera."""
-    m = model or CameraModel()
-    focal = 0.5 * m.width / np.tan(np.deg2rad(m.hfov_deg) / 2)
-    K = np.array([[focal, 0.0, m.width / 2], [0.0, focal, m.height / 2], [0.0, 0.0, 1.0]])
-    T = np.eye(4)
-    T[:3, :3] = (
-        _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
-    )
-    T[:3, 3] = m.x_m, m.y_m, m.z_m
-    return CameraSpec(m.name, m.width, m.height, K, T, m.shutter_us)
-
-
-def _rotation(yaw: float, pitch_down: float) -> F64:
-    """Return Rz(yaw) Ry(pitch): positive pitch about y (left) turns x (forward) down."""
-    cy = np.cos(yaw)
-    sy = np.sin(yaw)
-    cp = np.cos(pitch_down)
-    sp = np.sin(pitch_down)
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    return np.asarray(about_z @ about_y)
-
-
 def _vehicle(v: VehicleSpec) -> Vehicle:
     chassis = v.model_dump(exclude={"length_m", "width_m", "height_m"})
     return Vehicle(Box(v.length_m, v.width_m, v.height_m), **chassis)
@@ -288,7 +260,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     content = spec.model_dump(
         mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}}
     )
-    if spec.cameras is not None:
+    if isinstance(spec.cameras, tuple):
         content["cameras"].sort(key=lambda camera: camera["name"])
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"

@@ -5,16 +5,18 @@ writes the JSON Schema.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.printing import say
 from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, RoadSpec, within
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
+WIDEST_PINHOLE_DEG = 120  # a wider one is smeared towards its sides
 DEFAULT_DURATION_US = 8_000_000  # of the drive on a built road
 
 DEGRADATION_KEYS = {
@@ -88,12 +90,34 @@ class EnvironmentSpec(Part):
 
 
 class CameraModel(Part):
-    """A pinhole camera on the rig."""
+    """A camera on the rig."""
 
     name: str = Field(default="front", min_length=1, description="Name that policies request.")
     width: int = within(b.IMAGE_SIDE_PX, "Image width in pixels.", 256)
     height: int = within(b.IMAGE_SIDE_PX, "Image height in pixels.", 144)
-    hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
+    lens: Literal["pinhole", "opencv", "fisheye", "ftheta"] = Field(
+        default="pinhole", description="What bends its rays; docs/cameras.md has the equations."
+    )
+    hfov_deg: float = Field(
+        default=75.0,
+        gt=1,
+        lt=221,
+        description="Horizontal field of view; of pinhole and opencv at most 120.",
+    )
+    focal_px: tuple[float, float] | None = Field(
+        default=None, description="Focal lengths in x and y, in place of hfov_deg."
+    )
+    centre_px: tuple[float, float] | None = Field(
+        default=None, description="Where the axis meets the image; none: the middle."
+    )
+    coefficients: tuple[float, ...] = Field(
+        default=(),
+        max_length=12,
+        description="opencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. fisheye: k1 to k4. ftheta: pixels from the middle as a polynomial of the angle (rad).",
+    )
+    max_angle_deg: float | None = Field(
+        default=None, gt=0, le=110, description="Black beyond this angle from the axis."
+    )
     x_m: float = within(b.MOUNT_M, "Mount, metres ahead of the rear axle.", 1.6)
     y_m: float = within(b.MOUNT_M, "Mount, metres to the left.", 0.0)
     z_m: float = Field(
@@ -101,7 +125,69 @@ class CameraModel(Part):
     )
     yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
-    shutter_us: int = within(b.SHUTTER_US, "Exposure from shutter start to shutter end.", 0)
+    shutter_us: int = within(
+        b.SHUTTER_US,
+        "Rolling shutter: from the first row's exposure to the last one's; 0: all at once.",
+        0,
+    )
+    interval_us: int = Field(
+        default=0,
+        ge=0,
+        le=int(b.PERIOD_US.high),
+        description="Time between frames, a multiple of rates.control_us; 0: rates.camera_us.",
+    )
+
+    @model_validator(mode="after")
+    def _fitting(self) -> CameraModel:
+        if self.lens == "pinhole" and (self.coefficients or self.max_angle_deg is not None):
+            raise ValueError("coefficients or max_angle_deg of a pinhole | say which lens it has")
+        if self.focal_px is not None and min(self.focal_px) <= 0:
+            raise ValueError(f"focal_px = {list(self.focal_px)} | give positive focal lengths")
+        wide_deg = self.hfov_deg
+        if self.focal_px is not None:
+            wide_deg = math.degrees(2 * math.atan(0.5 * self.width / self.focal_px[0]))
+        if self.lens in ("pinhole", "opencv") and wide_deg > WIDEST_PINHOLE_DEG:
+            raise ValueError(
+                f"hfov_deg = {wide_deg:.0f} of a {self.lens}, at most {WIDEST_PINHOLE_DEG} | say lens: fisheye or ftheta, or narrow it"
+            )
+        return self
+
+
+class CameraSet(Part):
+    """Cameras of a shipped rig, or of a calibration, in place of a list."""
+
+    rig: Literal["alpasim-4", "alpasim-6", "front", "surround-6"] | None = Field(
+        default=None, description="Name of a shipped rig."
+    )
+    from_: str | None = Field(
+        default=None,
+        alias="from",
+        description="Calibration, relative to this file: an Argoverse 2 log folder or a .usdz of AlpaSim.",
+    )
+    names: tuple[str, ...] = Field(
+        default=(),
+        max_length=int(b.CAMERAS.high),
+        description="Which cameras of the calibration; none: all.",
+    )
+    width: int | None = Field(
+        default=None,
+        ge=b.IMAGE_SIDE_PX.low,
+        le=b.IMAGE_SIDE_PX.high,
+        description="Width of every camera, pixels; its height follows.",
+    )
+    shutter_us: int = within(b.SHUTTER_US, "Rolling shutter of every camera.", 0)
+
+    @model_validator(mode="after")
+    def _one(self) -> CameraSet:
+        if (self.rig is None) == (self.from_ is None):
+            raise ValueError("neither or both of rig and from | give one of them")
+        return self
+
+
+class Rigs(Part):
+    """The shipped rigs."""
+
+    rigs: dict[str, tuple[CameraModel, ...]]
 
 
 class RatesSpec(Part):
@@ -323,12 +409,18 @@ class ScenarioSpec(Part):
         default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users."
     )
     environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
-    cameras: tuple[CameraModel, ...] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=int(b.CAMERAS.high),
-        description="Cameras; none: the log's own, or one named front.",
-    )
+    cameras: (
+        Annotated[
+            Annotated[
+                tuple[CameraModel, ...],
+                Field(min_length=1, max_length=int(b.CAMERAS.high)),
+                Tag("(list)"),
+            ]
+            | Annotated[CameraSet, Tag("(set)")],
+            Discriminator(lambda given: "(list)" if isinstance(given, list | tuple) else "(set)"),
+        ]
+        | None
+    ) = Field(default=None, description="Cameras; none: the log's own, or one named front.")
     rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
     timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
     latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
@@ -404,6 +496,7 @@ def models() -> dict[str, type[BaseModel]]:
     out |= {
         "environment": EnvironmentSpec,
         "cameras[]": CameraModel,
+        "cameras (a set)": CameraSet,
         "rates": RatesSpec,
         "timing": TimingSpec,
         "latency": LatencySpec,

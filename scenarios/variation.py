@@ -94,14 +94,6 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
                 "give it another id",
             )
         seen[actor.id] = i
-    names = [camera.name for camera in spec.cameras or ()]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            raise document.error(
-                ("cameras", i, "name"),
-                f"duplicate camera name {name!r}",
-                "give it another name",
-            )
     if spec.log is not None and spec.actors:
         raise document.error(
             ("actors",),

@@ -339,6 +339,8 @@ def validate(model: type[M], document: Document) -> M:
     problems = [p for p in problems if p["type"] != "too_short"] or problems
     placed: list[tuple[bool, Mark, int, Key, Any]] = []
     for problem in problems[:MOST_PROBLEMS]:
+        # The tag of a union of forms is in brackets and leads to no model.
+        problem["loc"] = tuple(part for part in problem["loc"] if not str(part).startswith("("))
         loc = _in_document(document.data, problem["loc"])
         is_missing = problem["type"] == "missing"
         placed.append((is_missing, document.mark(loc), len(placed), loc, problem))
@@ -372,7 +374,8 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     name = dotted(loc)
     last = str(problem["loc"][-1]) if problem["loc"] else ""
     if kind == "extra_forbidden":
-        keys = sorted({k for m in _models_at(model, problem["loc"][:-1]) for k in m.model_fields})
+        models = _models_at(model, problem["loc"][:-1])
+        keys = sorted({f.alias or k for m in models for k, f in m.model_fields.items()})
         return f"unknown key {last!r} in {dotted(loc[:-1])}", _nearest(last, keys)
     if kind == "missing":
         fields = [m.model_fields.get(last) for m in _models_at(model, problem["loc"][:-1])]

@@ -24,6 +24,7 @@ MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lens
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
 CLOSE_PX = 0.05
 BEYOND_PX = 24  # a lens goes on so far beyond its image's edges, where resampling looks as well
+CHECKED_PX = 192  # across, of the image that a lens is checked with
 TABLE = 4096  # samples of a radius to angle function
 DO_THIS = "give intrinsics that describe a lens"
 # The axes x, y, z of a pinhole on each side of a cube, in the lens's axes.
@@ -143,17 +144,12 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     """Return a camera's lens covered by as few pinholes as show all of it well.
 
     Raises:
-        InputError: Values that make no lens, or a view of more than `WIDEST_OF_CUBE_RAD` from the
-            axis.
+        InputError: See `check_lens`.
     """
     if camera.lens is None:
         return (lens_of(camera),)
+    check_lens(camera)
     rays = rays_of(camera)
-    if rays.widest_rad > WIDEST_OF_CUBE_RAD:
-        raise InputError(
-            f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
-            f"choose a lens that sees at most {np.rad2deg(WIDEST_OF_CUBE_RAD):.0f} degrees from it",
-        )
     if rays.widest_rad <= WIDEST_RAD:
         return (_covered(camera, rays, rays.seen, ""),)
     ahead = np.stack([rays.ray @ np.array(axes[2]) for axes in SIDES.values()])
@@ -254,13 +250,54 @@ def lens_shares(camera: CameraSpec, pinhole: Lens, along: Along, backwards: bool
     return np.where(near, 1 - share if backwards else share, np.float32(np.nan)).astype(np.float32)
 
 
-def widest_rad(camera: CameraSpec) -> float:
-    """Return the largest angle from the axis that a camera sees."""
-    if camera.lens is not None:
-        return rays_of(camera).widest_rad
-    corners = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
-    slope = np.linalg.norm((corners @ np.linalg.inv(camera.K).T)[:, :2], axis=1)
-    return float(np.arctan(slope.max()))
+def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
+    """Return a camera whose image has another size: its middle and its focal lengths follow each
+    side, the polynomials of an f-theta lens the mean of both.
+    """
+    scale = width / camera.width, height / camera.height
+    lens = camera.lens
+    if lens is not None and lens.kind == "ftheta":
+        mean = (scale[0] + scale[1]) / 2
+        forward = tuple(a * mean for a in lens.coefficients)
+        backward = tuple(b / mean**k for k, b in enumerate(lens.pixel_to_angle))
+        lens = replace(lens, coefficients=forward, pixel_to_angle=backward)
+    K = np.diag([*scale, 1.0]) @ camera.K
+    return replace(camera, width=width, height=height, K=K, lens=lens)
+
+
+def check_lens(camera: CameraSpec) -> None:
+    """Refuse a lens that cannot be drawn whole.
+
+    Raises:
+        InputError: Values that make no lens, a lens that turns back within its image, or one that
+            sees too far from its axis.
+    """
+    if camera.lens is None:
+        return
+    small = resized(camera, CHECKED_PX, max(round(CHECKED_PX * camera.height / camera.width), 2))
+    rays = rays_of(small)
+    lens, K = _checked(small)
+    corners = np.array([[x, y] for x in (0, small.width) for y in (0, small.height)]) - K[:2, 2]
+    turns = not bool(rays.seen.all())
+    if lens.kind != "opencv":
+        scale = K[[0, 1], [0, 1]] if lens.kind == "fisheye" else np.ones(2)
+        reach = float(np.linalg.norm(corners / scale, axis=1).max())
+        if lens.pixel_to_angle:
+            angle = _value(lens.pixel_to_angle, np.linspace(0.0, reach, TABLE))
+            turns = bool((np.diff(angle[angle < _limit(lens)]) <= 0).any())
+        else:
+            grows = _growing(lens)
+            turns = grows < _limit(lens) and _value(_radius_of_angle(lens), grows) < reach
+    if turns:
+        raise InputError(
+            f"camera {camera.name!r}: a {lens.kind} lens that turns back within its image",
+            "correct the coefficients, or set max_angle_deg below where it turns",
+        )
+    if rays.widest_rad > WIDEST_OF_CUBE_RAD:
+        raise InputError(
+            f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
+            f"set max_angle_deg to at most {np.rad2deg(WIDEST_OF_CUBE_RAD):.0f}; the image is black beyond it",
+        )
 
 
 def _checked(camera: CameraSpec) -> tuple[LensModel, F64]:

@@ -409,6 +409,11 @@ class Scenario:
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(sorted(self.cameras, key=_camera_order)))
 
+    def period_us(self, sensor: SensorSpec) -> int:
+        """Return the time between the frames of a camera that a policy asks for."""
+        own = {camera.name: camera.interval_us for camera in self.cameras}
+        return sensor.interval_us or own.get(sensor.camera, 0) or self.rates.camera_us
+
     @property
     def scene(self) -> Scene:
         """Give the part that evaluators may see."""

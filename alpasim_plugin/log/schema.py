@@ -23,6 +23,7 @@ from alpasim_plugin.core.types import (
     Box,
     CameraSpec,
     EgoState,
+    LensModel,
     RenderRequest,
     Scenario,
     Trajectory,
@@ -283,19 +284,13 @@ def wire_camera(
 
 
 def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.CameraSpec:
-    """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as
-    zeros.
+    """Return the intrinsics of a camera; of a pinhole all twelve distortion coefficients are
+    stated, as zeros.
     """
-    return sensorsim_pb2.CameraSpec(
-        opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
-            principal_point_x=camera.K[0, 2],
-            principal_point_y=camera.K[1, 2],
-            focal_length_x=camera.K[0, 0],
-            focal_length_y=camera.K[1, 1],
-            radial_coeffs=[0.0] * 6,
-            tangential_coeffs=[0.0] * 2,
-            thin_prism_coeffs=[0.0] * 4,
-        ),
+    lens = camera.lens or LensModel("opencv")
+    focal = {"focal_length_x": camera.K[0, 0], "focal_length_y": camera.K[1, 1]}
+    middle = {"principal_point_x": camera.K[0, 2], "principal_point_y": camera.K[1, 2]}
+    spec = sensorsim_pb2.CameraSpec(
         logical_id=name or camera.name,
         resolution_h=camera.height,
         resolution_w=camera.width,
@@ -303,6 +298,36 @@ def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb
         if camera.shutter_us
         else sensorsim_pb2.GLOBAL,
     )
+    if lens.kind == "opencv":
+        k = [*lens.coefficients, *[0.0] * (12 - len(lens.coefficients))]
+        opencv = sensorsim_pb2.OpenCVPinholeCameraParam(
+            **focal,
+            **middle,
+            radial_coeffs=[*k[:2], *k[4:8]],
+            tangential_coeffs=k[2:4],
+            thin_prism_coeffs=k[8:],
+        )
+        spec.opencv_pinhole_param.CopyFrom(opencv)
+    elif lens.kind == "fisheye":
+        fisheye = sensorsim_pb2.OpenCVFisheyeCameraParam(
+            **focal, **middle, radial_coeffs=lens.coefficients, max_angle=lens.max_angle_rad
+        )
+        spec.opencv_fisheye_param.CopyFrom(fisheye)
+    else:
+        kind = sensorsim_pb2.FthetaCameraParam
+        c, d, e = lens.linear
+        ftheta = kind(
+            **middle,
+            reference_poly=kind.PIXELDIST_TO_ANGLE
+            if lens.pixel_to_angle
+            else kind.ANGLE_TO_PIXELDIST,
+            angle_to_pixeldist_poly=lens.coefficients,
+            pixeldist_to_angle_poly=lens.pixel_to_angle,
+            max_angle=lens.max_angle_rad,
+        )
+        ftheta.linear_cde.linear_c, ftheta.linear_cde.linear_d, ftheta.linear_cde.linear_e = c, d, e
+        spec.ftheta_param.CopyFrom(ftheta)
+    return spec
 
 
 def wire_render_request(
@@ -316,12 +341,15 @@ def wire_render_request(
     objects = []
     if request.actors:
         ids = sorted(request.actors)
-        stack = np.stack([request.actors[i] for i in ids])
-        poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
+        first = request.actors if request.exposure is None else request.exposure.actors_start
+        both = [
+            wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
+            for stack in (np.stack([at[i] for i in ids]) for at in (first, request.actors))
+        ]
         pair = sensorsim_pb2.PosePair
         objects = [
-            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p))
-            for i, p in zip(ids, poses, strict=True)
+            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=q))
+            for i, p, q in zip(ids, *both, strict=True)
         ]
     return sensorsim_pb2.RGBRenderRequest(
         scene_id=scene_id,

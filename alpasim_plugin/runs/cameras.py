@@ -82,7 +82,7 @@ def make_cadence(
             )
         )
     first, then = block.first, block.then
-    periods = {sensor.interval_us or scenario.rates.camera_us for sensor in sensors}
+    periods = {scenario.period_us(sensor) for sensor in sensors}
     if len(periods) > 1:
         raise InputError(
             f"cameras {', '.join(sensor.camera for sensor in sensors)}: periods of {' and '.join(map(str, sorted(periods)))} us",
@@ -142,7 +142,7 @@ class CameraRig:
                     f"scene {scenario.scene_id!r}: the policy needs camera {sensor.camera!r}; the scenario has {sorted(known)}",
                     "add that camera to the scenario or choose another policy",
                 )
-            period = sensor.interval_us or scenario.rates.camera_us
+            period = scenario.period_us(sensor)
             if period % clock.rates.control_us:
                 raise InputError(
                     f"camera {sensor.camera!r}: period {period} us is no multiple of the control period {clock.rates.control_us} us",

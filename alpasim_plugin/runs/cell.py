@@ -40,6 +40,7 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.writer import write_steps
 from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.lenses import through_lenses
 from alpasim_plugin.runs.plan import Cell, RunOptions
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.rollout import run_rollout
@@ -318,6 +319,14 @@ def make_renderer(
     """
     require_kernels()
     spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
+    return through_lenses(
+        scenario, lambda pinholes: _renderer_of_pinholes(spec, pinholes, seed, device, threads)
+    )
+
+
+def _renderer_of_pinholes(
+    spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None
+) -> Renderer:
     session = {"seed": seed, "device": device, "threads": threads}
     base: Renderer = build(spec.base, scenario=scenario, **session)
     if spec.fixer is None:

@@ -96,14 +96,14 @@ class SwitchedPolicy(Policy):
         then: Reset with ``then_seed``.
         at_us: When to switch.
         then_seed: Seed of the second policy.
-        camera_us: The scenario's camera period.
+        scenario: Its cameras' periods count.
     """
 
     def __init__(
-        self, first: Policy, then: Policy, at_us: int, then_seed: int, camera_us: int
+        self, first: Policy, then: Policy, at_us: int, then_seed: int, scenario: Scenario
     ) -> None:
         self.first, self.then, self.at_us, self.then_seed = first, then, at_us, then_seed
-        self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, camera_us)
+        self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, scenario)
 
     def reset(self, seed: int, route: Route) -> None:
         """Reset both."""
@@ -141,19 +141,19 @@ class SwitchedController(Controller):
 
 
 def merge_sensors(
-    first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int
+    first: Sequence[SensorSpec], then: Sequence[SensorSpec], scenario: Scenario
 ) -> tuple[SensorSpec, ...]:
     """Return the cameras of two policies; a camera of both has the shorter of its periods.
 
     Args:
         first: Cameras of one.
         then: Cameras of the other.
-        camera_us: The scenario's camera period, meant by a sensor's interval of 0.
+        scenario: Its cameras' periods are meant by a sensor's interval of 0.
     """
     joined = {sensor.camera: sensor for sensor in first}
     for sensor in then:
         known = joined.get(sensor.camera)
-        if known is None or (sensor.interval_us or camera_us) < (known.interval_us or camera_us):
+        if known is None or scenario.period_us(sensor) < scenario.period_us(known):
             joined[sensor.camera] = sensor
     return tuple(joined.values())
 
@@ -310,7 +310,7 @@ def _parts(
         SwitchedRenderer(
             before.renderer, before.renderer if same_renderer else after.renderer, at_us
         ),
-        SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
+        SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario),
         own.rollout_key if then == own else fork.rollout_key,
         before.names if then == own else after.names,
         SwitchedController(before.controller, after.controller, at_us),

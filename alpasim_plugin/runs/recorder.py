@@ -177,7 +177,9 @@ class Recorder:
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
         if cameras:
-            self._pictures = Pictures(clock, next(iter(cameras)), self._keep_frames)
+            first = next(iter(cameras))
+            period_us = self._scenario.period_us(SensorSpec(first))
+            self._pictures = Pictures(clock, first, period_us, self._keep_frames)
         header = header_from_scenario(
             self._scenario, self._session, self._seed, clock.n_steps, self._versions
         )
@@ -296,13 +298,14 @@ class Pictures:
     Args:
         clock: The rollout's clock.
         camera: Name of the camera.
+        period_us: Between its frames.
         all_frames: Keep every frame for a video, not only those of the strip.
     """
 
-    def __init__(self, clock: Clock, camera: str, all_frames: bool) -> None:
+    def __init__(self, clock: Clock, camera: str, period_us: int, all_frames: bool) -> None:
         self._camera = camera
         self._all = all_frames
-        self._period_us = clock.rates.camera_us
+        self._period_us = period_us
         self._strip_us = [
             clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us
             for fraction in STRIP_FRACTIONS

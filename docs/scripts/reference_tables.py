@@ -129,7 +129,7 @@ def key_row(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
         default = "required" if value is PydanticUndefined else ""
     elif isinstance(value, tuple):
         default = f"`[{', '.join(map(str, value))}]`"
-    return f"`{name}`", kind, default, field.description or ""
+    return f"`{field.alias or name}`", kind, default, field.description or ""
 
 
 def key_tables() -> str:

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
@@ -193,12 +193,12 @@ def test_a_scenario_that_has_changed_is_refused(
         find_rollout(tmp_path, CELL)
 
 
-def test_two_policies_share_a_camera_at_the_shorter_period() -> None:
+def test_two_policies_share_a_camera_at_the_shorter_period(straight_road: Scenario) -> None:
     first, then = (
         (SensorSpec("front"), SensorSpec("left", 200_000)),
         (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear")),
     )
-    assert merge_sensors(first, then, 100_000) == (
+    assert merge_sensors(first, then, straight_road) == (
         SensorSpec("front", 50_000),
         SensorSpec("left"),
         SensorSpec("rear"),

@@ -120,8 +120,8 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         (GOOD + "cameras: []\n", ":8:1", "cameras = []", "at least 1"),
         (
             GOOD + "cameras: [{name: a}, {name: a}]\n",
-            ":8:23",
-            "duplicate camera name 'a'",
+            ":8:22",
+            "two cameras named 'a'",
             "another name",
         ),
         (

@@ -19,7 +19,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.lens import DO_THIS, WIDEST_RAD, Lens, lens_of, place_in_lens
+from alpasim_plugin.core.lens import DO_THIS, WIDEST_RAD, Lens, lens_of, place_in_lens, resized
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, LensModel
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
@@ -212,7 +212,6 @@ def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Camera
             f"{what}: a windshield model",
             "it cannot be rendered here: put a renderer that can behind --upstream",
         )
-    sx, sy = width / spec.resolution_w, height / spec.resolution_h
     kind = spec.WhichOneof("camera_param")
     if kind is None or kind not in LENSES:
         raise InputError(
@@ -222,21 +221,22 @@ def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Camera
     p = getattr(spec, kind)
     focal = (1.0, 1.0)
     if kind != "ftheta_param":
-        focal = p.focal_length_x * sx, p.focal_length_y * sy
+        focal = p.focal_length_x, p.focal_length_y
     K = np.array(
         [
-            [focal[0], 0, p.principal_point_x * sx],
-            [0, focal[1], p.principal_point_y * sy],
+            [focal[0], 0, p.principal_point_x],
+            [0, focal[1], p.principal_point_y],
             [0, 0, 1.0],
         ]
     )
-    lens = LENSES[kind](p, (sx + sy) / 2, what)
+    lens = LENSES[kind](p, what)
     if not (lens or (np.isfinite(K).all() and min(focal) > 0)):
         raise InputError(f"{what}: focal lengths {focal[0]:.4g}, {focal[1]:.4g}", DO_THIS)
-    return CameraSpec(spec.logical_id, width, height, K, np.eye(4), lens=lens)
+    size = spec.resolution_w, spec.resolution_h
+    return resized(CameraSpec(spec.logical_id, *size, K, np.eye(4), lens=lens), width, height)
 
 
-def _opencv(p: Any, scale: float, what: str) -> LensModel | None:
+def _opencv(p: Any, what: str) -> LensModel | None:
     lengths = (p.radial_coeffs, 6), (p.tangential_coeffs, 2), (p.thin_prism_coeffs, 4)
     if any(len(given) > n for given, n in lengths):
         raise InputError(f"{what}: more coefficients than k1..k6, p1, p2, s1..s4", DO_THIS)
@@ -246,13 +246,12 @@ def _opencv(p: Any, scale: float, what: str) -> LensModel | None:
     return LensModel("opencv", (*k[:2], *t, *k[2:], *s))
 
 
-def _fisheye(p: Any, scale: float, what: str) -> LensModel:
+def _fisheye(p: Any, what: str) -> LensModel:
     return LensModel("fisheye", tuple(p.radial_coeffs), max_angle_rad=p.max_angle or WIDEST_RAD)
 
 
-def _ftheta(p: Any, scale: float, what: str) -> LensModel:
-    forward = tuple(a * scale for a in p.angle_to_pixeldist_poly)
-    backward = tuple(b / scale**k for k, b in enumerate(p.pixeldist_to_angle_poly))
+def _ftheta(p: Any, what: str) -> LensModel:
+    forward, backward = tuple(p.angle_to_pixeldist_poly), tuple(p.pixeldist_to_angle_poly)
     linear = (1.0, 0.0, 0.0)
     if p.HasField("linear_cde"):
         linear = p.linear_cde.linear_c, p.linear_cde.linear_d, p.linear_cde.linear_e
@@ -262,7 +261,7 @@ def _ftheta(p: Any, scale: float, what: str) -> LensModel:
     return LensModel("ftheta", forward, (), linear, p.max_angle)
 
 
-LENSES: Mapping[str, Callable[[Any, float, str], LensModel | None]] = {
+LENSES: Mapping[str, Callable[[Any, str], LensModel | None]] = {
     "opencv_pinhole_param": _opencv,
     "opencv_fisheye_param": _fisheye,
     "ftheta_param": _ftheta,

@@ -1,0 +1,187 @@
+"""The cameras that a scenario file lists or names: from a section, a shipped rig or a calibration
+to `CameraSpec`, checked before anything is built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.core import limits as b
+from alpasim_plugin.core.config import Document, load_yaml, validate
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import check_lens, resized
+from alpasim_plugin.core.types import F64, CameraSpec, LensModel, Vehicle
+from scenarios.schema import CameraModel, CameraSet, Rigs
+from scenarios.variation import Drawn
+
+RIGS_FILE = Path(__file__).with_name("rigs.yaml")
+RIG_PIXELS = b.Bound(
+    "pixels of all cameras", "", 1, 1 << 26, "a pixel takes some 60 bytes while it is drawn"
+)
+DEEPEST_M = 0.5  # below the body's surface: a camera behind the windscreen stands so deep
+FARTHEST_M = 0.6  # outside of the body
+# Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).
+_RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def given_cameras(drawn: Drawn) -> tuple[CameraSpec, ...] | None:
+    """Return the cameras of a scenario file; None where it leaves them to the log.
+
+    Raises:
+        InputError: No such file, a lens that is none, a period that is no multiple of the control
+            period, a shutter longer than that, or too many pixels; with the position of its key.
+    """
+    given = drawn.spec.cameras
+    if given is None:
+        return None
+    if isinstance(given, CameraSet):
+        cameras = _from_set(drawn, given)
+    else:
+        cameras = tuple(camera_spec(model) for model in given)
+    control_us = drawn.spec.rates.control_us
+    names = [camera.name for camera in cameras]
+    for i, camera in enumerate(cameras):
+        with drawn.at("cameras", i):
+            if camera.name in names[:i]:
+                raise InputError(f"two cameras named {camera.name!r}", "give one another name")
+            if camera.interval_us % control_us:
+                raise InputError(
+                    f"interval_us = {camera.interval_us}, no multiple of rates.control_us = {control_us}",
+                    "choose a whole multiple, or 0 for rates.camera_us",
+                )
+            if camera.shutter_us > control_us:
+                raise InputError(
+                    f"shutter_us = {camera.shutter_us}, longer than rates.control_us = {control_us}",
+                    "shorten the exposure, or lengthen the control period",
+                )
+    with drawn.at("cameras"):
+        RIG_PIXELS.check(sum(camera.width * camera.height for camera in cameras), "cameras")
+    for i, camera in enumerate(cameras):
+        with drawn.at("cameras", i):
+            check_lens(camera)
+    return cameras
+
+
+def check_mounts(drawn: Drawn, cameras: Sequence[CameraSpec], vehicle: Vehicle) -> None:
+    """Refuse cameras that stand inside the car's body, or away from it.
+
+    Raises:
+        InputError: With the position of the camera's key.
+    """
+    box = vehicle.box
+    centre = np.array([vehicle.rear_axle_to_centre_m, 0.0, box.height_m / 2])
+    half = np.array([box.length_m, box.width_m, box.height_m]) / 2
+    for i, camera in enumerate(cameras):
+        outside = np.abs(camera.T_rig_camera[:3, 3] - centre) - half  # along each axis, metres
+        deep_m = -float(outside.max())
+        far_m = float(np.linalg.norm(np.maximum(outside, 0.0)))
+        at = np.round(camera.T_rig_camera[:3, 3], 2).tolist()
+        with drawn.at("cameras", i):
+            if deep_m > DEEPEST_M:
+                raise InputError(
+                    f"camera {camera.name!r} at {at}: {deep_m:.2f} m inside the car's body",
+                    "mount it at the body's surface, or give the vehicle its true size",
+                )
+            if far_m > FARTHEST_M:
+                raise InputError(
+                    f"camera {camera.name!r} at {at}: {far_m:.2f} m away from the car's body",
+                    "use the calibration of this car, or give the vehicle its true size",
+                )
+
+
+def camera_spec(model: CameraModel | None = None) -> CameraSpec:
+    """Return the camera of a section; None gives the default front camera."""
+    m = model or CameraModel()
+    focal = m.focal_px or (_focal_px(m),) * 2
+    middle = m.centre_px or (m.width / 2, m.height / 2)
+    K = np.array([[focal[0], 0.0, middle[0]], [0.0, focal[1], middle[1]], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = (
+        _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
+    )
+    T[:3, 3] = m.x_m, m.y_m, m.z_m
+    lens = None
+    if m.lens != "pinhole":
+        coefficients = m.coefficients or ((0.0, focal[0]) if m.lens == "ftheta" else ())
+        limit = 0.0 if m.max_angle_deg is None else float(np.deg2rad(m.max_angle_deg))
+        lens = LensModel(m.lens, coefficients, max_angle_rad=limit)
+    return CameraSpec(m.name, m.width, m.height, K, T, m.shutter_us, lens, m.interval_us)
+
+
+def _focal_px(m: CameraModel) -> float:
+    """Return the focal length that shows ``hfov_deg`` across the image's width."""
+    half = np.deg2rad(m.hfov_deg) / 2
+    if m.lens in ("pinhole", "opencv"):
+        return 0.5 * m.width / float(np.tan(half))
+    powers = half ** (2 * np.arange(len(m.coefficients)) + 2)
+    bent = 1.0 if m.lens == "ftheta" else 1.0 + float(powers @ np.array(m.coefficients))
+    return 0.5 * m.width / (float(half) * bent)
+
+
+def _rotation(yaw: float, pitch_down: float) -> F64:
+    """Return Rz(yaw) Ry(pitch): positive pitch about y (left) turns x (forward) down."""
+    cy = np.cos(yaw)
+    sy = np.sin(yaw)
+    cp = np.cos(pitch_down)
+    sp = np.sin(pitch_down)
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    return np.asarray(about_z @ about_y)
+
+
+def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
+    if given.rig is not None:
+        document = load_yaml(RIGS_FILE)
+        rig = validate(Rigs, Document({"rigs": document.data}, {}, str(RIGS_FILE))).rigs[given.rig]
+        cameras = tuple(camera_spec(model) for model in rig)
+    else:
+        assert given.from_ is not None, "a set has a rig or a file"
+        path = drawn.document.folder_of(("cameras", "from")) / given.from_
+        if not path.exists():
+            raise drawn.document.error(
+                ("cameras", "from"),
+                f"{path} does not exist",
+                "correct the path; it is relative to the scenario file",
+            )
+        with drawn.at("cameras", "from"):
+            cameras = _from_file(path)
+        if given.names:
+            cameras = _named(drawn, cameras, given.names)
+    if given.width is not None:
+        width = given.width
+        cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)
+    return tuple(replace(camera, shutter_us=given.shutter_us) for camera in cameras)
+
+
+def _named(
+    drawn: Drawn, cameras: Sequence[CameraSpec], names: Sequence[str]
+) -> tuple[CameraSpec, ...]:
+    known = {camera.name: camera for camera in cameras}
+    for i, name in enumerate(names):
+        if name not in known:
+            raise drawn.document.error(
+                ("cameras", "names", i),
+                f"no camera {name!r} in this calibration",
+                f"choose from {', '.join(known)}",
+            )
+    return tuple(known[name] for name in names)
+
+
+def _from_file(path: Path) -> tuple[CameraSpec, ...]:
+    """Read the cameras of an Argoverse 2 log or an AlpaSim scene."""
+    if path.is_dir():
+        from scenarios.argoverse import read_calibration
+
+        return read_calibration(path)
+    if path.suffix == ".usdz":
+        from scenarios.ftheta import rig_cameras
+
+        return rig_cameras(path)
+    raise InputError(
+        f"{path}: no calibration that is known here",
+        "give an Argoverse 2 log folder, or a .usdz of AlpaSim",
+    )

@@ -1,0 +1,77 @@
+"""A run sees its cameras through their lenses, whoever renders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.lens import rays_of
+from alpasim_plugin.core.shutter import rolling_exposure
+from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest, Scenario
+from alpasim_plugin.runs.lenses import through_lenses
+
+
+class Directions(Renderer):
+    """Paints every pixel with the direction that it sees, and keeps the requests."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.asked: list[RenderRequest] = []
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Paint one frame."""
+        self.asked.append(request)
+        spec = request.camera
+        assert spec.lens is None
+        x, y = np.meshgrid(np.arange(spec.width) + 0.5, np.arange(spec.height) + 0.5)
+        ray = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(spec.K).T
+        ray = ray @ request.T_world_camera[1, :3, :3].T
+        unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        return Frame(request.t_us, spec.name, (127.5 + 127 * unit).round().astype(np.uint8))
+
+
+def fisheye(straight_road: Scenario) -> CameraSpec:
+    K = np.array([[60.0, 0.0, 100.0], [0.0, 60.0, 75.0], [0.0, 0.0, 1.0]])
+    lens = LensModel("fisheye", (), max_angle_rad=np.deg2rad(95))
+    return CameraSpec("fish", 200, 150, K, straight_road.cameras[0].T_rig_camera, 30_000, lens)
+
+
+def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road: Scenario) -> None:
+    camera = fisheye(straight_road)
+    scenario = replace(straight_road, cameras=(camera, straight_road.cameras[0]))
+    made: list[Directions] = []
+
+    def make(pinholes: Scenario) -> Renderer:
+        made.append(Directions(pinholes))
+        return made[0]
+
+    renderer = through_lenses(scenario, make)
+    T = np.stack([np.eye(4) @ camera.T_rig_camera] * 2)
+    exposure = rolling_exposure(camera, {}, {}, 100_000)
+    plain = RenderRequest(0, straight_road.cameras[0], T, {})
+    asked = RenderRequest(0, camera, T, {}, exposure=exposure)
+    first, second = renderer.render_batch([plain, replace(asked, ahead=[asked])])
+    assert (first.camera, second.camera) == ("front", "fish")
+    rays = rays_of(camera)
+    unit = rays.ray / np.linalg.norm(rays.ray, axis=1, keepdims=True)
+    off = np.abs(second.rgb.reshape(-1, 3) - (127.5 + 127 * unit @ T[1, :3, :3].T)).max(axis=1)
+    assert (off[rays.seen] <= 2).mean() > 0.995
+    names = [camera.name for camera in made[0].scenario.cameras]
+    sides = ["fish.ahead", "fish.left", "fish.right", "fish.up", "fish.down"]
+    assert sorted(names) == sorted(["front", *sides])
+    assert {request.camera.name for request in made[0].asked} == set(names)
+    for request in made[0].asked[1:]:
+        assert request.exposure is not None
+        share = request.exposure.share
+        assert share.shape == (request.camera.height, request.camera.width)
+        (later,) = request.ahead
+        assert later.camera.name == request.camera.name
+    ahead = made[0].asked[1].exposure
+    assert ahead is not None
+    assert abs(float(np.nanmedian(ahead.share)) - 0.5) < 0.02
+
+
+def test_pinholes_alone_are_rendered_as_they_are(straight_road: Scenario) -> None:
+    assert isinstance(through_lenses(straight_road, Directions), Directions)

@@ -1,0 +1,99 @@
+"""The cameras of a scenario file: sections, shipped rigs, calibrations, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import rays_of, sides_of
+from scenarios.load import load_scenario
+from scenarios.usdz_write import write_usdz
+
+ROAD = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\n"
+
+
+def written(folder: Path, cameras: str, more: str = "") -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(f"{ROAD}{more}cameras: {cameras}\n")
+    return path
+
+
+def test_lens_shutter_and_rate_of_a_section_are_the_cameras(tmp_path: Path) -> None:
+    text = "[{name: a, lens: fisheye, width: 200, height: 160, hfov_deg: 190, shutter_us: 30000, interval_us: 200000, max_angle_deg: 100}]"
+    (camera,) = load_scenario(written(tmp_path, text)).cameras
+    assert (camera.shutter_us, camera.interval_us) == (30_000, 200_000)
+    rays = rays_of(camera)
+    middle = rays.ray.reshape(160, 200, 3)[80, [0, 199]]
+    angle = np.rad2deg(np.arctan2(np.abs(middle[:, 0]), middle[:, 2]))
+    np.testing.assert_allclose(angle, 95 * 199 / 200, atol=0.1)
+    assert len(sides_of(camera)) == 5
+
+
+def test_the_order_of_listing_changes_no_scenario(tmp_path: Path) -> None:
+    text = ["{name: b, yaw_deg: 90}", "{name: a}", "{name: c, hfov_deg: 100}"]
+    one = load_scenario(written(tmp_path, f"[{', '.join(text)}]"))
+    other = load_scenario(written(tmp_path, f"[{', '.join(text[::-1])}]"))
+    assert [camera.name for camera in one.cameras] == ["c", "a", "b"]
+    assert [camera.name for camera in other.cameras] == ["c", "a", "b"]
+    assert one.content_hash == other.content_hash
+
+
+@pytest.mark.parametrize(
+    ("rig", "count"), [("front", 1), ("alpasim-4", 4), ("alpasim-6", 6), ("surround-6", 6)]
+)
+def test_a_shipped_rig_is_read_and_scaled(tmp_path: Path, rig: str, count: int) -> None:
+    cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras
+    assert [camera.width for camera in cameras] == [192] * count
+    assert cameras[0].T_rig_camera[0, 2] > 0.99
+
+
+def test_cameras_of_a_usdz_have_its_lenses(tmp_path: Path) -> None:
+    write_usdz(tmp_path / "s.usdz", load_scenario(written(tmp_path, "{rig: surround-6}")))
+    cameras = load_scenario(written(tmp_path, "{from: s.usdz, shutter_us: 20000}")).cameras
+    assert len(cameras) == 6
+    assert all(camera.lens and camera.shutter_us == 20_000 for camera in cameras)
+    rays = rays_of(cameras[0])
+    across = rays.ray.reshape(288, 512, 3)[144, [0, -1]]
+    np.testing.assert_allclose(across[:, 0] / across[:, 2], [-0.7, 0.7], atol=0.005)
+
+
+def test_cameras_of_an_argoverse_log_have_its_distortion(shared_data: Path, tmp_path: Path) -> None:
+    (log,) = (p.parent.parent for p in shared_data.glob("av2/*/calibration/intrinsics.feather"))
+    text = f"{{from: {log}, width: 205, names: [ring_side_left, ring_front_center]}}"
+    cameras = load_scenario(written(tmp_path, text)).cameras
+    assert [camera.name for camera in cameras] == ["ring_front_center", "ring_side_left"]
+    assert all(camera.lens and camera.lens.kind == "opencv" for camera in cameras)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "named"),
+    [
+        ("[{hfov_deg: 165}]", "hfov_deg"),
+        ("[{focal_px: [30, 30]}]", "hfov_deg"),
+        ("[{coefficients: [0.1]}]", "pinhole"),
+        ("[{lens: fisheye, coefficients: [-0.9]}]", "turns back"),
+        ("[{lens: ftheta, hfov_deg: 220}]", "degrees from the axis"),
+        ("[{name: a}, {name: a}]", "'a'"),
+        ("[{interval_us: 150000}]", "150000"),
+        ("[{shutter_us: 200000}]", "200000"),
+        ("[{x_m: 1.4, z_m: 0.8}]", "inside the car's body"),
+        ("[{x_m: 8}]", "away from the car's body"),
+        ("[{name: a, width: 8192, height: 8192}, {name: b, width: 8}]", "67,110,016"),
+        ("{rig: alpasim-5}", "alpasim-5"),
+        ("{rig: front, wdth: 64}", "wdth"),
+        ("{rig: front, from: x.usdz}", "rig and from"),
+        ("{from: none.usdz}", "none.usdz"),
+        ("{from: scene.yaml}", "calibration"),
+    ],
+)
+def test_cameras_that_cannot_be_drawn_are_refused_before_the_road_is_built(
+    tmp_path: Path, cameras: str, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "body" not in named:
+        monkeypatch.setattr("scenarios.load.built_drive", None)
+    with pytest.raises(InputError) as error:
+        load_scenario(written(tmp_path, cameras))
+    assert named in error.value.message
