@@ -18,7 +18,7 @@ from urllib.parse import parse_qs
 import can
 import numpy as np
 
-from alpasim_plugin.control.can_codec import BadFrame, Codec, Received
+from alpasim_plugin.control.can_codec import BadFrame, Codec, FrameId, Received
 from alpasim_plugin.core.errors import InputError, PolicyError
 
 HOLD_US = 200_000  # how long the last command stands in for a missing one
@@ -79,15 +79,22 @@ class Address:
         )
 
 
-def open_bus(address: Address) -> can.BusABC:
+def open_bus(address: Address, codec: Codec | None = None) -> can.BusABC:
     """Open a bus; nothing that it sends comes back to it.
+
+    Args:
+        address: Of the bus.
+        codec: Whose messages it carries; None is classic CAN.
 
     Raises:
         InputError: The interface or the channel does not work on this machine.
     """
     try:
         return can.Bus(
-            interface=address.interface, channel=address.channel, receive_own_messages=False
+            interface=address.interface,
+            channel=address.channel,
+            receive_own_messages=False,
+            fd=codec is not None and codec.uses_fd,
         )
     except Exception as error:  # every interface raises errors of its own
         raise InputError(
@@ -138,10 +145,10 @@ class Exchange:
         self._steer = _Command(self.codec.map.steer)
         self._accel = _Command(self.codec.map.accel)
         self._began_us: int | None = None
-        self._own_ids = {self.codec.message(sent.message).frame_id for sent in self.codec.map.send}
-        self._by_id = {
-            self.codec.message(one.part.message).frame_id: one for one in (self._steer, self._accel)
-        }
+        self._own_ids = {self.codec.address(sent.message) for sent in self.codec.map.send}
+        self._by_id: dict[FrameId, list[_Command]] = {}
+        for one in (self._steer, self._accel):  # one message may carry both
+            self._by_id.setdefault(self.codec.address(one.part.message), []).append(one)
 
     def step(self, t_us: int, quantities: Mapping[str, float]) -> Commands:
         """Send the messages that are due at an instant and return the commands that answer them.
@@ -156,13 +163,13 @@ class Exchange:
         self._drain(t_us)
         for sent in self.codec.map.send:
             if t_us % sent.period_us == 0:
-                self._send(*self.codec.encode(sent, quantities))
+                self._send(self.codec.encode(sent, quantities))
         began = self.clock()
         waiting = {id(self._steer), id(self._accel)}
         while waiting and (left := began + self.timeout_s - self.clock()) > 0:
             frame = self.bus.recv(left)
-            if frame is not None and (one := self._take(frame, t_us)) is not None:
-                waiting.discard(id(one))
+            if frame is not None:
+                waiting -= {id(one) for one in self._take(frame, t_us)}
         if not waiting:
             self.latencies_s.append(self.clock() - began)
         return self._commands(t_us, not waiting)
@@ -182,14 +189,11 @@ class Exchange:
         is known.
         """
         while (frame := self.bus.recv(0)) is not None:
-            if self._take(frame, t_us) is not None:
-                self.counts["late"] += 1
+            self.counts["late"] += bool(self._take(frame, t_us))
 
-    def _send(self, frame_id: int, data: bytes) -> None:
+    def _send(self, frame: can.Message) -> None:
         try:
-            self.bus.send(
-                can.Message(arbitration_id=frame_id, data=data, is_extended_id=frame_id > 0x7FF)
-            )
+            self.bus.send(frame)
         except can.CanError as error:
             raise PolicyError(
                 f"{self.bus.channel_info}: {error}",
@@ -197,18 +201,23 @@ class Exchange:
             ) from error
         self.counts["sent"] += 1
 
-    def _take(self, frame: can.Message, t_us: int) -> _Command | None:
-        """Take in a frame; return the command that it renews, or None where it is refused or
+    def _take(self, frame: can.Message, t_us: int) -> list[_Command]:
+        """Take in a frame; return the commands that it renews, none where it is refused or
         another's.
         """
-        if frame.arbitration_id in self._own_ids:
-            return None  # multicast gives back what was sent
-        one = self._by_id.get(frame.arbitration_id)
-        if one is None or frame.is_error_frame or frame.is_remote_frame:
+        address = frame.arbitration_id, frame.is_extended_id
+        if address in self._own_ids:
+            return []  # multicast gives back what was sent
+        mine = self._by_id.get(address, [])
+        if not mine or frame.is_error_frame or frame.is_remote_frame:
             self.counts["other"] += 1
-            return None
+            return []
+        return [one for one in mine if self._renew(one, frame, t_us)]
+
+    def _renew(self, one: _Command, frame: can.Message, t_us: int) -> bool:
+        """Take in a command; return whether the frame renews it."""
         try:
-            value, counter = self.codec.decode(one.part, bytes(frame.data))
+            found = self.codec.decode(one.part, bytes(frame.data))
         except BadFrame as error:
             text = str(error)
             self.counts[
@@ -218,7 +227,10 @@ class Exchange:
                 if "outside" in text
                 else "malformed"
             ] += 1
-            return None
+            return False
+        if found is None:
+            return False
+        value, counter = found
         if counter is not None and one.counter is not None and one.part.counter is not None:
             size = (
                 1
@@ -227,10 +239,10 @@ class Exchange:
             ahead = (counter - one.counter) % size
             if ahead == 0:
                 self.counts["repeated"] += 1
-                return None
+                return False
             self.counts["lost"] += ahead - 1
         one.counter, one.value, one.t_us = counter, value, t_us
-        return one
+        return True
 
     def _commands(self, t_us: int, fresh: bool) -> Commands:
         """Return the newest commands, or what replaces them."""

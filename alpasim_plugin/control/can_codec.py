@@ -10,11 +10,13 @@ checks have passed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import can
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.core.config import load_yaml, validate
@@ -22,6 +24,8 @@ from alpasim_plugin.core.errors import InputError
 
 POLYNOMIAL = 0x1D  # CRC-8 SAE J1850
 START = 0xFF
+FD_BYTES = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # that a frame of CAN FD carries
+FrameId = tuple[int, bool]  # identifier, and whether it is an extended one of 29 bits
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
 Quantity = Literal[
@@ -80,6 +84,11 @@ class CanMap(_Part):
     steer: Received
     accel: Received
 
+    @property
+    def parts(self) -> tuple[Sent | Received, ...]:
+        """Return every message that the map sends or reads."""
+        return (*self.send, self.steer, self.accel)
+
 
 def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     """Read a map and return it with the path of its database.
@@ -122,16 +131,36 @@ class Codec:
         """Return a message of the database."""
         return self.database.get_message_by_name(name)
 
-    def encode(self, sent: Sent, quantities: Mapping[str, float]) -> tuple[int, bytes]:
-        """Return identifier and data of a message, with the next counter and its checksum."""
+    @property
+    def uses_fd(self) -> bool:
+        """Return whether any message of the map needs a CAN FD frame."""
+        return any(is_fd(self.message(part.message)) for part in self.map.parts)
+
+    def address(self, name: str) -> FrameId:
+        """Return what identifies the frames of a message."""
+        message = self.message(name)
+        return int(message.frame_id), bool(message.is_extended_frame)
+
+    def frame(self, name: str, data: bytes) -> can.Message:
+        """Return data as a frame of the kind that the database states."""
+        message = self.message(name)
+        return can.Message(
+            arbitration_id=message.frame_id,
+            is_extended_id=message.is_extended_frame,
+            is_fd=is_fd(message),
+            data=data,
+        )
+
+    def encode(self, sent: Sent, quantities: Mapping[str, float]) -> can.Message:
+        """Return the frame of a message, with the next counter and its checksum."""
         values = {
             name: self._carried(sent.message, name, quantities[quantity])
             for name, quantity in sent.signals.items()
         }
         return self.pack(sent.message, values, sent.counter, sent.checksum)
 
-    def encode_command(self, received: Received, value: float) -> tuple[int, bytes]:
-        """Return identifier and data of a command, as a control unit sends it."""
+    def encode_command(self, received: Received, value: float) -> can.Message:
+        """Return the frame of a command, as a control unit sends it."""
         values = {
             received.signal: self._carried(
                 received.message, received.signal, value * received.scale
@@ -142,12 +171,14 @@ class Codec:
 
     def pack(
         self, name: str, values: Mapping[str, float], counter: str | None, checksum: str | None
-    ) -> tuple[int, bytes]:
-        """Return identifier and data of given signal values; signals that are not named are at
-        their lowest raw value, 0 in most.
+    ) -> can.Message:
+        """Return the frame of given signal values; signals that are not named are at their lowest
+        raw value, 0 in most.
         """
         message = self.message(name)
-        full = {signal.name: signal.offset for signal in message.signals} | dict(values)
+        full = {signal.name: signal.offset for signal in message.signals}
+        named = [one for one in (*values, counter, checksum) if one is not None]
+        full |= {**multiplexed(message, named, {}), **values}
         if counter is not None:
             length = message.get_signal_by_name(counter).length
             full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (
@@ -159,10 +190,11 @@ class Codec:
         if checksum is not None:
             position = _byte_of(message, checksum)
             data[position] = checksum_of(message.frame_id, bytes(data), position)
-        return message.frame_id, bytes(data)
+        return self.frame(name, bytes(data))
 
-    def decode(self, received: Received, data: bytes) -> tuple[float, int | None]:
-        """Return a command's value and counter.
+    def decode(self, received: Received, data: bytes) -> tuple[float, int | None] | None:
+        """Return a command's value and counter; None where the frame carries other signals of a
+        multiplexed message.
 
         Raises:
             BadFrame: Wrong length, wrong checksum, a value that the database does not allow, or a
@@ -170,6 +202,8 @@ class Codec:
         """
         message = self.message(received.message)
         values = checked_values(message, data, received.checksum)
+        if not {received.signal, *received.enabled} <= set(values):
+            return None
         off = [
             f"{name} = {values[name]}"
             for name, wanted in received.enabled.items()
@@ -190,6 +224,8 @@ class Codec:
         signal = self.message(message).get_signal_by_name(name)
         low, high = _range(signal)
         held = min(max(wanted, low), high)
+        if signal.is_float:
+            return float(held)
         raw = round((held - signal.offset) / signal.scale)
         first, last = _raw_range(signal)
         return float(min(max(raw, first), last) * signal.scale + signal.offset)
@@ -219,19 +255,91 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             "repair the database, or remove the message that it names",
         ) from error
     codec = Codec(can_map, loaded)
-    for part in (*can_map.send, can_map.steer, can_map.accel):
-        signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
-        signals += [name for name in (part.counter, part.checksum) if name is not None]
-        try:
-            message = codec.message(part.message)
-            for name in signals:
-                message.get_signal_by_name(name)
-        except KeyError as error:
-            raise InputError(
-                f"{database}: no {error} of message {part.message}",
-                "name a database of the vehicle that the map is for",
-            ) from error
+    for part in can_map.parts:
+        _check(codec, database, part)
     return codec
+
+
+def _check(codec: Codec, database: Path, part: Sent | Received) -> None:
+    """Refuse a message that a map names and that cannot be sent or read as it says."""
+    signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
+    whole = [name for name in (part.counter, part.checksum) if name is not None]
+    where = f"{database}, message {part.message}"
+    try:
+        message = codec.message(part.message)
+        found = {name: message.get_signal_by_name(name) for name in (*signals, *whole)}
+    except KeyError as error:
+        raise InputError(
+            f"{where}: no {error}", "name a database of the vehicle that the map is for"
+        ) from error
+    if is_fd(message) and message.length not in FD_BYTES:
+        raise InputError(
+            f"{where}: {message.length} bytes, which no CAN frame carries",
+            f"use a message of up to 8 bytes, or of {', '.join(map(str, FD_BYTES[1:]))} in CAN FD",
+        )
+    odd = next((name for name, one in found.items() if not one.scale), None)
+    if isinstance(part, Received) and not part.scale:
+        odd = part.signal
+    odd = odd or next((name for name in whole if found[name].is_float), None)
+    if part.checksum is not None and odd is None:
+        one = found[part.checksum]
+        first = one.start % 8 == (7 if one.byte_order == "big_endian" else 0)
+        odd = None if one.length == 8 and first else part.checksum
+    if odd is not None:
+        raise InputError(
+            f"{where}, signal {odd}: it cannot carry what the map wants of it",
+            "use a signal with a scale; counters of whole numbers, checksums of one whole byte",
+        )
+    fixed = part.enabled if isinstance(part, Received) else {}
+    multiplexed(message, [*signals, *whole], fixed, where)
+    try:  # what else a database can have wrong shows as the message is made and read once
+        trial = Codec(codec.map, codec.database).pack(
+            part.message,
+            {name: found[name].offset for name in signals} | dict(fixed),
+            part.counter,
+            part.checksum,
+        )
+        checked_values(message, bytes(trial.data), part.checksum)
+    except Exception as error:  # the encoder raises errors of many kinds
+        raise InputError(
+            f"{where}: {type(error).__name__}: {error}", "correct the message in the database"
+        ) from error
+
+
+def multiplexed(
+    message: Any, names: Sequence[str], fixed: Mapping[str, int], where: str = ""
+) -> dict[str, int]:
+    """Return the values of multiplexers under which a message carries signals.
+
+    Args:
+        message: Of a database.
+        names: The signals.
+        fixed: Values that multiplexers must have.
+        where: The message's place, for the error.
+
+    Raises:
+        InputError: No frame carries all of them.
+    """
+    allowed: dict[str, set[int]] = {name: {value} for name, value in fixed.items()}
+    for name in names:
+        signal = message.get_signal_by_name(name)
+        while signal.multiplexer_signal is not None:
+            ids = set(signal.multiplexer_ids)
+            over = allowed[signal.multiplexer_signal] = (
+                allowed.get(signal.multiplexer_signal, ids) & ids
+            )
+            if not over:
+                raise InputError(
+                    f"{where}: no frame carries {', '.join(names)} together: they are of different values of {signal.multiplexer_signal}",
+                    "name signals of one multiplexer value; send the message once for each",
+                )
+            signal = message.get_signal_by_name(signal.multiplexer_signal)
+    return {name: min(ids) for name, ids in allowed.items() if name not in fixed}
+
+
+def is_fd(message: Any) -> bool:
+    """Return whether a message of a database needs a CAN FD frame."""
+    return bool(message.is_fd) or int(message.length) > 8
 
 
 def checked_values(message: Any, data: bytes, checksum: str | None) -> dict[str, float]:
@@ -280,6 +388,12 @@ def _range(signal: Any) -> tuple[float, float]:
     often hold one that they cannot, such as 0 to 65535 for a yaw rate of 10 bits from -125 deg/s;
     then the bits decide.
     """
+    if signal.is_float:
+        most = float(np.finfo(f"f{int(signal.length) // 8}").max)
+        stated = signal.minimum, signal.maximum
+        if None in stated or stated[0] == stated[1]:  # DBC writes [0|0] where it states none
+            return -most, most
+        return float(stated[0]), float(stated[1])
     low, high = sorted(
         raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal)
     )

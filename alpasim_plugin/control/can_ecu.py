@@ -30,16 +30,17 @@ class LaneKeeper:
     def __init__(self, codec: Codec) -> None:
         self._codec, self._ratio = codec, codec.map.steering_ratio
         self._seen: dict[str, float] = {}
-        self._sent = {codec.message(one.message).frame_id: one for one in codec.map.send}
-        self._trigger = codec.message(codec.map.send[-1].message).frame_id
+        self._sent = {codec.address(one.message): one for one in codec.map.send}
+        self._trigger = codec.address(codec.map.send[-1].message)
         self._cruise_mps: float | None = None
 
-    def answer(self, frame: can.Message) -> list[tuple[int, bytes]]:
-        """Take in a frame and return the identifiers and data of the commands that answer it.
+    def answer(self, frame: can.Message) -> list[can.Message]:
+        """Take in a frame and return the commands that answer it.
 
         A frame that fails its checks is not answered.
         """
-        one = self._sent.get(frame.arbitration_id)
+        address = frame.arbitration_id, frame.is_extended_id
+        one = self._sent.get(address)
         if one is None:
             return []
         try:
@@ -50,7 +51,7 @@ class LaneKeeper:
             return []
         for name, quantity in one.signals.items():
             self._seen[quantity] = values[name]
-        if frame.arbitration_id != self._trigger or "speed_kph" not in self._seen:
+        if address != self._trigger or "speed_kph" not in self._seen:
             return []
         steer, accel = self._codec.map.steer, self._codec.map.accel
         wheel_deg, accel_mps2 = self.command(self._seen)
@@ -80,8 +81,8 @@ def serve(bus: can.BusABC, unit: LaneKeeper, stop: threading.Event) -> None:
     """Answer the bus until `stop` is set."""
     while not stop.is_set():
         frame = bus.recv(0.05)
-        for frame_id, data in unit.answer(frame) if frame is not None else ():
-            bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=False))
+        for command in unit.answer(frame) if frame is not None else ():
+            bus.send(command)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -92,8 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="as after can://, such as udp_multicast:239.74.163.2 or socketcan:vcan0?map=MAP.yaml&dbc=FILE",
     )
     address = Address.parse(parser.parse_args(arguments).address)
-    unit = LaneKeeper(open_codec(*load_map(address.map, address.dbc)))
-    with open_bus(address) as bus:
+    codec = open_codec(*load_map(address.map, address.dbc))
+    unit = LaneKeeper(codec)
+    with open_bus(address, codec) as bus:
         say(f"control unit on {address.interface}:{address.channel}, map {address.map}")
         try:
             serve(bus, unit, threading.Event())

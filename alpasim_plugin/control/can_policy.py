@@ -61,10 +61,20 @@ class CanPolicy(Policy):
                 f"can://{address}: the shortest message period is {self._step_us} us, the query period {self._period_us} us",
                 "choose a rates.policy_us that is a whole multiple",
             )
-        self._bus = open_bus(self._address)
+        self._bus = open_bus(self._address, self._codec)
         self._exchange = Exchange(self._bus, self._codec, self._address.timeout_s)
         self._predicted: tuple[int, BicycleState] | None = None
         self._steer_rate = self._accel = 0.0
+
+    @classmethod
+    def check_address(cls, address: str) -> None:
+        """Refuse an address, a map or a database that cannot be driven with, before anything runs.
+
+        Raises:
+            InputError: As `Address.parse`, `load_map` and `open_codec`.
+        """
+        parsed = Address.parse(address)
+        open_codec(*load_map(parsed.map, parsed.dbc))
 
     def reset(self, seed: int, route: Route) -> None:
         """Start a new rollout on the same bus: counts, commands and motion begin anew."""

@@ -54,11 +54,11 @@ def exchange(codec: Codec, bus: can.BusABC) -> Exchange:
     return Exchange(bus, codec, timeout_s=0.001)
 
 
-def send(bus: can.BusABC, frame: tuple[int, bytes]) -> None:
-    bus.send(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False))
+def send(bus: can.BusABC, frame_id: int, data: bytes) -> None:
+    bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=False))
 
 
-def commands(codec: Codec, wheel_deg: float, accel_mps2: float) -> list[tuple[int, bytes]]:
+def commands(codec: Codec, wheel_deg: float, accel_mps2: float) -> list[can.Message]:
     return [
         codec.encode_command(codec.map.steer, wheel_deg),
         codec.encode_command(codec.map.accel, accel_mps2),
@@ -81,9 +81,9 @@ def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> No
     message = codec.message("EGO_MOTION")
     step = float(message.get_signal_by_name("SPEED").scale)
     for speed_kph in np.linspace(0.1, 120.0, 50):
-        _, data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": speed_kph})
+        data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": speed_kph}).data
         assert abs(message.decode(data)["SPEED"] - speed_kph) <= step * (0.5 + 1e-6)
-    _, data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": 1e6})
+    data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": 1e6}).data
     assert message.decode(data)["SPEED"] < 1000.0
 
 
@@ -119,7 +119,7 @@ def test_commands_that_answer_are_fresh(codec: Codec, wires: tuple[can.BusABC, c
     sent = open_codec(*load_map("example"))
     for i in range(3):
         for frame in commands(sent, 12.3, -0.7):
-            send(unit, frame)
+            unit.send(frame)
         got = one.step(10_000 * i, NOTHING)
         assert (got.wheel_deg, got.accel_mps2) == (pytest.approx(12.3), pytest.approx(-0.7))
     assert one.counts["late"] == 6  # they came before the instant that they were taken for
@@ -132,7 +132,7 @@ def test_a_missing_command_is_held_and_then_the_brake_grows(
     bus, unit = wires
     one = exchange(codec, bus)
     for frame in commands(open_codec(*load_map("example")), 5.0, 1.0):
-        send(unit, frame)
+        unit.send(frame)
     got = [one.step(t, NOTHING) for t in range(0, HOLD_US + 2_000_000, 50_000)]
     held = HOLD_US // 50_000 + 1
     assert [g.mark for g in got] == ["held"] * held + ["ramped"] * (len(got) - held)
@@ -164,20 +164,19 @@ def test_every_fault_is_counted_by_cause(
     one, other = exchange(codec, bus), open_codec(*load_map("example"))
     frames = [commands(other, 1.0, 0.5) for _ in range(6)]
     for frame in frames[0]:
-        send(unit, frame)
-        send(unit, frame)  # the same counter again
+        unit.send(frame)
+        unit.send(frame)  # the same counter again
     for frame in frames[3]:  # two of each lost
-        send(unit, frame)
-    steer_id, data = frames[4][0]
-    send(unit, (steer_id, bytes([data[0] ^ 1]) + data[1:]))  # a flipped bit
-    send(unit, (steer_id, data[:5]))  # cut short
+        unit.send(frame)
+    steer_id, data = frames[4][0].arbitration_id, bytes(frames[4][0].data)
+    send(unit, steer_id, bytes([data[0] ^ 1]) + data[1:])  # a flipped bit
+    send(unit, steer_id, data[:5])  # cut short
     off = other.pack("ACCEL_CMD", {"ACCEL": 1.0, "ENABLE": 0}, "COUNTER", other.map.accel.checksum)
-    send(unit, off)
-    send(
-        unit,
-        other.pack("ACCEL_CMD", {"ACCEL": -30.0, "ENABLE": 1}, "COUNTER", other.map.accel.checksum),
+    unit.send(off)
+    unit.send(
+        other.pack("ACCEL_CMD", {"ACCEL": -30.0, "ENABLE": 1}, "COUNTER", other.map.accel.checksum)
     )
-    send(unit, (0x7AB, b"\1\2"))  # of nobody here
+    send(unit, 0x7AB, b"\1\2")  # of nobody here
     got = one.step(0, NOTHING)
     wanted = {
         "repeated": 2,

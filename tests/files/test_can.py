@@ -1,0 +1,170 @@
+"""CAN databases as vehicles have them: multiplexed, of floats, extended and CAN FD frames.
+
+Every database is made here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+
+pytest.importorskip("cantools", reason="the extra [can] is not installed")
+can = pytest.importorskip("can")
+
+from alpasim_plugin.control.can_bus import Address, Exchange, open_bus  # noqa: E402
+from alpasim_plugin.control.can_codec import Codec, load_map, open_codec  # noqa: E402
+
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: SIM ECU\n'
+EXTENDED = 1 << 31
+
+
+def message(i: int, name: str, length: int, *signals: str) -> str:
+    return f"BO_ {i} {name}: {length} ECU\n" + "".join(f" SG_ {one}\n" for one in signals) + "\n"
+
+
+SPEED = 'SPEED : 0|16@1- (0.01,0) [-300|300] "" ECU'
+ANGLE = 'ANGLE : 0|16@1- (0.1,0) [-900|900] "" SIM'
+ACCEL = 'ACCEL : 16|16@1- (0.001,0) [-10|5] "" SIM'
+
+
+def opened(
+    folder: Path, *parts: str, steer: str = "", accel: str = "", send: str = ""
+) -> tuple[Codec, Path]:
+    """Write a database and a map of it, and open both; the standard messages fill what is not
+    given.
+    """
+    (folder / "car.dbc").write_text(HEAD + "".join(parts))
+    send = send or "{message: EGO, period_us: 10000, signals: {SPEED: speed_kph}}"
+    steer, accel = (
+        steer or "{message: CMD, signal: ANGLE}",
+        accel or "{message: CMD, signal: ACCEL}",
+    )
+    text = f"dbc: car.dbc\nsteering_ratio: 15\nsend: [{send}]\nsteer: {steer}\naccel: {accel}\n"
+    (folder / "map.yaml").write_text(text)
+    return open_codec(*load_map(str(folder / "map.yaml"))), folder / "map.yaml"
+
+
+def answered(codec: Codec, *frames: can.Message) -> Exchange:
+    """Send frames to one end of a bus and take them in at the other."""
+    address = Address.parse(f"test-files-{id(frames)}")
+    with open_bus(address, codec) as one, open_bus(address, codec) as other:
+        exchange = Exchange(one, codec, timeout_s=0.01)
+        for frame in frames:
+            other.send(frame)
+        exchange.commands = exchange.step(0, dict.fromkeys(("speed_kph",), 36.0))
+        return exchange
+
+
+EGO, CMD = message(257, "EGO", 4, SPEED), message(512, "CMD", 4, ANGLE, ACCEL)
+
+
+def test_one_message_may_carry_both_commands(tmp_path: Path) -> None:
+    codec, _ = opened(tmp_path, EGO, CMD)
+    frame = codec.pack("CMD", {"ANGLE": 12.3, "ACCEL": -0.5}, None, None)
+    got = answered(codec, frame).commands
+    assert (got.mark, round(got.wheel_deg, 6), round(got.accel_mps2, 6)) == ("held", 12.3, -0.5)
+
+
+def test_multiplexed_commands_come_in_frames_of_their_own(tmp_path: Path) -> None:
+    mux = ('KIND M : 0|8@1+ (1,0) [0|3] "" SIM', 'ANGLE m1 : 8|16@1- (0.1,0) [-900|900] "" SIM')
+    codec, _ = opened(
+        tmp_path,
+        EGO,
+        message(512, "CMD", 8, *mux, 'ACCEL m2 : 8|16@1- (0.001,0) [-10|5] "" SIM'),
+    )
+    steer = codec.encode_command(codec.map.steer, 12.3)
+    accel = codec.encode_command(codec.map.accel, -0.5)
+    assert (steer.data[0], accel.data[0]) == (1, 2)
+    exchange = answered(codec, steer, accel)
+    assert exchange.commands.wheel_deg == pytest.approx(12.3)
+    assert exchange.commands.accel_mps2 == pytest.approx(-0.5)
+    assert exchange.counts["malformed"] == 0
+
+
+def test_nested_multiplexers_are_set(tmp_path: Path) -> None:
+    signals = (
+        'KIND M : 0|8@1+ (1,0) [0|3] "" ECU',
+        'PART m2M : 8|8@1+ (1,0) [0|3] "" ECU',
+        'SPEED m3 : 16|16@1- (0.01,0) [-300|300] "" ECU',
+    )
+    nested = "SG_MUL_VAL_ 257 PART KIND 2-2;\nSG_MUL_VAL_ 257 SPEED PART 3-3;\n"
+    codec, _ = opened(tmp_path, message(257, "EGO", 8, *signals), CMD, nested)
+    assert list(codec.encode(codec.map.send[0], {"speed_kph": 36.0}).data[:4]) == [2, 3, 0x10, 0x0E]
+
+
+@pytest.mark.parametrize("order", ["0|32@1", "7|32@0"])
+def test_floats_go_out_and_come_in_as_floats(tmp_path: Path, order: str) -> None:
+    signal = f'{{}} : {order}- (1,0) [0|0] "" ECU'
+    names = ("EGO", "SPEED"), ("STEER", "ANGLE"), ("ACC", "ACCEL")
+    parts = [message(256 + i, m, 4, signal.format(s)) for i, (m, s) in enumerate(names)]
+    parts += [f"SIG_VALTYPE_ {256 + i} {s} : 1;\n" for i, (_, s) in enumerate(names)]
+    codec, _ = opened(
+        tmp_path,
+        *parts,
+        steer="{message: STEER, signal: ANGLE}",
+        accel="{message: ACC, signal: ACCEL}",
+    )
+    frame = codec.encode(codec.map.send[0], {"speed_kph": 36.04321})
+    assert codec.message("EGO").decode(bytes(frame.data))["SPEED"] == pytest.approx(
+        36.04321, rel=1e-6
+    )
+    steer = codec.encode_command(codec.map.steer, -12.3456)
+    assert codec.decode(codec.map.steer, bytes(steer.data))[0] == pytest.approx(-12.3456, rel=1e-6)
+
+
+def test_extended_and_standard_frames_of_one_number_are_two(tmp_path: Path) -> None:
+    codec, _ = opened(
+        tmp_path,
+        message(257 | EXTENDED, "EGO", 4, SPEED),
+        message(512 | EXTENDED, "CMD", 4, ANGLE, ACCEL),
+    )
+    assert codec.encode(codec.map.send[0], {"speed_kph": 1.0}).is_extended_id
+    frame = codec.pack("CMD", {"ANGLE": 1.0, "ACCEL": 0.5}, None, None)
+    assert answered(codec, frame).commands.mark == "held"
+    frame.is_extended_id = False
+    exchange = answered(codec, frame)
+    assert exchange.commands.mark == "ramped"
+    assert exchange.counts["other"] == 1
+
+
+def test_messages_longer_than_8_bytes_are_sent_as_can_fd(tmp_path: Path) -> None:
+    codec, _ = opened(tmp_path, message(257, "EGO", 16, SPEED), CMD)
+    frame = codec.encode(codec.map.send[0], {"speed_kph": 1.0})
+    assert (frame.is_fd, len(frame.data)) == (True, 16)
+    assert codec.uses_fd
+    assert not opened(tmp_path, EGO, CMD)[0].uses_fd
+
+
+TWO = message(
+    257,
+    "EGO",
+    8,
+    'KIND M : 0|8@1+ (1,0) [0|3] "" ECU',
+    'SPEED m1 : 8|16@1- (0.01,0) [-300|300] "" ECU',
+    'YAW m2 : 8|16@1- (0.01,0) [-300|300] "" ECU',
+)
+
+
+@pytest.mark.parametrize(
+    ("parts", "keys", "found"),
+    [
+        ((TWO, CMD), {"send": "{message: EGO, period_us: 10000, signals: {SPEED: speed_kph, YAW: yaw_rate_degps}}"}, "KIND"),
+        ((message(257, "EGO", 10, SPEED), CMD), {}, "10 bytes"),
+        ((message(257, "EGO", 4, SPEED.replace("(0.01,0)", "(0,0)")), CMD), {}, "SPEED"),
+        ((message(257, "EGO", 1, SPEED), CMD), {}, "EGO"),
+        ((EGO, CMD), {"steer": "{message: CMD, signal: ANGLE, checksum: ANGLE}"}, "ANGLE"),
+        ((EGO, CMD), {"steer": "{message: CMD, signal: WHEEL}"}, "WHEEL"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_sent_is_refused_when_the_map_is_opened(
+    tmp_path: Path, parts: tuple[str, ...], keys: dict[str, str], found: str
+) -> None:
+    with pytest.raises(InputError, match=found):
+        opened(tmp_path, *parts, **keys)
+    policy = f"can://virtual:files?map={tmp_path / 'map.yaml'}"
+    command = ["--renderer", "clean", "--policy", policy, "--dry-run", "smoke/straight"]
+    assert run_command([*command, "--out", str(tmp_path / "out")]) == 2
