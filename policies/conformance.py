@@ -1,21 +1,22 @@
 """Conformance test of a policy: synthetic situations, and a readable sentence for every fault.
 
 What is checked: the policy's cameras exist; plans are finite, begin now, at the ego, in the rig
-frame (x forward, y left), in metres, radians and microseconds; they reach two seconds ahead; the
-same seed gives the same plans; a reset forgets the drive before; an older frame is accepted; the
-plan is in time.
+frame (x forward, y left), in metres, radians and microseconds; they reach two seconds ahead; they
+turn with a mirrored scene, and with a mirrored image or route alone; they begin with the ego's
+speed; the same seed gives the same plans; a reset forgets the rollout before; an older frame is
+accepted; the plan is in time. Notes say which inputs the plan follows, and how late.
 """
 
 from __future__ import annotations
 
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from alpasim_plugin.core.blame import raised
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.core.interfaces import Policy
@@ -44,7 +45,12 @@ FIRST_POSE_M = 0.5
 START_US = 1_700_000_000_000_000  # epoch time, so that a policy that counts in float32 fails
 STEP_US = 100_000
 # Away from the origin: world coordinates differ from rig coordinates.
-T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)
+YAW_RAD = 0.7
+T_WORLD_ROAD = se2(1200.0, -800.0, YAW_RAD)
+LEAST_M = 0.5  # at the end of a plan: what is less says nothing of sides
+BEGIN_S = 0.3  # a plan's first part, in which a car hardly changes its speed
+LEAST_SHARE, MOST_SHARE = 0.65, 1.6  # of the ego's speed, with which a plan may begin
+MOST_MPS = 25.0
 
 
 def time_fault(plan: Plan, now: int) -> str:
@@ -103,29 +109,82 @@ def frame_fault(plan: Plan) -> str:
     return ""
 
 
-def unit_fault(plan: Plan) -> str:
-    """Check the advance in the first second of a plan made at 10 m/s on a free straight."""
-    t_s = (plan.times_us - plan.times_us[0]) * 1e-6
-    x, y = (float(np.interp(1.0, t_s, plan.xy[:, d])) for d in (0, 1))
-    distance = float(np.hypot(x, y))
-    if not 4.0 <= distance <= 14.0:
-        unit = unit_guess(distance / 10.0)
-        guess = f"it looks like {unit}" if unit else "a car does between 4 and 14 m, forwards"
-    elif x > abs(y):
-        return ""
-    elif -x > abs(y):
-        guess = "it runs backwards, x is forward"
-    else:
-        guess = "it runs sideways, x is forward and y is left"
-    return f"at 10 m/s on a free straight the plan advances {distance:.2f} in the first second: {guess}"
+def direction_fault(plans: Sequence[Plan]) -> str:
+    """Check that plans made on a straight road lead straight on in the rig frame, in the median."""
+    x, y = np.median([plan.xy[-1] for plan in plans], axis=0)
+    turned = float(np.arctan2(y, x))
+    where = f"on a straight road the plan leads to x = {x:.1f}, y = {y:.1f} m"
+    if abs(turned - YAW_RAD) < 0.1:
+        return f"{where}: it looks like the world's axes, needed are the rig's"
+    if abs(x) > abs(y):
+        return f"{where}: it runs backwards, x is forward" if x < -LEAST_M else ""
+    if abs(y) > LEAST_M:
+        return f"{where}: it runs sideways, x is forward and y is left"
+    return ""
 
 
-def side_fault(left: Plan, right: Plan) -> str:
-    """Check that a left-hand road leads further left than a right-hand one."""
-    y_left, y_right = float(left.xy[-1, 1]), float(right.xy[-1, 1])
-    if y_left >= y_right - 0.5:
-        return ""
-    return f"a left-hand road leads to y = {y_left:.1f} m and a right-hand one to y = {y_right:.1f} m: y is mirrored, it points left"
+def side_fault(plans: Mapping[str, Sequence[Plan]]) -> str:
+    """Check that a bend to the left leads further left than one to the right, and further left than
+    straight on where the image alone or the route alone bends.
+    """
+    left_m, right_m = (_end_m(plans[road.name]) for road in (LEFT, RIGHT))
+    by_route_m = _end_m(plans[ROUTE_LEFT.name], plans[STRAIGHT.name])
+    by_image_m = 0.0
+    if {one.name for one in IMAGES} <= plans.keys():
+        by_image_m = _end_m(plans[IMAGE_LEFT.name], plans[NO_ROUTE.name])
+    if left_m < right_m - LEAST_M:
+        wrong = "left and right are exchanged, y points left"
+        if by_image_m < -LEAST_M and by_route_m > LEAST_M:
+            wrong = "the images are read mirrored"
+        return f"a left-hand road leads to y = {left_m:.1f} m and a right-hand one to y = {right_m:.1f} m: {wrong}"
+    for what, by_m in (("image", by_image_m), ("route", by_route_m)):
+        if by_m < -LEAST_M:
+            return f"where the {what} alone bends left the plan ends {-by_m:.1f} m further right: the {what} is read mirrored"
+    return ""
+
+
+def _end_m(plans: Sequence[Plan], others: Sequence[Plan] = ()) -> float:
+    """Return how far to the left the last three plans end, or further than others, by the
+    least of the three; 0 where they disagree on the side.
+    """
+    ends_m = [float(plan.xy[-1, 1]) for plan in plans[-3:]]
+    if others:
+        ends_m = [m - float(plan.xy[-1, 1]) for m, plan in zip(ends_m, others[-3:], strict=True)]
+    if min(ends_m) < 0 < max(ends_m):
+        return 0.0
+    return min(ends_m, key=abs)
+
+
+def speed_fault(fast: Plan, slow: Plan) -> str:
+    """Check the speed with which plans begin that were made at 10 and at 4 m/s: not both at the
+    same wrong multiple of it, and in a car's range.
+    """
+    begins_mps = []
+    for plan in (fast, slow):
+        t_s = (plan.times_us - plan.times_us[0]) * 1e-6
+        xy = [np.interp(BEGIN_S, t_s, plan.xy[:, axis]) for axis in (0, 1)]
+        begins_mps.append(float(np.hypot(*xy)) / BEGIN_S)
+    at_fast, at_slow = begins_mps[0] / STRAIGHT.speed_mps, begins_mps[1] / SLOW_LEFT.speed_mps
+    where = f"at 10 m/s plans begin with {begins_mps[0]:.4g} m/s, at 4 m/s with {begins_mps[1]:.4g}"
+    unit = unit_guess(at_fast)
+    if unit and unit_guess(at_slow) == unit:
+        return f"{where}: it looks like {unit}"
+    is_one_factor = max(at_fast, at_slow) < 1.25 * min(at_fast, at_slow)
+    if is_one_factor and not LEAST_SHARE < at_fast < MOST_SHARE:
+        return f"{where}: as if time steps or lengths were off by {at_fast:.2g}"
+    if begins_mps[0] > MOST_MPS:
+        return f"{where}: a car does not reach that"
+    return ""
+
+
+def _late(straight: Sequence[Plan], bent: Sequence[Plan]) -> int | None:
+    """Return how many queries after the change of the scene plans differ; None where they never
+    do.
+    """
+    for step in range(CHANGE, min(len(straight), len(bent))):
+        if difference([bent[step]], [straight[step]]):
+            return step - CHANGE
+    return None
 
 
 def difference(one: Sequence[Plan], other: Sequence[Plan] | str) -> float:
@@ -142,20 +201,27 @@ def difference(one: Sequence[Plan], other: Sequence[Plan] | str) -> float:
     return float(largest)
 
 
-def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[str]:
-    """List legal but unusual properties."""
+def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[Check]:
+    """List legal but unusual properties, by the plans of each situation."""
     out = []
-    if {"left", "right"} <= plans.keys() and difference(plans["left"], plans["right"]) == 0:
-        out.append(
-            "the plan depends neither on the route nor on the frames: left and right give the same"
-        )
-    if "standing" in plans:
-        last = plans["standing"][-1]
-        out.append(
-            f"from standstill on a free road it moves {float(np.hypot(*(last.xy[-1] - last.xy[0]))):.1f} m within its horizon"
-        )
-    if not any(plan.samples for drive in plans.values() for plan in drive):
-        out.append("it carries no sampled alternatives, so plan metrics see one trajectory")
+    probes = [("route_rig", STRAIGHT, ROUTE_LEFT)]
+    if {one.name for one in IMAGES} <= plans.keys():
+        probes.append(("images", NO_ROUTE, IMAGE_LEFT))
+    for what, straight, left in probes:
+        late = _late(plans[straight.name], plans[left.name])
+        if late is None:
+            found = f"a bend in {what} changed no plan within {STEPS - CHANGE} queries"
+            out.append(Check(what, True, found))
+        elif late > 0:
+            found = f"a bend in {what} changes the plan {late} queries late"
+            out.append(Check("lag", True, found))
+    last = plans[STANDING.name][-1]
+    moves_m = float(np.hypot(*(last.xy[-1] - last.xy[0])))
+    found = f"from standstill on a free road it moves {moves_m:.1f} m within its horizon"
+    out.append(Check("standstill", True, found))
+    if not any(plan.samples for driven in plans.values() for plan in driven):
+        found = "it carries no sampled alternatives, so plan metrics see one trajectory"
+        out.append(Check("samples", True, found))
     return out
 
 
@@ -190,7 +256,7 @@ class Report:
     """What a conformance run found."""
 
     checks: tuple[Check, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Check, ...] = ()  # legal but unusual
     latency_ms: tuple[float, float] = (
         0.0,
         0.0,
@@ -211,16 +277,21 @@ class Report:
             f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}"
             for check in self.checks
         ]
-        lines += [f"note {note}" for note in self.notes]
+        lines += [f"note {note.name}: {note.sentence}" for note in self.notes]
         median_ms, worst_ms = self.latency_ms
         lines.append(f"plans in {median_ms:.1f} ms (median), {worst_ms:.1f} ms (worst)")
         return "\n".join(lines)
 
 
+STEPS = 14
+CHANGE = 3  # the step from which the scene of a probe differs
+
+
 @dataclass(frozen=True)
 class Situation:
     """A stretch of road driven at a constant speed, with a policy query every 0.1 s; a blank one
-    shows the policy a grey picture.
+    shows the policy a grey image; without a route, all its points are NaN. From step `CHANGE` on, the image and the route may bend
+    otherwise than the road.
     """
 
     name: str
@@ -229,16 +300,25 @@ class Situation:
     frame_age_us: int = 0
     steps: int = 6
     is_blank: bool = False
+    has_route: bool = True
+    image_1pm: float | None = None
+    route_1pm: float | None = None
 
 
-STRAIGHT = Situation("straight")
-LEFT = Situation("left", 1 / 60)
-SLOW_LEFT = Situation("left", 1 / 60, speed_mps=4.0)
-RIGHT = Situation("right", -1 / 60)
+BEND = 1 / 60
+STRAIGHT = Situation("straight", steps=STEPS)
+LEFT = Situation("left", BEND)
+SLOW_LEFT = Situation("left", BEND, speed_mps=4.0)
+RIGHT = Situation("right", -BEND)
 STANDING = Situation("standing", speed_mps=0.0)
 OLD_FRAME = Situation("old frame", frame_age_us=STEP_US)
-LONG = Situation("long drive", 1 / 200, steps=40)
+LONG = Situation("long drive", 1 / 200, steps=25)
 BLANK = Situation("nothing to see", steps=12, is_blank=True)
+ROUTE_LEFT = Situation("the route alone bends left", steps=STEPS, route_1pm=BEND)
+# Without a route, a policy that may do without one has the images alone.
+NO_ROUTE = Situation("no route", steps=STEPS, has_route=False)
+IMAGE_LEFT = replace(NO_ROUTE, name="no route, the image bends left", image_1pm=BEND)
+IMAGES = (NO_ROUTE, IMAGE_LEFT)
 
 
 def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scenario:
@@ -295,27 +375,37 @@ def _checked(policy: Policy, scenario: Scenario, latency_limit_ms: float) -> Rep
     replays = getattr(policy, "controller", "") == "perfect"
     situations = [STRAIGHT, OLD_FRAME]
     if not replays:
-        situations += [LEFT, RIGHT, STANDING, LONG, BLANK]
+        situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK, *(IMAGES if cameras else ())]
     plans: dict[str, list[Plan]] = {}
     durations_ms: list[float] = []
     for situation in situations:
         driven = _drive(policy, situation, cameras, durations_ms)
         if isinstance(driven, str):
-            checks.append(Check("plans", False, driven))
+            if situation not in IMAGES and not any(
+                check.sentence.endswith(driven) for check in checks
+            ):
+                sentence = f"in the situation {situation.name!r} {driven}"
+                checks.append(Check("plans", False, sentence))
         else:
             plans[situation.name] = driven
-            checks += _plan_faults(situation, driven)
-    notes: tuple[str, ...] = ()
+            failed = {check.name for check in checks if not check.ok}
+            checks += [
+                check for check in _plan_faults(situation, driven) if check.name not in failed
+            ]
+    notes: tuple[Check, ...] = ()
     if all(check.ok for check in checks):
         straight = plans["straight"]
         checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
-        fine = "at 10 m/s a plan advances as a car does"
-        checks.append(_check("units", unit_fault(straight[0]), fine))
-        if not replays:
-            fault = side_fault(plans["left"][-1], plans["right"][-1])
-            checks.append(_check("side", fault, "no road leads to its wrong side"))
+        fine = "plans lead on along the road, in the rig frame"
+        checks.append(_check("direction", direction_fault(straight), fine))
         checks += _memory_checks(policy, cameras, straight, OLD_FRAME if replays else SLOW_LEFT)
-        notes = tuple(remarks(plans))
+        if not replays and all(check.ok for check in checks):
+            checks.append(_check("side", side_fault(plans), "no road leads to its wrong side"))
+        slow = [] if replays else _drive(policy, SLOW_LEFT, cameras, [])
+        if slow and not isinstance(slow, str):
+            fault = speed_fault(straight[0], slow[0])
+            checks.append(_check("speed", fault, "plans begin with a speed that a car can have"))
+            notes = tuple(remarks(plans))
     latency_ms = (0.0, 0.0)
     if durations_ms:
         latency_ms = (float(np.median(durations_ms)), max(durations_ms))
@@ -328,33 +418,35 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
     """Yield what the policy sees in a situation: painted frames, history, ego state and route."""
     road = PaintedRoad(situation.curvature_1pm)
 
+    def along(t_us: int) -> float:
+        return situation.speed_mps * (t_us - START_US) * 1e-6
+
     def pose(t_us: int) -> F64:
-        return T_WORLD_ROAD @ road.pose(situation.speed_mps * (t_us - START_US) * 1e-6)
+        return T_WORLD_ROAD @ road.pose(along(t_us))
 
     for step in range(situation.steps):
         now = START_US + step * STEP_US
-        times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
-        T_world_rig = pose(now)
+        shown, ahead = road, road
+        if step >= CHANGE:
+            shown = road if situation.image_1pm is None else PaintedRoad(situation.image_1pm)
+            ahead = road if situation.route_1pm is None else PaintedRoad(situation.route_1pm)
         frames = {}
         for name, camera in cameras.items():
             seen_us = now - situation.frame_age_us
-            rgb = road.image(camera, inverse(T_WORLD_ROAD) @ pose(seen_us), seed=step)
+            rgb = shown.image(camera, shown.pose(along(seen_us)), seed=step)
             rgb = np.full_like(rgb, 128) if situation.is_blank else rgb
             rgb.setflags(write=False)  # a policy that scribbles on its input is found out
             frames[name] = Frame(seen_us, name, rgb)
-        ahead = situation.speed_mps * (now - START_US) * 1e-6 + 80 / 19 * np.arange(20)
-        route = np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in ahead])
-        ego = EgoState(
-            now,
-            T_world_rig,
-            situation.speed_mps,
-            0.0,
-            situation.speed_mps * situation.curvature_1pm,
-        )
+        T_ahead_rig = ahead.pose(along(now))
+        points = [ahead.pose(along(now) + 80 / 19 * number)[:3, 3] for number in range(20)]
+        route = transform_points(inverse(T_ahead_rig), np.array(points))
+        if not situation.has_route:
+            route = np.full_like(route, np.nan)
+        yaw_rate = situation.speed_mps * situation.curvature_1pm
+        ego = EgoState(now, pose(now), situation.speed_mps, 0.0, yaw_rate)
+        times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
-        yield Observation(
-            now, frames, cameras, ego, history, transform_points(inverse(T_world_rig), route)
-        )
+        yield Observation(now, frames, cameras, ego, history, route)
 
 
 def _drive(
@@ -362,7 +454,6 @@ def _drive(
 ) -> list[Plan] | str:
     """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
-    where = f"in the situation {situation.name!r} the policy"
     plans: list[Plan] = []
     try:
         policy.reset(
@@ -374,10 +465,9 @@ def _drive(
             if step:
                 durations_ms.append(1e3 * (time.perf_counter() - began))
     except SimrunError as error:
-        return f"{where} failed: {error.message}"
+        return f"the policy failed: {error.message}"
     except Exception as error:  # whatever a foreign policy raises is a result of the check
-        at = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{where} raised {type(error).__name__}: {error} in query {len(plans) + 1} ({at.filename}:{at.lineno})"
+        return f"the policy raised in query {len(plans) + 1}: {raised(error)}"
     return plans
 
 
@@ -395,9 +485,11 @@ def _memory_checks(
     policy: Policy, cameras: dict[str, CameraSpec], straight: list[Plan], other: Situation
 ) -> list[Check]:
     """Compare fresh drives with the one that was driven first of all."""
-    again = _drive(policy, STRAIGHT, cameras, [])
+    short = replace(STRAIGHT, steps=6)
+    straight = straight[: short.steps]
+    again = _drive(policy, short, cameras, [])
     _drive(policy, other, cameras, [])  # ends elsewhere, at another speed
-    after = _drive(policy, STRAIGHT, cameras, [])
+    after = _drive(policy, short, cameras, [])
     same = "the same seed and observations give the same plans"
     apart = difference(straight, again)
     if apart > 0:

@@ -24,6 +24,7 @@ DASH_M = 3.0
 PERIOD_M = 9.0
 NOISE = 4.0  # grey levels
 SUPERSAMPLE = 2
+MOST_PX = 640
 
 
 def pinhole_camera(
@@ -95,10 +96,13 @@ class PaintedRoad:
         return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
 
     def painted(self, camera: CameraSpec, T: F64) -> F32:
-        """Draw the road at `SUPERSAMPLE` times the camera's size, seen from the pose ``(4, 4)``."""
+        """Draw the road at `SUPERSAMPLE` times the camera's size, or at `MOST_PX` columns, seen
+        from the pose ``(4, 4)``.
+        """
         K, rotation = camera.K, T[:3, :3]
-        u = (np.arange(camera.width * SUPERSAMPLE) + 0.5) / SUPERSAMPLE
-        v = (np.arange(camera.height * SUPERSAMPLE) + 0.5) / SUPERSAMPLE
+        scale = min(SUPERSAMPLE, MOST_PX / camera.width)
+        u = (np.arange(round(camera.width * scale)) + 0.5) / scale
+        v = (np.arange(round(camera.height * scale)) + 0.5) / scale
         # A ray is linear in the pixel: one outer sum per axis.
         across, down = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
         ray = [

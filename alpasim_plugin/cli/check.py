@@ -124,7 +124,7 @@ def check_policy(
             {"check": check.name, "ok": check.ok, "found": check.sentence}
             for check in report.checks
         ],
-        "notes": report.notes,
+        "notes": [note.sentence for note in report.notes],
         "latency_ms": dict(zip(("p50", "max"), report.latency_ms, strict=True)),
     }
     show(as_json, facts, *str(report).splitlines())

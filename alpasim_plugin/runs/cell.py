@@ -201,12 +201,14 @@ def _failure(error: Exception, folder: Path) -> dict[str, Any]:
 
 
 def _log_traceback(error: Exception, folder: Path) -> None:
-    """Add the traceback of what failed first to the log of the rollout, which the terminal
-    names.
+    """Add the traceback of what failed first to the log of the rollout, which the terminal names;
+    not of an error of ours, whose text says all.
     """
     cause = error
     while isinstance(cause.__cause__, Exception):
         cause = cause.__cause__
+    if isinstance(cause, SimrunError):
+        return
     text = "".join(traceback.format_exception(cause))
     with (
         suppress(OSError),

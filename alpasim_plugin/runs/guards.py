@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import sysconfig
-import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from alpasim_plugin.core.blame import raised
 from alpasim_plugin.core.errors import PolicyError, RendererError, SimrunError
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 
-LIBRARIES = (
-    "site-packages",
-    sysconfig.get_paths()["stdlib"],
-)  # in the paths of files that are nobody's own
 CHECK = "simrun check policy finds all faults of a policy"
 TRACEBACK = "see the traceback in output.log of the rollout"
 
@@ -69,19 +64,6 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
     if "black" not in frame.events and is_black(frame.rgb):
         return replace(frame, events=(*frame.events, "black"))
     return frame
-
-
-def raised(error: Exception) -> str:
-    """Name an error of a foreign part with the line of that part at which it was raised, or from
-    which a library was called.
-    """
-    frames = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)[1:]
-        if not any(part in frame.filename for part in LIBRARIES)
-    ]
-    where = f" at {frames[-1].filename}:{frames[-1].lineno}, in {frames[-1].name}" if frames else ""
-    return f"{type(error).__name__}: {error}{where}"
 
 
 def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:

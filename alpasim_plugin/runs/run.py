@@ -25,6 +25,7 @@ from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import RunPlan
+from alpasim_plugin.runs.policy_checks import check_policies
 from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
@@ -133,11 +134,14 @@ def execute_run(
         how = HowToRun(threads, resume, limit_s, executor)
         if threads.workers > 1:
             Thread(target=_load_ending, daemon=True).start()
+        known = held.get("policy_checks") or {}
         try:
+            checks = check_policies(plan, known, how, progress.noticed)
             manifests = execute(plan, root, how, on_done(progress), progress.noticed)
             wall_s = time.perf_counter() - began
             more: dict[str, Any] = {
-                "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))}
+                "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))},
+                "policy_checks": checks,
             }
             if repeat:
                 more["repeat"] = repeat_rollout(plan, root, manifests, how.cores_here)

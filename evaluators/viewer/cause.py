@@ -45,6 +45,7 @@ from evaluators.viewer.drive_data import (
     recorded_drive,
     user_data,
 )
+from evaluators.viewer.evidence import plan_facts
 from evaluators.viewer.page import as_json, fill
 from evaluators.viewer.pictures import frame_rows, jpeg, seen_before
 
@@ -168,12 +169,17 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -
     partings = [
         _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
     ]
-    outcome = in_words(outcomes_of(rollout))
-    sentences = list(_checked(run, rollout))
+    outcomes = outcomes_of(rollout)
+    outcome = in_words(outcomes)
+    breaches, notes = _checked(run, rollout)
+    sentences = list(breaches)
     if not rollout.ok:
         outcome = f"{rollout.failure_class}: {rollout.failure}"
-        sentences = [*last_output(run.folder / rollout.path / OUTPUT_NAME), *sentences]
-    sentences += behind_others(run, rollout)
+        said = last_output(run.folder / rollout.path / OUTPUT_NAME)
+        sentences = [*(sentences or [rollout.failure]), *said]
+    sentences += [*behind_others(run, rollout), *notes]
+    if log is not None and rollout.ok and failed_us is not None:
+        sentences += plan_facts(log, failed_us, outcomes, _met(run, rollout))
     for one in partings:
         at_s = (one.t_us - start_us) * 1e-6
         sentences.append(
@@ -209,9 +215,34 @@ def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
         return None  # it broke off before there was anything to show
 
 
-def _checked(run: Run, rollout: Rollout) -> list[str]:
-    """Return what the check of the policy found before the run drove."""
-    return list((run.info.get("policy_checks") or {}).get(rollout.policy) or ())
+# Notes of a check, and the outcomes beside which they are shown.
+TELLING = {
+    "lag": tuple(OUTCOMES),
+    "images": ("collision_any", "collision_at_fault", "offroad", "wrong_lane", "left_route"),
+    "route_rig": ("offroad", "wrong_lane", "left_route"),
+    "standstill": ("stalled",),
+}
+
+
+def _checked(run: Run, rollout: Rollout) -> tuple[list[str], list[str]]:
+    """Return what the check of the policy found before the run: breaches, and the notes that are
+    telling beside the outcome.
+    """
+    checks = (run.info.get("policy_checks") or {}).get(rollout.policy) or {}
+    had = outcomes_of(rollout)
+    notes = sorted(checks.get("notes") or (), key=lambda note: note[0] != "lag")
+    telling = [note for note in notes if had & {*TELLING.get(note[0], ())}]
+    breaches, shown = (
+        [f"Check of the policy before the run: {text}." for _, text in found]
+        for found in (checks.get("breaches") or (), telling)
+    )
+    return breaches, shown
+
+
+def _met(run: Run, rollout: Rollout) -> str:
+    """Return the road user of the first contact; empty where there is none."""
+    contacts = run.manifest(rollout).get("contacts") or ()
+    return str(contacts[0]["actor_id"]) if contacts else ""
 
 
 def failed_at(manifest: Mapping[str, Any]) -> int | None:

@@ -17,9 +17,12 @@ from alpasim_plugin.core import parts
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.run import execute_run
-from evaluators.viewer.cause import failed_at
+from evaluators.opening import read_run
+from evaluators.viewer.cause import cause_of, failed_at
 from scenarios.suite import expand
+from tests.runs.faulty_policies import CAUSES, FAULTS
 from tests.runs.grey_renderer import GREY
 from tests.runs.test_runs import Announced
 
@@ -251,3 +254,31 @@ def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
     assert text["speed"] == "7.25"
     assert text["net"] == "not shown: object"
     assert "not shown" in text["gaps"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_no_page_names_a_false_cause_and_most_show_the_right_evidence_first(
+    tmp_path: Path,
+) -> None:
+    bend = BEND.replace("length_m: 12", "length_m: 30").replace("3_000_000", "6_000_000")
+    (tmp_path / "bend.yaml").write_text(bend)
+    missed = []
+    for scenario, faults in FAULTS.items():
+        renderer, source = ("clean", scenario)
+        if scenario == "bend":
+            renderer, source = (GREY, str(tmp_path / "bend.yaml"))
+        names = {f"tests.runs.faulty_policies:{one.__name__}": word for one, word in faults.items()}
+        plan = make_plan(expand(source), (renderer,), tuple(names), (0,), RunOptions())
+        folder = tmp_path / scenario.replace("/", "-")
+        execute_run(plan, folder, 1, ["simrun"], Announced())
+        read = read_run(folder)
+        for one in read.rollouts:
+            sentences = cause_of(read, one, divergences_of(read, one)).sentences
+            word = names[one.policy]
+            if not sentences or word not in sentences[0]:
+                missed.append(one.policy)
+            for sentence in sentences:
+                named = [cause for cause in CAUSES if cause in sentence and cause not in word]
+                assert not named or word in sentence, (one.policy, sentence)
+    assert len(missed) <= 2, missed

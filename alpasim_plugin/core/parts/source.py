@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
+from alpasim_plugin.core.blame import raised
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256, read_bytes
 
@@ -194,7 +195,7 @@ def load(target: str, kind: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
-        raise InputError(f"{kind} {target!r}: {type(error).__name__}: {error}", DO_THIS) from error
+        raise InputError(f"{kind} {target!r}: {raised(error)}", DO_THIS) from error
 
 
 def make_importable(target: str) -> str:

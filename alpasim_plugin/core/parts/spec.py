@@ -16,6 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from alpasim_plugin.core import interfaces
+from alpasim_plugin.core.blame import raised
 from alpasim_plugin.core.errors import (
     EvaluatorError,
     FixerError,
@@ -198,7 +199,7 @@ def build(spec: PartSpec, **known: Any) -> Any:
         raise
     except Exception as error:  # a part of any origin: the cause is chained
         raise ERRORS.get(spec.kind, InputError)(
-            f"{spec.kind} {spec.name!r}: {type(error).__name__}: {error}",
+            f"{spec.kind} {spec.name!r}: {raised(error)}",
             "run with --debug for the traceback",
         ) from error
     return complete(part, kind.interface, f"{spec.kind} {spec.name!r}")

@@ -43,6 +43,14 @@ class MetricFacts(TypedDict):
     help: str
 
 
+class PolicyCheck(TypedDict):
+    """What the check of a policy found before the run: names and sentences."""
+
+    digest: str | None
+    breaches: list[list[str]]
+    notes: list[list[str]]
+
+
 class RunInfo(TypedDict, total=False):
     """``run.json``."""
 
@@ -57,6 +65,7 @@ class RunInfo(TypedDict, total=False):
     outcome: dict[str, int]
     rollouts: list[str]
     repeat: Facts
+    policy_checks: dict[str, PolicyCheck]
     command: list[str]
     version: str
     started_at: str
