@@ -9,6 +9,7 @@ accepted; the plan is in time. Notes say which inputs the plan follows, and how 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -162,8 +163,8 @@ def speed_fault(fast: Plan, slow: Plan) -> str:
     begins_mps = []
     for plan in (fast, slow):
         t_s = (plan.times_us - plan.times_us[0]) * 1e-6
-        xy = [np.interp(BEGIN_S, t_s, plan.xy[:, axis]) for axis in (0, 1)]
-        begins_mps.append(float(np.hypot(*xy)) / BEGIN_S)
+        x, y = (float(np.interp(BEGIN_S, t_s, plan.xy[:, axis])) for axis in (0, 1))
+        begins_mps.append(math.hypot(x, y) / BEGIN_S)
     at_fast, at_slow = begins_mps[0] / STRAIGHT.speed_mps, begins_mps[1] / SLOW_LEFT.speed_mps
     where = f"at 10 m/s plans begin with {begins_mps[0]:.4g} m/s, at 4 m/s with {begins_mps[1]:.4g}"
     unit = unit_guess(at_fast)

@@ -36,7 +36,7 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
     }
     for name, value in debug.items():
         kind = kind_of(name, value)
-        array = np.asarray(value) if kind != "text" else np.empty(0)
+        array: Any = np.asarray(value) if kind != "text" else None
         if kind == "text":
             shown: list[Any] = [_words(value)]
         elif kind == "images":

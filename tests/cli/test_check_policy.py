@@ -67,9 +67,17 @@ def test_a_policy_that_prints_leaves_one_document_on_stdout(
     printed = capsys.readouterr()
     document = json.loads(printed.out)
     assert document["ok"]
-    assert {"sensors", "values", "times", "frame", "units", "side", "determinism", "reset"} <= {
-        row["check"] for row in document["checks"]
-    }
+    assert {
+        "sensors",
+        "values",
+        "times",
+        "frame",
+        "direction",
+        "side",
+        "speed",
+        "determinism",
+        "reset",
+    } <= {row["check"] for row in document["checks"]}
     assert "planning" in printed.err
 
 
