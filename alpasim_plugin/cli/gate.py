@@ -104,7 +104,7 @@ def gate(
         preset,
         repeatable,
     )
-    files = write_gate_files(verdict, source, stored_run, out or run, rows)
+    files = write_gate_files(verdict, source, stored_run, out or run)
     if out is None and (run / PAGES[0]).is_file():
         write_reports(run, flips=read_run_json(run).get("kind") != "score")
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}

@@ -6,7 +6,6 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.escape import markdown as escape
@@ -15,7 +14,6 @@ from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.core.reading import exists, read_text
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.sides import Row
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run, read_run
@@ -243,9 +241,7 @@ def _properties(parent: ET.Element, values: Mapping[str, str]) -> None:
             ET.SubElement(holder, "property", {"name": clean(name), "value": clean(value)})
 
 
-def gate_md(
-    verdict: GateVerdict, gate: str, run: str, worst: Sequence[Mapping[str, Any]] = ()
-) -> str:
+def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:
     """Render a verdict as Markdown: heading, what led to it, every check, the scenes that did
     worst.
 
@@ -253,7 +249,6 @@ def gate_md(
         verdict: What `judge` gave.
         gate: Name or file of the gate.
         run: Name or folder of the run.
-        worst: As `evaluators.report.gate.worst_of` gives it.
     """
     parts = [
         f"## Gate: {verdict.outcome.title}\n\n",
@@ -270,7 +265,7 @@ def gate_md(
         head = ["metric", "renderer", "result", "rule", "numbers"]
         parts.append(f"\n{table(head, checks)}")
     pairs = []
-    for pair in worst:
+    for pair in worst_of(verdict.as_dict()["checks"]):
         variant = f"{pair['renderer']}/{pair['policy']}"
         names = [pair["scene"], variant, str(pair["seed"]), pair["metric"]]
         pairs.append([*names, short(pair["was"]), short(pair["now"])])
@@ -283,18 +278,16 @@ def gate_md(
     return "".join(parts)
 
 
-def write_gate_files(
-    verdict: GateVerdict, gate: str, run: Run, folder: Path, stored: Sequence[Row] | None = None
-) -> list[Path]:
+def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) -> list[Path]:
     """Write ``gate.md``, ``gate.junit.xml`` and in the run folder ``gate.json``; append the
     Markdown to what $GITHUB_STEP_SUMMARY names.
 
     Raises:
         InfrastructureError: The disk refused.
     """
-    worst = worst_of(run, verdict, stored)
-    text = gate_md(verdict, gate, str(run.folder), worst)
-    text += "\n" + overview_md(overview_of(run), "###")
+    text = gate_md(verdict, gate, str(run.folder))
+    text += "
+" + overview_md(overview_of(run), "###")
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text))
@@ -302,7 +295,7 @@ def write_gate_files(
     append_job_summary(text)
     if folder.resolve() != run.folder.resolve():
         return [page, tests]
-    return [page, tests, write_gate(run, verdict, gate, worst)]
+    return [page, tests, write_gate(run, verdict, gate)]
 
 
 def append_job_summary(text: str) -> Path | None:

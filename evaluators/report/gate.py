@@ -12,12 +12,9 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
-from alpasim_plugin.log.run_folder.sides import Row, value_of
 from evaluators.opening import Run
 from evaluators.report.numbers import DASH, short
-from evaluators.statistics.baselines import rows_of_run
-from evaluators.statistics.gate import Check, GateVerdict
-from evaluators.statistics.variants import Variant, short_name
+from evaluators.statistics.gate import GateVerdict
 from evaluators.statistics.verdicts import WORDS
 
 GATE_NAME = "gate.json"
@@ -26,47 +23,29 @@ TONES = {"pass": "better", "regression": "worse", "undecided": "unclear"}
 CAUSES_FIRST = ("regression", "undecided")
 
 
-def write_gate(
-    run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mapping[str, Any]]
-) -> Path:
+def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
     """Keep a verdict in the run folder, for its report, and return the file.
 
     Args:
         run: The run that was judged.
         verdict: What `evaluators.statistics.gate.judge` gave.
         gate: Name or file of the gate.
-        worst: As `worst_of` gives it.
     """
     path = run.folder / GATE_NAME
-    head = {"of": _content(run), "gate": gate, "worst": list(worst)}
-    write_json(path, head | verdict.as_dict())
+    write_json(path, {"of": _content(run), "gate": gate} | verdict.as_dict())
     return path
 
 
-def worst_of(
-    run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None
-) -> list[dict[str, Any]]:
+def worst_of(checks: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the pairs that did worst in every check that did not pass, once each, those of a shown
-    regression first.
-
-    Args:
-        run: The run.
-        verdict: Of a gate.
-        stored: Rows of a stored baseline.
+    regression first; ``checks`` are those of `GateVerdict.as_dict`.
     """
-    rows = rows_of_run(run)
-    base_rows = rows if stored is None else stored
-    checks = sorted(
-        (check for check in verdict.checks if check.cause != "pass"),
-        key=lambda check: check.cause != "regression",
-    )
     pairs: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for check in checks:
-        for pair in _worst_pairs(check, run, rows, base_rows):
-            key = tuple(pair[name] for name in ("metric", "renderer", "policy", "scene", "seed"))
-            known = pairs.setdefault(key, pair)
-            if known["was"] is None:  # a limit has no baseline, the margin of the same metric has
-                known["was"] = pair["was"]
+    for check in sorted(checks, key=lambda check: check["cause"] != "regression"):
+        if check["cause"] != "pass":
+            of = {name: check[name] for name in ("metric", "renderer", "policy")}
+            for pair in check["entry"]["worst"][:WORST]:
+                pairs.setdefault((*of.values(), pair["scene"], pair["seed"]), of | pair)
     return list(pairs.values())
 
 
@@ -75,44 +54,6 @@ def _content(run: Run) -> str:
     return str(
         checksums_of(table_path(run.folder, ROLLOUTS).parent, [ROLLOUTS])[ROLLOUTS]["sha256"]
     )
-
-
-def _worst_pairs(
-    check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence[Row]
-) -> list[dict[str, Any]]:
-    """Return the pairs in which a variant did worst against its baseline, or its worst rollouts
-    where a limit is broken.
-    """
-    variant = Variant(check.renderer, check.policy)
-    sign = -1.0 if run.table.info(check.metric).direction == "higher" else 1.0
-    before: dict[tuple[Any, Any], float | None] = {}
-    if check.kind == "margin":
-        for row in base_rows:
-            base = Variant(str(row["renderer"]), str(row["policy"]))
-            if short_name(base, variant) == check.entry["baseline"]:
-                before[row["scene"], row["seed"]] = value_of(row, check.metric)
-    found: list[dict[str, Any]] = []
-    for row in rows:
-        if (row["renderer"], row["policy"]) != (check.renderer, check.policy):
-            continue
-        now = value_of(row, check.metric)
-        was = before.get((row["scene"], row["seed"]))
-        if now is None or (was is None and check.kind == "margin"):
-            continue
-        found.append(
-            {
-                "scene": str(row["scene"]),
-                "seed": int(row["seed"]),
-                "was": was,
-                "now": now,
-                "worse": sign * (now - (was or 0.0)),
-                "metric": check.metric,
-                "renderer": check.renderer,
-                "policy": check.policy,
-            }
-        )
-    worse = [pair for pair in found if pair["worse"] > 0.0]
-    return sorted(worse, key=lambda pair: -pair["worse"])[:WORST]
 
 
 def gate_section(run: Run) -> dict[str, Any] | None:
@@ -135,7 +76,7 @@ def gate_section(run: Run) -> dict[str, Any] | None:
         stored["checks"], key=lambda check: (order.get(check["cause"], 2), not check["binding"])
     )
     worst = []
-    for pair in stored["worst"]:
+    for pair in worst_of(stored["checks"]):
         unit = run.table.shown(pair["metric"]).unit
         was = DASH if pair["was"] is None else short(pair["was"], unit)
         cell = (pair["renderer"], pair["policy"], pair["scene"], pair["seed"])

@@ -35,6 +35,7 @@ from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (
     LISTED,
+    ROUNDING,
     Change,
     chances,
     change_of,
@@ -384,6 +385,14 @@ class _Pair:
     label: str
     against: str
 
+    def check(
+        self, metric: MetricInfo, cause: Cause, text: str, entry: Mapping[str, Any], binding: bool
+    ) -> Check:
+        """Make the check of a metric."""
+        renderer, policy = self.variant.renderer, self.variant.policy
+        sentence = f"{renderer}: {metric.name} against {self.against}: {text}"
+        return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
+
 
 def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
     """Test what others of the population may show.
@@ -410,7 +419,8 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
         if entry["n_missing"] > spec.max_missing * (entry["n_cells"] + entry["n_missing"]):
             cause = "incomplete"
         text = f"{difference_text(entry, metric)}: {entry['verdict']}"
-        checks.append(_check(pair, metric, cause, text, entry, binding))
+        entry["worst"] = change_of(pair.side, pair.base, metric, margin, ()).worst()
+        checks.append(pair.check(metric, cause, text, entry, binding))
     return checks
 
 
@@ -428,7 +438,7 @@ def _of_suite(
         margin = rules[name].margin if name in rules else None
         accepted = metric.accepted if margin is None else margin
         changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
-    is_equal = not any(change.diff.any() or change.cut for change in changes)
+    is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
     p_values: Sequence[float | None] = [None] * len(changes)
     if is_noisy and not is_equal:
         p_values = chances(changes)
@@ -448,74 +458,64 @@ def _suite_check(
     metric = change.metric
     max_new = spec.max_new if rule.max_new is None else rule.max_new
     verdict = verdict_of(change, p, max_new)
-    mean = -change.mean if metric.direction == "higher" else change.mean
-    n_missing = len(change.missing)
+    n_cells, n_missing = int(np.sum(change.is_pair)), len(change.missing)
+    if metric.is_flag:
+        counts = {"new": change.n_new, "gone": change.n_gone}
+    else:
+        counts = {"worse": int(np.sum(change.beyond(change.margin)))}
+        counts["better"] = int(np.sum(change.harms[0] < -change.margin - ROUNDING))
+    n_equal = n_cells - int(np.sum(change.harms[0] != 0.0))
     entry = {
         "baseline": pair.label,
-        "diff": mean,
+        "diff": -change.mean if metric.direction == "higher" else change.mean,
         "margin": change.margin,
         "max_new": max_new,
         "p_value": p,
         "verdict": verdict,
-        "unit": metric.unit,
-        "direction": metric.direction,
-        "n_cells": len(change.cells),
-        "n_scenes": len(change.scenes[0]),
+        "n_cells": n_cells,
+        "n_scenes": len(change.by_scene(change.now)),
         "n_missing": n_missing,
         "n_neither": change.n_neither,
-        "n_far": 0 if metric.is_flag and p is None else len(change.far_scenes),
-        "counts": change.counts(),
+        "n_far": 0 if metric.is_flag and p is None else change.n_far,
+        "counts": counts | {"equal": n_equal},
         "worst": change.worst(),
-        "cut": [f"{scene} seed {seed}" for _, scene, seed in change.cut],
-        "missing": [
-            {"scene": scene, "seed": seed, "why": why}
-            for (_, scene, seed), why in list(change.missing.items())[:LISTED]
+        "cut": [
+            f"{scene} seed {seed}"
+            for (_, scene, seed), is_cut in zip(change.side.cells, change.is_cut, strict=True)
+            if is_cut
         ],
+        "missing": change.missing[:LISTED],
         "seeds": seeds_that_decide(change) if verdict == "undecided" else None,
     }
-    text = change_text(entry, metric)
-    cause = CAUSES[verdict]
-    n_scenes = len({scene for _, scene, _ in (*change.cells, *change.cut)})
-    is_missing = n_missing > spec.max_missing * (len(change.cells) + n_missing)
-    if is_missing:
+    text, cause = change_text(entry, metric), CAUSES[verdict]
+    is_missing = n_missing > spec.max_missing * (n_cells + n_missing)
+    n_scenes = len({pair.side.scene[i] for i in np.flatnonzero(change.is_pair | change.is_cut)})
+    if is_missing or n_scenes < spec.min_scenes:
         cause = "incomplete"
-    elif n_scenes < spec.min_scenes:
-        cause = "incomplete"
-        text += f"; {plural(n_scenes, 'scene')}, the gate asks for {spec.min_scenes}"
+        text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
     binding = rule.must_decide or is_missing or cause == "regression"
-    return _check(pair, metric, cause, text, entry, binding)
-
-
-def _check(
-    pair: _Pair,
-    metric: MetricInfo,
-    cause: Cause,
-    text: str,
-    entry: Mapping[str, Any],
-    binding: bool,
-) -> Check:
-    renderer, policy = pair.variant.renderer, pair.variant.policy
-    sentence = f"{renderer}: {metric.name} against {pair.against}: {text}"
-    return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
+    return pair.check(metric, cause, text, entry, binding)
 
 
 def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -> Check:
     values = side.values(metric.name)
     known = values[np.isfinite(values)]
-    bounds = {"max": rule.max, "min": rule.min}
-    limits = " and ".join(
-        f"{kind} {value:g}" for kind, value in bounds.items() if value is not None
-    )
+    mean = float(known.mean()) if len(known) else None
     cause: Cause = "incomplete"
-    mean, text = None, f"no valid value, its limit is {limits}"
-    if len(known):
-        mean = float(known.mean())
+    if mean is not None:
         is_above = rule.max is not None and mean > rule.max
         is_below = rule.min is not None and mean < rule.min
         cause = "regression" if is_above or is_below else "pass"
-        text = f"{short(mean, metric.unit)}, limit {limits}"
+    bounds = {"max": rule.max, "min": rule.min}
+    limits = " and ".join(f"{kind} {end:g}" for kind, end in bounds.items() if end is not None)
+    found = "no valid value" if mean is None else short(mean, metric.unit)
+    text = f"{variant.renderer}: {metric.name} {found}, limit {limits}"
+    worst = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
     entry = {"mean": mean, **bounds, "n_rollouts": len(known)}
-    text = f"{variant.renderer}: {metric.name} {text}"
+    entry["worst"] = [
+        {"scene": side.cells[i][1], "seed": side.cells[i][2], "was": None, "now": values[i]}
+        for i in worst[:LISTED]
+    ]
     binding = rule.must_decide or cause == "regression"
     return Check(
         variant.renderer, variant.policy, metric.name, "limit", cause, text, entry, binding

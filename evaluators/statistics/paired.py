@@ -423,34 +423,35 @@ class Pairs:
     """Cells with a value on both sides, and those without."""
 
     def __init__(self, side: Side, base: Side, metric: str) -> None:
-        own_values, base_values = side.values(metric), base.values(metric)
-        index = side.place_in(base)
+        here, there = side.values(metric), base.values(metric)
+        self.index = side.place_in(base)
+        self.here = here
         # The last value stands for cells that the base does not have: index -1.
-        partner = np.append(base_values, np.nan)[index]
-        both: Bool = np.isfinite(own_values) & np.isfinite(partner)
-        self.mine = own_values[both]
-        self.base = partner[both]
-        self.scenes = side.scene[both]
-        self._index = index
-        self._sides = {"here": (side, own_values), "baseline": (base, base_values)}
-        only_base = np.flatnonzero(base.place_in(side) < 0)
-        self._lone = ((side, np.flatnonzero(~both)), (base, only_base))
-        self.n_missing = int(np.sum(~both)) + len(only_base)
+        self.there = np.append(there, np.nan)[self.index]
+        self.both: Bool = np.isfinite(self.here) & np.isfinite(self.there)
+        self.mine, self.base = self.here[self.both], self.there[self.both]
+        self.scenes = side.scene[self.both]
+        self._sides = {"here": (side, here), "baseline": (base, there)}
+        self.only_base = np.flatnonzero(base.place_in(side) < 0)
+        self.n_missing = int(np.sum(~self.both)) + len(self.only_base)
 
     def of_event(self, event: str) -> tuple[F64, I64]:
         """Return the change of a flag on the cells where both sides have it, and their scenes."""
         (side, _), (base, _) = self._sides.values()
-        change = side.values(event) - np.append(base.values(event), np.nan)[self._index]
+        change = side.values(event) - np.append(base.values(event), np.nan)[self.index]
         known = np.isfinite(change)
         return change[known], side.scene[known]
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
         """Name the first cells without a pair, with side and cause."""
+        (side, _), (base, _) = self._sides.values()
         # Both sides are sorted already.
-        cells = [side.cells[i] for side, places in self._lone for i in places[:listed].tolist()]
-        return [self._cause(cell, metric) for cell in sorted(cells)[:listed]]
+        cells = [side.cells[i] for i in np.flatnonzero(~self.both)[:listed].tolist()]
+        cells += [base.cells[i] for i in self.only_base[:listed].tolist()]
+        return [self.cause(cell, metric) for cell in sorted(cells)[:listed]]
 
-    def _cause(self, cell: Cell, metric: str) -> dict[str, Any]:
+    def cause(self, cell: Cell, metric: str) -> dict[str, Any]:
+        """Name a cell without a pair, with side and cause."""
         policy, scene, seed = cell
         causes = {
             name: side.why_missing(cell, metric, values)

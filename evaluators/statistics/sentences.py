@@ -65,51 +65,35 @@ def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
     """Say what changed on a suite, and where.
 
     Args:
-        entry: The ``entry`` of a check of `evaluators.statistics.gate`.
+        entry: Of a check of `evaluators.statistics.gate`.
         metric: What was compared.
     """
-    counts, n = entry["counts"], plural(entry["n_cells"], "pair")
     scale, unit = scale_and_unit(metric, metric.unit)
-    if metric.is_flag:
-        allowed = f" ({entry['max_new']} new accepted)" if entry["max_new"] else ""
-        text = f"{counts['new']} new, {counts['gone']} gone in {n}{allowed}"
-        where = [f"{cell['scene']} seed {cell['seed']}" for cell in entry["worst"]]
-        parts = [text, f"new in {_some(where)}" if where else ""]
-    else:
-        mean = _signed(entry["diff"] * scale, unit)
-        text = f"{mean} on average (margin {short(entry['margin'] * scale, unit)})"
-        sides = f"{counts['worse']} worse by more than the margin, {counts['better']} better"
-        if metric.direction == "none":
-            sides = f"{counts['worse']} changed by more than the margin"
-        sides += f", {counts['equal']} equal of {n}"
-        worst = [
-            f"{scene['scene']} {_signed(scene['diff'] * scale, unit)}" for scene in entry["worst"]
-        ]
-        is_named = entry["verdict"] != "non-inferior" and worst
-        parts = [text, sides, f"worst in {_some(worst)}" if is_named else ""]
+    counts = ", ".join(f"{n} {name}" for name, n in entry["counts"].items())
+    parts = [f"{counts} of {plural(entry['n_cells'], 'pair')}"]
+    if not metric.is_flag:
+        mean, margin = (f"{entry[key] * scale:.3g} {unit}".rstrip() for key in ("diff", "margin"))
+        parts.insert(0, f"{mean} on average, margin {margin}")
+    if entry["worst"] and entry["verdict"] != "non-inferior":
+        parts.append(f"worst in {_some([_place(pair) for pair in entry['worst']])}")
     if entry["n_far"]:
         parts.append(f"{plural(entry['n_far'], 'scene')} beyond three margins")
     if entry["cut"]:
-        parts.append(f"not compared where an event ended one side only: {_some(entry['cut'])}")
+        parts.append(f"not compared, as an event ended one side: {_some(entry['cut'])}")
     if entry["n_neither"]:
         parts.append(f"no value on either side in {plural(entry['n_neither'], 'pair')}")
     if entry["missing"]:
         first = entry["missing"][0]
-        where = f"{first['scene']} seed {first['seed']}"
-        missing = plural(entry["n_missing"], "rollout has", "rollouts have")
-        parts.append(f"{missing} no pair, such as {where}: {first['why']}")
+        missing = f"{plural(entry['n_missing'], 'pair')} missing"
+        parts.append(f"{missing}, first {_place(first)} ({first['why']})")
     if entry["verdict"] == "undecided":
-        seeds = entry["seeds"]
-        parts.append(
-            f"about {plural(seeds, 'seed')} a scene would decide"
-            if seeds
-            else "more seeds that show the same would not decide"
-        )
-    return "; ".join(part for part in parts if part)
+        seeds = plural(entry["seeds"], "seed") if entry["seeds"] else "more seeds"
+        parts.append(f"{seeds} a scene would show whether this is chance")
+    return "; ".join(parts)
 
 
-def _signed(value: float, unit: str) -> str:
-    return f"{fixed(value, decimals(value), sign=True)}\u00a0{unit}".strip("\u00a0")
+def _place(pair: Mapping[str, Any]) -> str:
+    return f"{pair['scene']} seed {pair['seed']}"
 
 
 def _some(names: list[str]) -> str:

@@ -17,124 +17,103 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
-from alpasim_plugin.log.run_folder.sides import Cell, Side
-from evaluators.statistics.intervals import TAIL, cluster_means
-from evaluators.statistics.verdicts import Verdict, flipped_sums, scenes_needed
+from alpasim_plugin.log.run_folder.sides import Side
+from evaluators.statistics.intervals import TAIL, cluster_means, exact_rate
+from evaluators.statistics.paired import Pairs
+from evaluators.statistics.verdicts import Verdict, flipped_sums
 
 ROUNDING = 1e-9  # a smaller difference, relative, may come from another processor
 SCENE_MARGINS = 3.0  # that one scene may be worse
 LISTED = 50  # cells named of a check; counts are always whole
 EVENT_LEVEL = 2.0**-6  # six of six
 LEVEL = TAIL - EVENT_LEVEL  # of the other metrics
-MOST_SEEDS = 200
+MOST_SEEDS = 100  # that are asked for
 
 
 @dataclass(frozen=True)
 class Change:
-    """One metric in the cells of two variants.
+    """One metric of a variant and of its baseline.
 
     Attributes:
         metric: The metric.
         margin: How much worse is accepted, in its unit.
-        cells: ``(N,)`` cells with a value on both sides.
-        diff: ``(N,)`` variant minus baseline there, 0 where they are equal but for rounding.
-        cut: Cells that an event has ended on one side only, where a value over part of a rollout
-            would meet one over the whole.
+        side: The variant, whose C cells (scene and seed) the arrays are about.
+        was, now: ``(C,)`` values of baseline and variant; NaN where there is none.
+        is_pair: ``(C,)`` cells that are compared.
+        is_cut: ``(C,)`` cells that an event has ended on one side only, where a value over part of
+            a rollout would meet one over the whole.
         n_neither: Cells in which the metric has no value on either side.
-        missing: Cells without a pair -> why.
+        missing: Cells without a pair, and why.
     """
 
     metric: MetricInfo
     margin: float
-    cells: tuple[Cell, ...]
-    diff: F64
-    cut: tuple[Cell, ...]
+    side: Side
+    was: F64
+    now: F64
+    is_pair: Bool
+    is_cut: Bool
     n_neither: int
-    missing: Mapping[Cell, str]
+    missing: Sequence[Mapping[str, Any]]
 
     @property
-    def harm(self) -> F64:
-        """Give the differences ``(N,)`` with the sign that makes positive worse; their size where
-        any change of a flag without a better side counts.
+    def harms(self) -> list[F64]:
+        """Give the differences ``(C,)`` with the sign that makes positive worse, 0 where there is no
+        pair; with either sign where no side is better.
         """
-        if self.metric.direction == "none" and self.metric.is_flag:
-            return np.abs(self.diff)
-        return -self.diff if self.metric.direction == "higher" else self.diff
+        diff = np.where(self.is_pair, self.now - self.was, 0.0)
+        size = np.fmax(1.0, np.fmax(np.abs(self.now), np.abs(self.was)))
+        diff[np.abs(diff) <= ROUNDING * size] = 0.0
+        if self.metric.direction == "none":
+            return [np.abs(diff)] if self.metric.is_flag else [diff, -diff]
+        return [-diff if self.metric.direction == "higher" else diff]
 
-    @property
-    def scenes(self) -> tuple[list[str], F64]:
-        """Give the scenes and the mean harm ``(G,)`` of each over its seeds."""
-        names = [scene for _, scene, _ in self.cells]
-        if not names:
-            return [], np.zeros(0)
-        return sorted(set(names)), cluster_means(self.harm, names)[0]
+    def by_scene(self, values: F64) -> F64:
+        """Return the means ``(G,)`` of values ``(C,)`` over the compared seeds of each scene."""
+        return cluster_means(values[self.is_pair], self.side.scene[self.is_pair])[0]
 
     @property
     def mean(self) -> float:
-        """Give the mean harm over scenes; 0 where no cell can be compared."""
-        _, means = self.scenes
-        return float(np.mean(means)) if len(means) else 0.0
+        """Give the mean of the first of `harms` over scenes; 0 where nothing is compared."""
+        return float(np.mean(self.by_scene(self.harms[0]))) if self.is_pair.any() else 0.0
 
     @property
     def is_beyond(self) -> bool:
-        """Tell whether the mean over scenes is beyond the margin."""
-        return self._size(self.mean) > self.margin + ROUNDING
+        """Tell whether the mean over scenes is worse than the margin."""
+        size = abs(self.mean) if len(self.harms) == 2 else self.mean
+        return size > self.margin + ROUNDING
 
     @property
-    def far_scenes(self) -> list[str]:
-        """Name the scenes that are more than `SCENE_MARGINS` margins worse, the worst first."""
-        names, means = self.scenes
-        sizes = self._size(means)
-        worst = np.argsort(-sizes, kind="stable").tolist()
-        return [names[i] for i in worst if sizes[i] > SCENE_MARGINS * self.margin + ROUNDING]
+    def n_far(self) -> int:
+        """Count the scenes that are more than `SCENE_MARGINS` margins worse."""
+        most = SCENE_MARGINS * self.margin + ROUNDING
+        return sum(int(np.sum(self.by_scene(harm) > most)) for harm in self.harms)
 
-    def _size(self, harm: Any) -> Any:
-        return np.abs(harm) if self.metric.direction == "none" else harm
+    def beyond(self, margin: float) -> Bool:
+        """Return the cells ``(C,)`` that are worse by more than a margin."""
+        return np.any([harm > margin + ROUNDING for harm in self.harms], axis=0)
 
     @property
-    def new(self) -> list[Cell]:
-        """Give the cells of a flag that have the event now and had not before; none of others."""
-        if not self.metric.is_flag:
-            return []
-        return [self.cells[i] for i in np.flatnonzero(self.harm > 0).tolist()]
+    def n_new(self) -> int:
+        """Count new events."""
+        return int(np.sum(self.beyond(0.0)))
 
     @property
     def n_gone(self) -> int:
-        """Count the cells of a flag that had the event and have it no more."""
-        return int(np.sum(self.harm < 0))
-
-    def counts(self) -> dict[str, int]:
-        """Count cells: equal, and of a flag new and gone events, else worse and better by more than
-        the margin.
-        """
-        equal = {"equal": int(np.sum(self.diff == 0))}
-        if self.metric.is_flag:
-            return equal | {"new": len(self.new), "gone": self.n_gone}
-        worse = int(np.sum(self._size(self.harm) > self.margin + ROUNDING))
-        better = self.harm < -self.margin - ROUNDING
-        return equal | {
-            "worse": worse,
-            "better": 0 if self.metric.direction == "none" else int(np.sum(better)),
-        }
+        """Count the events that the baseline had alone."""
+        return int(np.sum(self.harms[0] < 0.0))
 
     def worst(self) -> list[dict[str, Any]]:
-        """Name the cells with a new event, or the scenes that are worse with their mean difference,
-        the worst first.
-        """
-        if self.metric.is_flag:
-            return [{"scene": scene, "seed": seed} for _, scene, seed in self.new[:LISTED]]
-        names, means = self.scenes
-        sizes = self._size(means)
-        order = np.argsort(-sizes, kind="stable").tolist()
-        sign = -1.0 if self.metric.direction == "higher" else 1.0
-        return [
-            {"scene": names[i], "diff": sign * float(means[i])}
-            for i in order[:LISTED]
-            if sizes[i] > 0.0
-        ]
+        """Name the cells that are worse, the worst first."""
+        harm = np.max(self.harms, axis=0)
+        order = np.argsort(-harm, kind="stable")[: int(np.sum(harm > 0.0))]
+        return [self._named(i) for i in order[:LISTED].tolist()]
+
+    def _named(self, i: int) -> dict[str, Any]:
+        _, scene, seed = self.side.cells[i]
+        return {"scene": scene, "seed": seed, "was": self.was[i], "now": self.now[i]}
 
 
 def change_of(
@@ -148,53 +127,31 @@ def change_of(
         margin: How much worse is accepted.
         stops: Events after which the preset scores nothing.
     """
-    here, there = side.values(metric.name), base.values(metric.name)
-    index = side.place_in(base)
-    is_shared = index >= 0
-    # The last value stands for cells that the baseline does not have: index -1.
-    partner = np.append(there, np.nan)[index]
-    was_stopped = np.append(_any_of(base, stops), False)[index]
+    pairs = Pairs(side, base, metric.name)
+    is_shared = pairs.index >= 0
+    was_stopped = np.append(_any_of(base, stops), False)[pairs.index]
     is_cut = is_shared & (_any_of(side, stops) != was_stopped) & (not metric.is_flag)
-    both = np.isfinite(here) & np.isfinite(partner) & ~is_cut
-    ran = _ran(side) & np.append(_ran(base), False)[index]
-    is_neither = ran & np.isnan(here) & np.isnan(partner) & ~is_cut
-    missing = {}
-    for i in np.flatnonzero(~(both | is_cut | is_neither)).tolist():
-        missing[side.cells[i]] = _why(side.cells[i], metric.name, side, here, base, there)
-    for i in np.flatnonzero(base.place_in(side) < 0).tolist():
-        missing[base.cells[i]] = _why(base.cells[i], metric.name, side, here, base, there)
-    diff = here[both] - partner[both]
-    scale = np.maximum(1.0, np.maximum(np.abs(here[both]), np.abs(partner[both])))
+    is_pair = pairs.both & ~is_cut
+    ran = _ran(side) & np.append(_ran(base), False)[pairs.index]
+    is_neither = ran & np.isnan(pairs.here) & np.isnan(pairs.there) & ~is_cut
+    lone = [side.cells[i] for i in np.flatnonzero(~(is_pair | is_cut | is_neither)).tolist()]
+    lone += [base.cells[i] for i in pairs.only_base.tolist()]
+    missing = [pairs.cause(cell, metric.name) for cell in lone]
+    n_neither = int(np.sum(is_neither))
     return Change(
-        metric,
-        margin,
-        tuple(cell for cell, is_kept in zip(side.cells, both, strict=True) if is_kept),
-        np.where(np.abs(diff) <= ROUNDING * scale, 0.0, diff),
-        tuple(cell for cell, is_one in zip(side.cells, is_cut, strict=True) if is_one),
-        int(np.sum(is_neither)),
-        missing,
+        metric, margin, side, pairs.there, pairs.here, is_pair, is_cut, n_neither, missing
     )
 
 
 def _any_of(side: Side, events: Sequence[str]) -> Bool:
     """Tell of every cell ``(C,)`` whether one of the events happened."""
-    fired = np.zeros(len(side.cells), dtype=bool)
-    for event in events:
-        fired |= side.values(event) > 0  # a comparison with NaN is false
-    return fired
+    values = [np.zeros(len(side.cells)), *(side.values(event) for event in events)]
+    return np.any(np.array(values) > 0.0, axis=0)
 
 
 def _ran(side: Side) -> Bool:
     """Tell of every cell ``(C,)`` whether all its rollouts ran to their end."""
     return np.bincount(side.cell, weights=~side.ok, minlength=len(side.cells)) == 0
-
-
-def _why(cell: Cell, metric: str, side: Side, here: F64, base: Side, there: F64) -> str:
-    reasons = {
-        "the run": side.why_missing(cell, metric, here),
-        "the baseline": base.why_missing(cell, metric, there),
-    }
-    return "; ".join(f"{name}: {why}" for name, why in reasons.items() if why)
 
 
 def chances(changes: Sequence[Change]) -> list[float]:
@@ -204,23 +161,18 @@ def chances(changes: Sequence[Change]) -> list[float]:
     Args:
         changes: Of one variant, in all metrics that are tested.
     """
-    numbers = {cell: i for i, cell in enumerate(sorted({c for one in changes for c in one.cells}))}
     p = [1.0] * len(changes)
     for is_flag in (True, False):
-        rows, owners = [], []
-        for owner, change in enumerate(changes):
-            if change.metric.is_flag != is_flag:
-                continue
-            is_either = change.metric.direction == "none" and not is_flag
-            for sign in (1.0, -1.0) if is_either else (1.0,):
-                row = np.zeros(len(numbers))
-                places = [numbers[cell] for cell in change.cells]
-                row[places] = sign * change.harm - (0.0 if is_flag else change.margin)
-                rows.append(row)
-                owners.append(owner)
-        found = flipped(np.array(rows).reshape(len(rows), len(numbers)))
-        for owner, chance in zip(owners, found.tolist(), strict=True):
-            p[owner] = min(p[owner], chance)
+        family = [
+            (i, np.where(change.is_pair, harm - (0.0 if is_flag else change.margin), 0.0))
+            for i, change in enumerate(changes)
+            for harm in change.harms
+            if change.metric.is_flag == is_flag
+        ]
+        if family:
+            found = flipped(np.array([row for _, row in family]))
+            for (i, _), chance in zip(family, found.tolist(), strict=True):
+                p[i] = min(p[i], chance)
     return p
 
 
@@ -258,62 +210,51 @@ def verdict_of(change: Change, p: float | None, max_new: int) -> Verdict:
     """
     is_flag = change.metric.is_flag
     if p is None:
-        is_worse = len(change.new) > max_new if is_flag else change.is_beyond or change.far_scenes
+        is_worse = change.n_new > max_new if is_flag else change.is_beyond or change.n_far
         return "worse" if is_worse else "non-inferior"
-    more = len(change.new) - change.n_gone
+    more = change.n_new - change.n_gone
     if p <= EVENT_LEVEL and more > max_new if is_flag else p <= LEVEL:
         return "worse"
-    return "non-inferior" if is_within(change) and not change.far_scenes else "undecided"
+    return "non-inferior" if is_within(change) and not change.n_far else "undecided"
 
 
 def is_within(change: Change) -> bool:
-    """Tell whether a metric of a policy that is not repeatable is shown to be within its margin: its
-    upper 97.5 % bound is.
-
-    A distance takes the sign-flip test against its margin. The rate of a flag takes the bounds of
-    Clopper and Pearson of new and of gone events, which also hold where scenes have other
-    chances.
+    """Tell whether a metric of a policy that is not repeatable is shown to be within its margin: a
+    distance by the sign-flip test against it, a rate by `rate_bound`.
     """
     if change.metric.is_flag:
-        return rate_bound(len(change.new), change.n_gone, len(change.cells)) < change.margin
-    sides = [change.harm, -change.harm] if change.metric.direction == "none" else [change.harm]
-    return all(flipped((change.margin - harm)[None])[0] <= TAIL for harm in sides)
+        n = int(np.sum(change.is_pair))
+        return rate_bound(change.n_new, change.n_gone, n) < change.margin
+    rows = [np.where(change.is_pair, change.margin - harm, 0.0)[None] for harm in change.harms]
+    return all(flipped(row)[0] <= TAIL for row in rows)
 
 
-def rate_bound(new: float, gone: float, n: float) -> float:
-    """Return the upper 97.5 % bound of a rate's increase from new and gone events in n cells.
+def rate_bound(new: float, gone: float, n: int) -> float:
+    """Return an upper bound of a rate's increase from new and gone events in n cells, by the bounds
+    of Clopper and Pearson, which also hold where scenes have other chances.
 
     Example:
-        >>> round(rate_bound(0, 0, 42), 3)
-        0.099
+        >>> round(rate_bound(0, 0, 36), 3)
+        0.097
     """
-    if n == 0:
-        return 1.0
-    tail = TAIL / 2
-    upper = 1.0 if new >= n else float(scipy.special.betaincinv(new + 1, n - new, 1 - tail))
-    lower = 0.0 if gone <= 0 else float(scipy.special.betaincinv(gone, n - gone + 1, tail))
-    return upper - lower
+    return exact_rate(new, n)[1] - exact_rate(gone, n)[0] if n else 1.0
 
 
 def seeds_that_decide(change: Change) -> int | None:
-    """Return about how many seeds a scene would decide, if more of them show the same; None where
-    that is more than `MOST_SEEDS`.
+    """Return about how many seeds a scene would show that a metric is within its margin, if more of
+    them show the same; None where that is more than `MOST_SEEDS`.
     """
-    n_scenes, n = len(change.scenes[0]), len(change.cells)
-    if n == 0:
+    n, n_scenes = int(np.sum(change.is_pair)), len(change.by_scene(change.now))
+    if n < 2:
         return None
-    if change.metric.is_flag:
-        new, gone = len(change.new), change.n_gone
-        for seeds in range(1, MOST_SEEDS + 1):
-            more = seeds * n_scenes / n
-            changed = round(more * (new + gone))
-            chance = float(scipy.special.bdtr(round(more * gone), changed, 0.5))
-            within = rate_bound(more * new, more * gone, more * n) < change.margin
-            if within or (new > gone and chance <= EVENT_LEVEL):
-                return seeds
-        return None
-    spread = float(np.std(change.harm, ddof=1)) if n > 1 else 0.0
-    cells = scenes_needed(abs(change.margin - change.mean), spread)
-    least = math.ceil(math.log2(1 / LEVEL))  # signs that can refute anything
-    seeds = None if cells is None else math.ceil(max(cells, least) / n_scenes)
-    return seeds if seeds is not None and seeds <= MOST_SEEDS else None
+    for seeds in range(1, MOST_SEEDS + 1):
+        cells = seeds * n_scenes
+        more = cells / n
+        if change.metric.is_flag:
+            is_shown = rate_bound(more * change.n_new, more * change.n_gone, cells) < change.margin
+        else:
+            error = float(np.std(change.harms[0][change.is_pair], ddof=1)) / math.sqrt(cells)
+            is_shown = abs(change.mean) + 2.0 * error < change.margin and 2.0**-cells <= TAIL
+        if is_shown:
+            return seeds
+    return None

@@ -197,9 +197,9 @@ def test_a_verdict_counts_and_names_what_changed() -> None:
     checks = {check.metric: check for check in verdict.checks}
     event, distance = checks["collision_at_fault"], checks["lateral_distance_m"]
     assert event.entry["counts"] == {"equal": 10, "new": 1, "gone": 3}
-    assert event.entry["worst"] == [{"scene": "s004", "seed": 0}]
+    assert event.entry["worst"] == [{"scene": "s004", "seed": 0, "was": 0.0, "now": 1.0}]
     assert distance.entry["counts"] == {"equal": 13, "worse": 1, "better": 0}
-    assert distance.entry["worst"][0]["diff"] == pytest.approx(0.4)
+    assert [pair["scene"] for pair in distance.entry["worst"]] == ["s004"]
     for check in (event, distance):
         assert check.cause == "regression"
         assert "s004" in check.text

@@ -44,25 +44,13 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
     assert gate_section(read_run(root)) is None
 
 
-def test_what_breaks_a_limit_stands_before_what_is_undecided_and_once(
-    usual_run: Path, tmp_path: Path
-) -> None:
-    run = read_run(usual_run)
-    rows = rows_of_run(run)
-    stored = [dict(row) | {"collision_any": 0.0, "lateral_distance_m": 0.0} for row in rows]
-    rules = "version: 1\nmin_scenes: 99\nmetrics:\n  lateral_distance_m: {margin: 0.1}\n  collision_any: {margin: 0.9, max: 0}\n"
-    (tmp_path / "gate.yaml").write_text(rules)
-    spec, _ = load_gate(str(tmp_path / "gate.yaml"), run.table)
-    verdict = judge(rows, spec, stored, "before.json", run.table)
-    worst = worst_of(run, verdict, stored)
-    keys = [
-        (pair["metric"], pair["renderer"], pair["policy"], pair["scene"], pair["seed"])
-        for pair in worst
+def test_what_breaks_a_rule_is_named_once_and_before_what_is_undecided() -> None:
+    pair = {"scene": "bend", "seed": 0, "was": 0.0, "now": 1.0}
+    undecided = {"metric": "progress", "renderer": "r", "policy": "p", "cause": "undecided"}
+    broken = undecided | {"metric": "collision_any", "cause": "regression"}
+    passed = undecided | {"cause": "pass"}
+    checks = [check | {"entry": {"worst": [pair]}} for check in (passed, undecided, broken, broken)]
+    assert [(one["metric"], one["scene"]) for one in worst_of(checks)] == [
+        ("collision_any", "bend"),
+        ("progress", "bend"),
     ]
-    assert worst[0]["metric"] == "collision_any"
-    assert worst[0]["was"] == 0.0  # its limit has no baseline, its margin has
-    assert len(set(keys)) == len(keys)
-    assert {"collision_any", "lateral_distance_m"} == {pair["metric"] for pair in worst}
-    assert all(
-        " of before.json" in check.text for check in verdict.checks if check.kind == "margin"
-    )
