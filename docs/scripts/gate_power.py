@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from alpasim_plugin.core.types import F64
+from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.metrics import METRICS
 from evaluators.statistics.suite import Change, chances, verdict_of
 
@@ -75,13 +76,14 @@ CASES: dict[str, Draw] = {
 def shares(draw: Draw, scenes: int, seeds: int, runs: int) -> tuple[float, float]:
     """Return the shares of red and of green gates."""
     random = np.random.Generator(np.random.Philox(key=[scenes, seeds]))
-    cells = tuple(("p", f"s{i:02d}", seed) for i in range(scenes) for seed in range(seeds))
+    cells = [(f"s{i:02d}", seed) for i in range(scenes) for seed in range(seeds)]
+    side = Side.of([{"policy": "p", "scene": scene, "seed": seed} for scene, seed in cells])
+    every, none = np.ones(len(cells), dtype=bool), np.zeros(len(cells))
     red = green = 0
     for _ in range(runs):
-        drawn = draw(random, scenes, seeds)
         changes = [
-            Change(METRICS[name], RULES[name], cells, diff.reshape(-1), (), 0, {})
-            for name, diff in drawn.items()
+            Change(METRICS[name], RULES[name], side, none, diff.reshape(-1), every, ~every, 0, [])
+            for name, diff in draw(random, scenes, seeds).items()
         ]
         verdicts = [
             verdict_of(change, p, 0) for change, p in zip(changes, chances(changes), strict=True)

@@ -72,8 +72,8 @@ def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
     counts = ", ".join(f"{n} {name}" for name, n in entry["counts"].items())
     parts = [f"{counts} of {plural(entry['n_cells'], 'pair')}"]
     if not metric.is_flag:
-        mean, margin = (f"{entry[key] * scale:.3g} {unit}".rstrip() for key in ("diff", "margin"))
-        parts.insert(0, f"{mean} on average, margin {margin}")
+        mean, margin = entry["diff"] * scale, entry["margin"] * scale
+        parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":
         parts.append(f"worst in {_some([_place(pair) for pair in entry['worst']])}")
     if entry["n_far"]:

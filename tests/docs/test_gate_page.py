@@ -1,0 +1,72 @@
+"""The gate of docs/ci.md, word for word, on the suite that the page names, with policies whose
+drives are known: as before, worse, better, with one new collision, and not repeatable.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from evaluators.opening import read_run
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "ci.md"
+MINE = "my_policy:Mine"
+NOISY = "tests.runs.broken_policies:RemembersEarlierRollouts"
+POLICIES = ("log-replay", "constant-velocity", "pure-pursuit", NOISY)
+BASELINES = ("log-replay", "constant-velocity")
+
+
+def gate_file() -> str:
+    (text,) = re.findall(r"```yaml\n(# gate\.yaml\n.*?)```", PAGE.read_text(), re.DOTALL)
+    return text
+
+
+def workflow() -> tuple[list[str], list[str]]:
+    """Return the words of the two commands of the page's job: drive, and gate."""
+    lines = re.findall(r"- run: simrun (.*)", PAGE.read_text())
+    drive, gate = (shlex.split(line, comments=True) for line in lines)
+    return drive, gate
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drive every policy as the page does, and store two baselines."""
+    folder = tmp_path_factory.mktemp("ci")
+    (folder / "gate.yaml").write_text(gate_file())
+    drive, _ = workflow()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for policy in POLICIES:
+            words = [policy if word == MINE else word for word in drive]
+            words[words.index("runs/change")] = f"runs/{policy}"
+            assert run_command([*words, "--quiet", "--no-report", "--workers", "1"]) == 0
+        for policy in BASELINES:
+            stored = ["gate", f"runs/{policy}", "--write-baseline", f"{policy}.json"]
+            assert run_command(stored) == 0
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)  # the suite is driven four times
+@pytest.mark.parametrize(
+    ("policy", "baseline", "code"),
+    [
+        ("log-replay", "log-replay", 0),
+        ("constant-velocity", "log-replay", 1),
+        ("log-replay", "constant-velocity", 0),
+        ("pure-pursuit", "log-replay", 1),  # one new collision in 14 scenes
+        (NOISY, "log-replay", 3),
+    ],
+)
+def test_the_page_s_gate_decides_as_common_sense_does(
+    work: Path, monkeypatch: pytest.MonkeyPatch, policy: str, baseline: str, code: int
+) -> None:
+    monkeypatch.chdir(work)
+    _, gate = workflow()
+    change = {"runs/change": f"runs/{policy}", "baseline.json": f"{baseline}.json"}
+    assert run_command([change.get(word, word) for word in gate]) == code
+    assert len(read_run(work / "runs" / policy).rollouts) == 14
