@@ -286,8 +286,7 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) ->
         InfrastructureError: The disk refused.
     """
     text = gate_md(verdict, gate, str(run.folder))
-    text += "
-" + overview_md(overview_of(run), "###")
+    text += "\n" + overview_md(overview_of(run), "###")
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text))
