@@ -2,9 +2,8 @@
 page.
 
 The browser draws the table row by row as it is scrolled, so it may have any length. The page holds
-one block: a header in JSON, then the columns as bytes, compressed together. 100,000 rollouts with
-25 metrics take some seven megabytes; a row of HTML each would take a hundred. Numbers are rounded
-to 13 significant bits (four digits), which the tables of the run are not.
+one compressed block of columns; a row of HTML each would take ten times the room. Numbers are
+rounded to four digits, which the tables of the run are not.
 """
 
 from __future__ import annotations
@@ -13,15 +12,13 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import numpy.typing as npt
 
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import WHY_NAME
 from evaluators.metrics.outcomes import (
@@ -148,7 +145,6 @@ def _at(own: Own, name: str, t_us: int) -> float | None:
 
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a failure's message
-KEPT_BITS = 13  # of a number's mantissa
 COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
 CLIP = "front.mp4"
 
@@ -158,7 +154,7 @@ class RolloutBlock:
     """The block of the page.
 
     Attributes:
-        data: Base64 of the compressed columns.
+        data: Base64 of the compressed document.
         shown: Rollouts in it.
         left_out: Rollouts that are not.
     """
@@ -169,96 +165,57 @@ class RolloutBlock:
 
 
 def rollout_block(run: Run) -> RolloutBlock:
-    """Pack the rollouts of a run.
+    """Pack the rollouts of a run: base64 of compressed JSON.
 
-    The block is gzip of: length of the header (uint32), header (UTF-8 JSON, spaces up to a multiple
-    of four), columns. Little-endian. The header names the columns in their order, each ``{"name",
-    "type", "values"?}``: type is ``u8``, ``u32`` or ``f32``; the bytes of a column stand by
-    significance, all lowest ones first, which compresses better. ``values`` are the texts that a
-    ``u32`` column counts through. A missing number is NaN.
+    The document holds ``renderers``; ``texts``: NAME -> a text a rollout; ``state``: what each
+    ended with and which files it has, as bits; and ``numbers``: metrics with ``name``, ``unit``,
+    what they are, and ``data``, a number a rollout with four digits, null where it is missing.
     """
     rollouts = run.rollouts[:MAX_ROLLOUTS]
     parents = [os.path.split(r.path) for r in rollouts]
-    header: list[dict[str, Any]] = []
-    columns: list[U8] = []
-
-    def add(name: str, kind: str, data: npt.NDArray[Any], **more: Any) -> None:
-        header.append({"name": name, "type": kind} | more)
-        by_significance = data.view(np.uint8).reshape(len(data), data.itemsize).T
-        columns.append(np.ascontiguousarray(by_significance).reshape(-1))
-
-    texts: dict[str, Iterable[str]] = {
-        "scene": (r.scene for r in rollouts),
-        "renderer": (r.renderer for r in rollouts),
-        "policy": (r.policy for r in rollouts),
-        "seed": (str(r.seed) for r in rollouts),
-        "folder": (quote(parent) for parent, _ in parents),
-        "leaf": (quote(leaf) for _, leaf in parents),
-        "outcome": (in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts),
-        "failure": (
-            (f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT] if not r.ok else "")
+    texts = {
+        "scene": [r.scene for r in rollouts],
+        "renderer": [r.renderer for r in rollouts],
+        "policy": [r.policy for r in rollouts],
+        "seed": [str(r.seed) for r in rollouts],
+        "folder": [quote(r.path) for r in rollouts],
+        "outcome": [in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts],
+        "failure": [
+            "" if r.ok else f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT]
             for r in rollouts
-        ),
+        ],
     }
-    for name, column in texts.items():
-        codes, values = _coded(column)
-        add(name, "u32", codes, values=values)
-    add("state", "u8", _states(run, parents))
-    add(
-        "wall_s",
-        "f32",
-        _rounded([r.wall_s for r in rollouts]),
-        unit="s",
-        percent=False,
-        headline=False,
-        flag=False,
-    )
+    walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
+    numbers = [walls | {"data": [_short(r.wall_s) for r in rollouts]}]
     for metric in run.table.ordered(run.metric_names):
-        numbers = _rounded([r.metrics.get(metric) for r in rollouts])
         facts = run.table.shown(metric)
-        add(
-            metric,
-            "f32",
-            numbers,
-            unit=facts.unit,
-            percent=facts.in_percent,
-            headline=facts.is_headline,
-            flag=facts.is_flag,
+        numbers.append(
+            {
+                "name": metric,
+                "unit": facts.unit,
+                "percent": facts.in_percent,
+                "headline": facts.is_headline,
+                "flag": facts.is_flag,
+                "data": [_short(r.metrics.get(metric)) for r in rollouts],
+            }
         )
-    head = json.dumps(
-        {"rows": len(rollouts), "columns": header, "renderers": run.renderers},
-        separators=(",", ":"),
-    ).encode()
-    head += b" " * (-len(head) % 4)
-    packed = gzip.compress(
-        np.uint32(len(head)).tobytes() + head + b"".join(one.tobytes() for one in columns),
-        compresslevel=9,
-        mtime=0,
-    )
-    return RolloutBlock(
-        base64.b64encode(packed).decode(), len(rollouts), len(run.rollouts) - len(rollouts)
-    )
+    document = {
+        "renderers": run.renderers,
+        "texts": texts,
+        "state": _states(run, parents),
+        "numbers": numbers,
+    }
+    plain = json.dumps(document, separators=(",", ":")).encode()
+    data = base64.b64encode(gzip.compress(plain, mtime=0)).decode()
+    return RolloutBlock(data, len(rollouts), len(run.rollouts) - len(rollouts))
 
 
-def _coded(values: Iterable[str]) -> tuple[npt.NDArray[np.uint32], list[str]]:
-    """Return the number of each value ``(N,)``, and the values in order of appearance."""
-    known: dict[str, int] = {}
-    codes = [known.setdefault(value, len(known)) for value in values]
-    return np.array(codes, dtype="<u4"), list(known)
+def _short(value: float | None) -> float | None:
+    """Return a number with four digits: what says nothing does not compress."""
+    return None if value is None else float(f"{value:.4g}")
 
 
-def _rounded(values: Sequence[float | None]) -> npt.NDArray[np.float32]:
-    """Return numbers ``(N,)`` with `KEPT_BITS` significant bits, NaN for None; bits that say
-    nothing are what does not compress.
-    """
-    exact = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    mantissa, exponent = np.frexp(exact)
-    return np.asarray(
-        np.ldexp(np.round(np.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS), dtype="<f4"
-    )
-
-
-def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
+def _states(run: Run, parents: Sequence[tuple[str, str]]) -> list[int]:
     """Return what each rollout ended with, and which files of it are there, as bits."""
     has_clips = str((run.info.get("config") or {}).get("video") or "none") != "none"
     names: dict[str, frozenset[str]] = {}
@@ -289,4 +246,4 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
                 else 0
             )
         states.append(state)
-    return np.array(states, dtype=np.uint8)
+    return states

@@ -69,7 +69,7 @@ def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
     head = "[...document.querySelectorAll('#table-flips th .sort')].find(b => b.textContent.startsWith('Plans part')).click()"
     for _ in range(2):
         browser.evaluate(head)
-        times = column(browser, "table-flips", 6)
+        times = column(browser, "table-flips", 7)
         known = [float(text.split("\u00a0")[0]) for text in times if text != "\u2014"]
         assert known in (sorted(known), sorted(known)[::-1])
         assert times[-1] == "\u2014"
@@ -79,8 +79,8 @@ def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -
     browser.open(write_report(usual_run))
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     for _ in range(2):
-        browser.evaluate("document.querySelectorAll('#table-more th .sort')[1].click()")
-        assert column(browser, "table-more", 1)[-1] == "\u2014"
+        browser.evaluate("document.querySelectorAll('#table-results th .sort')[1].click()")
+        assert column(browser, "table-results", 1)[-1] == "\u2014"
 
 
 def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run: Path) -> None:

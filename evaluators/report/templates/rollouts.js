@@ -11,30 +11,15 @@
   const unpack = async () => {
     const packed = Uint8Array.from(atob(holder.content.textContent), (letter) => letter.charCodeAt(0));
     holder.remove();
-    const plain = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
-    const size = new DataView(plain).getUint32(0, true);
-    const { rows, columns, renderers } = JSON.parse(new TextDecoder().decode(new Uint8Array(plain, 4, size)));
-    let from = 4 + size;
-    const found = new Map();
-    for (const column of columns) {
-      const width = column.type === "u8" ? 1 : 4;
-      const planes = new Uint8Array(plain, from, rows * width), whole = new Uint8Array(rows * width);
-      for (let byte = 0; byte < width; byte++) for (let row = 0; row < rows; row++) whole[row * width + byte] = planes[byte * rows + row];
-      from += rows * width;
-      const data = column.type === "u8" ? whole : column.type === "u32" ? new Uint32Array(whole.buffer) : new Float32Array(whole.buffer);
-      found.set(column.name, { ...column, data });
-    }
-    return { rows, columns: found, renderers };
+    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).json();
   };
 
-  const start = ({ rows, columns, renderers }) => {
-    const column = (name) => columns.get(name), text = (name, row) => column(name).values[column(name).data[row]];
-    const state = column("state").data;
-    const numeric = [...columns.values()].filter((one) => one.type === "f32");
+  const start = ({ renderers, texts, state, numbers }) => {
+    const rows = state.length, text = (name, row) => texts[name][row];
     const shortly = new Intl.NumberFormat("en", { minimumSignificantDigits: 4, maximumSignificantDigits: 4, useGrouping: false });
     const number = (one, row) => {
       const value = one.data[row];
-      if (Number.isNaN(value)) return "\u2014";
+      if (value === null) return "\u2014";
       if (one.flag && (value === 0 || value === 1)) return value ? "yes" : "no";
       if (value === 0) return one.percent ? "0\u00a0%" : one.unit ? "0\u00a0" + one.unit : "0";
       return (shortly.format(one.percent ? 100 * value : value) + (one.percent ? "\u00a0%" : one.unit ? "\u00a0" + one.unit : "")).replace("-", "\u2212");
@@ -45,36 +30,34 @@
 
     // Which columns are drawn: names, the outcome, the headline numbers that are no flags, and one more of choice.
     const more = at("rollouts-more");
-    const own = numeric.filter((one) => one.headline && !one.flag);
-    for (const one of numeric.filter((other) => !own.includes(other))) more.append(make("option", one.name, { value: one.name }));
+    const own = numbers.filter((one) => one.headline && !one.flag);
+    for (const one of numbers.filter((other) => !own.includes(other))) more.append(make("option", one.name, { value: one.name }));
     const drawn = () => [
       { name: "scene", names: true }, { name: "renderer", names: true },
-      ...(column("policy").values.length > 1 ? [{ name: "policy", names: true }] : []),
-      { name: "seed", names: true }, { name: "outcome" }, ...own, ...(more.value ? [column(more.value)] : []),
+      ...(new Set(texts.policy).size > 1 ? [{ name: "policy", names: true }] : []),
+      { name: "seed", names: true }, { name: "outcome" }, ...own, ...numbers.filter((one) => one.name === more.value),
     ];
 
     let order = Uint32Array.from({ length: rows }, (_, row) => row), sorted = { name: "", up: true }, opened = -1, shown = drawn();
     const ranks = (name) => { // texts by the alphabet with numbers in it
-      const { values } = column(name), collator = new Intl.Collator("en", { numeric: true });
-      const rank = new Uint32Array(values.length);
-      values.map((value, code) => [value, code]).sort(([a], [b]) => collator.compare(a, b)).forEach(([, code], place) => { rank[code] = place; });
-      return rank;
+      const { compare } = new Intl.Collator("en", { numeric: true });
+      return new Map([...new Set(texts[name])].sort(compare).map((value, place) => [value, place]));
     };
     const keyOf = (one) => {
       if (one.name === "outcome") return (row) => state[row] & (COLLIDED | OTHERWISE | FAILED);
-      if (!one.names) return (row) => one.data[row];
-      const rank = ranks(one.name), { data } = column(one.name);
-      return (row) => rank[data[row]];
+      if (!one.names) return (row) => one.data[row] ?? NaN;
+      const rank = ranks(one.name);
+      return (row) => rank.get(text(one.name, row));
     };
 
     const select = () => {
       const mask = Number(at("rollouts-state").value);
-      const words = at("rollouts-words").value.toLowerCase().split(/\s+/).filter(Boolean).map((word) =>
-        ["scene", "renderer", "policy", "seed"].map((name) => [column(name).data, column(name).values.map((value) => name === "seed" ? value === word : value.toLowerCase().includes(word))]));
+      const words = at("rollouts-words").value.toLowerCase().split(/\s+/).filter(Boolean);
+      const has = (row, word) => text("seed", row) === word || ["scene", "renderer", "policy"].some((name) => text(name, row).toLowerCase().includes(word));
       const kept = new Uint32Array(rows);
       let n = 0;
       for (let row = 0; row < rows; row++) {
-        if ((!mask || state[row] & mask) && words.every((word) => word.some(([data, hits]) => hits[data[row]]))) kept[n++] = row;
+        if ((!mask || state[row] & mask) && words.every((word) => has(row, word))) kept[n++] = row;
       }
       order = kept.slice(0, n);
       const chosen = shown.find((one) => one.name === sorted.name);
@@ -142,14 +125,14 @@
     const open = (row) => {
       opened = row;
       const links = make("p", undefined, { className: "small" });
-      const folder = `${text("folder", row)}/${text("leaf", row)}`;
+      const folder = text("folder", row);
       if (state[row] & HAS_WHY) links.append(make("a", "why", { href: `${folder}/why.html` }), " ");
       if (state[row] & HAS_FOLDER) links.append(make("a", "rollout folder", { href: `${folder}/` }), " ");
       if (state[row] & HAS_CLIP) links.append(make("a", "clip", { href: `${folder}/front.mp4` }), " ");
       if (!(state[row] & HAS_FOLDER)) links.append("No folder of this rollout is beside this page. ");
       links.append("Watch it: ", make("code", `simrun view RUN --scene ${quoted(text("scene", row))} --seed ${text("seed", row)}`));
       const facts = make("dl");
-      for (const one of numeric) facts.append(make("dt", one.name), make("dd", number(one, row)));
+      for (const one of numbers) facts.append(make("dt", one.name), make("dd", number(one, row)));
       const title = make("h3", `${text("scene", row)}, ${text("renderer", row)}, ${text("policy", row)}, seed ${text("seed", row)}: ${outcome(row)}`);
       const failure = text("failure", row);
       picked.replaceChildren(title, ...(failure ? [make("p", failure, { className: "message" })] : []), links, facts);
