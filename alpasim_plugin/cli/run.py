@@ -46,7 +46,7 @@ from evaluators.report.numbers import plural
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
 from evaluators.statistics.variants import base_named, variants_of
-from scenarios.suite import ScenarioRef, expand, shipped_names
+from scenarios.suite import ScenarioRef, expand
 
 SHOWN_FAILURES = 5
 
@@ -323,10 +323,7 @@ def _print_result(result: RunResult) -> None:
     lines = []
     if "repeat" in result.summary:
         lines.append(f"repeat   {repeat_line(result.summary['repeat'])}")
-    following = next_line(run)
-    for name, path in shipped_names().items():
-        following = following.replace(str(path.absolute()), name)
-    show(False, {}, *first_screen(run), "", *lines, *report_lines(root), following)
+    show(False, {}, *first_screen(run), "", *lines, *report_lines(root), next_line(run))
     failures: dict[str, list[dict[str, Any]]] = {}
     for cell in result.summary["failures"]["cells"]:
         failures.setdefault(cell["error"]["message"], []).append(cell)

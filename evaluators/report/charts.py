@@ -1,20 +1,16 @@
-"""Charts of a report as SVG in the page's colours: axes, and speed against error."""
+"""Charts of a report as SVG in the page's colours."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
 
 from alpasim_plugin.core.types import F64
-from evaluators.metrics import MetricInfo
-from evaluators.opening import Run
-from evaluators.report.numbers import LEAST_SPAN, finite, interval, scale_and_unit
 
 N_COLOURS = 8
 WIDTH_PT, HEIGHT_PT = 331.2, 194.4  # about 440 x 260 CSS pixels: legible on a phone
@@ -23,12 +19,6 @@ MOST_TICKS = 7
 DASHES = ("", "9 3.6", "2.7 2.7", "10.8 2.7 2.7 3.6")
 VARIANT = [f"var(--variant-{i})" for i in range(N_COLOURS)]
 INK, MUTED, GRID = "var(--ink)", "var(--muted)", "var(--line)"
-N_BINS = 60  # of the time axis
-ERRORS = ("collision_at_fault", "offroad", "lateral_distance_m")
-SPEED_NOTE = (
-    "Across: ms per camera frame, mean, with a line to the 95th percentile. "
-    "Paired with the baseline, which lies on the line; 95 % over scenes."
-)
 Values = Sequence[float] | F64
 
 
@@ -117,14 +107,6 @@ class Axes:
         room = 0.05 * ((high - low) or abs(high) or 1.0)
         return low - room, high + room
 
-    def widen(self, axis: int, unit: str) -> None:
-        """Widen an axis to `LEAST_SPAN`: a micrometre drawn across the page would pass for a
-        finding.
-        """
-        low, high = self.range(axis)
-        missing = max(LEAST_SPAN.get(unit, 0.0) - (high - low), 0.0)
-        self.limits[axis] = low - missing / 2, high + missing / 2
-
     def chart(self, title: str, note: str) -> Chart:
         """Draw everything."""
         left, top, right, bottom = self.box
@@ -189,64 +171,3 @@ def round_ticks(low: float, high: float) -> list[tuple[float, str]]:
     places = max(0, -math.floor(math.log10(step) + 1e-9))
     numbers = range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return [(k * step, f"{k * step:.{places}f}".replace("-", "\u2212")) for k in numbers]
-
-
-class Difference(NamedTuple):
-    """One paired difference turned so that positive is worse, in printed units."""
-
-    centre: float
-    low: float
-    high: float
-
-
-def _difference(metric: MetricInfo, entry: Mapping[str, Any]) -> Difference | None:
-    """Return a difference; None without an interval, or where neither side is better."""
-    centre, direction = finite(entry.get("diff")), entry.get("direction")
-    bounds = interval(entry.get("ci95"), centre)
-    if centre is None or bounds is None or direction not in ("lower", "higher"):
-        return None
-    scale, _ = scale_and_unit(metric, "")
-    turned = scale if direction == "lower" else -scale
-    low, high = sorted(value * turned for value in bounds)
-    return Difference(centre * turned, low, high)
-
-
-def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
-    """Draw milliseconds per frame against how much the renderer changed the driving, for each of a
-    few metrics.
-
-    The time is the mean: a fixer of blocks spends nothing on most frames, so its median says
-    nothing of what a rollout costs.
-    """
-    paired = run.summary.get("paired") or {}
-    charts = []
-    for name in ERRORS:
-        metric, points = run.table.shown(name), []
-        for variant, times in (run.summary.get("speed") or {}).items():
-            mean_ms = finite(times.get("ms_per_frame_mean"))
-            baseline = Difference(0.0, 0.0, 0.0)
-            entry = (paired.get(variant) or {}).get(name) or {}
-            difference = _difference(metric, entry) if variant in paired else baseline
-            if mean_ms and difference is not None:
-                p95_ms = finite(times.get("ms_per_frame_p95")) or mean_ms
-                points.append((variants.get(variant, 0), mean_ms, p95_ms, difference))
-        if len(points) >= 2 and any(point[-1].low < point[-1].high for point in points):
-            charts.append(_speed_chart(metric, points))
-    return charts
-
-
-def _speed_chart(
-    metric: MetricInfo, points: Sequence[tuple[int, float, float, Difference]]
-) -> Chart:
-    axes = Axes()
-    axes.across(0.0, INK, 0.9)
-    for colour, mean_ms, p95_ms, difference in points:
-        paint = VARIANT[colour % N_COLOURS]
-        axes.line([mean_ms, mean_ms], [difference.low, difference.high], paint)
-        axes.line([mean_ms, max(p95_ms, mean_ms)], [difference.centre] * 2, paint, 0.9)
-        axes.points([mean_ms], [difference.centre], paint, 7.0)
-    _, unit = scale_and_unit(metric, "m")
-    axes.widen(1, unit)
-    axes.limits[0] = 0.0, axes.range(0)[1]
-    axes.labels = ["ms per camera frame", f"{unit} worse"]
-    return axes.chart(metric.words, SPEED_NOTE)

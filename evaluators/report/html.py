@@ -28,7 +28,6 @@ from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.charts import speed_against_error
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, flip_bases, flip_rows
@@ -158,7 +157,6 @@ def context(run: Run) -> dict[str, Any]:
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
-        "speed_charts": speed_against_error(run, colours),
         "invalid": invalid_rows(run),
         "metric_rows": rows,
         "pair_rows": pairs,

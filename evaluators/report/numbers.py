@@ -13,11 +13,6 @@ if TYPE_CHECKING:
     from evaluators.metrics import MetricInfo
 
 DASH, NARROW = "\u2014", "\u202f"
-LEAST_SPAN = {
-    "m": 0.1,
-    "points": 1.0,
-    "s": 0.1,
-}  # of an axis, by unit: less than this is not worth a picture
 ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
 

@@ -4,10 +4,8 @@ worth trying.
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from textwrap import wrap
 from typing import Any
 
@@ -23,7 +21,7 @@ from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips
 from evaluators.report.numbers import labelled
-from evaluators.report.overview import TONES, Overview, overview_of
+from evaluators.report.overview import TONES, Overview
 from evaluators.report.tables import metric_rows
 from evaluators.scores.table import SCORES
 
@@ -31,10 +29,6 @@ STYLES = {"worse": "red", "better": "green", "mixed": "yellow", "unclear": "yell
 MOST_NAMED = 6  # variants whose failures are named
 HEAD_WIDTH = 9
 LEAST_PLOT = 20  # letters
-MORE_SCENES = "suites/urban"
-SEEING = "lane-camera"  # a shipped policy with a camera
-KEPT = ("--set", "--preset", "--controller")  # options of a command that the next one has too
-OF_A_SCENE = r"(road|ego|actors)\b"  # settings that another scene cannot have
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 
 
@@ -214,11 +208,11 @@ def forest_lines(shown: Overview, width: int) -> list[Text]:
 
 def next_line(run: Run) -> str:
     """Return the line that names the next command worth trying, and why."""
-    command, why = next_command(run, overview_of(run))
+    command, why = next_command(run)
     return labelled("next", f"{shlex.join(command)}   # {why}")
 
 
-def next_command(run: Run, shown: Overview) -> tuple[list[str], str]:
+def next_command(run: Run) -> tuple[list[str], str]:
     """Choose the command that most helps with what was found.
 
     Returns:
@@ -232,46 +226,10 @@ def next_command(run: Run, shown: Overview) -> tuple[list[str], str]:
     if failed:
         words = ["simrun", "check", "run", str(run.folder)]
         return words, "says what is damaged or missing; the same command runs it again"
-    scenes = run.scenes_asked or [MORE_SCENES]
-    other = next((name for name in ("3dgs", "onefixer") if name not in run.renderers), "clean")
-    if all(rollout.frames == 0 for rollout in run.rollouts):
-        names = run.renderers if len(run.renderers) > 1 else [*run.renderers, other]
-        why = "a policy that looks: without a camera it drives alike behind every renderer"
-        return _again(run, names, scenes, SEEING), why
     flips, _ = find_flips(run)
     changed = [rollout for flip in flips for rollout in (flip.other, flip.base)]
     for rollout in [*changed, *run.rollouts]:
         if outcomes_of(rollout):
             words = ["simrun", "why", f"{run.folder}/{cell_name(*rollout.cell)}"]
             return words, "what the policy saw and planned there"
-    if len(shown.rows) == 1:
-        return _again(run, [*run.renderers, other], scenes), f"compares with {other}, pair by pair"
-    if any(row.difference and row.difference.tone == "unclear" for row in shown.rows):
-        why = "more scenes: the interval is too wide to decide"
-        return _again(run, run.renderers, [MORE_SCENES]), why
     return ["simrun", "view", str(run.folder)], "replays the rollouts side by side in a browser"
-
-
-def _again(
-    run: Run, renderers: Sequence[str], scenes: Sequence[str], policy: str = ""
-) -> list[str]:
-    """Return the command of a run with other renderers or scenes, its settings kept."""
-    words: list[str] = []
-    for text in run.info.get("command") or ():
-        words += text.split("=", 1) if text.startswith("--") else [text]
-    settings = []
-    for option, value in pairwise(words):
-        is_elsewhere = scenes == [MORE_SCENES] and re.match(OF_A_SCENE, value)
-        if option in KEPT and not is_elsewhere:
-            settings += [option, value]
-    return [
-        "simrun",
-        "--renderer",
-        ",".join(dict.fromkeys(renderers)),
-        "--policy",
-        policy or ",".join(run.policies),
-        "--seeds",
-        str(max(1, len(run.info.get("seeds") or ()))),
-        *settings,
-        *scenes,
-    ]

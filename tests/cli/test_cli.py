@@ -165,9 +165,7 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(
     assert run_command(command) == 0
     captured = capsys.readouterr()
     assert "primary" in captured.out
-    assert captured.out.splitlines()[-1].startswith(
-        "next     simrun --renderer clean,3dgs --policy lane-camera --seeds 1 smoke/straight "
-    )
+    assert captured.out.splitlines()[-1].startswith(f"next     simrun view {tmp_path} ")
     assert "report.html" in captured.out
     assert f"simrun view {tmp_path}" in captured.out
     names = {
