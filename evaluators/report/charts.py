@@ -16,7 +16,6 @@ N_COLOURS = 8
 WIDTH_PT, HEIGHT_PT = 331.2, 194.4  # about 440 x 260 CSS pixels: legible on a phone
 FONT_PT = 10.0  # the page's font
 MOST_TICKS = 7
-DASHES = ("", "9 3.6", "2.7 2.7", "10.8 2.7 2.7 3.6")
 VARIANT = [f"var(--variant-{i})" for i in range(N_COLOURS)]
 INK, MUTED, GRID = "var(--ink)", "var(--muted)", "var(--line)"
 Values = Sequence[float] | F64
@@ -37,15 +36,12 @@ class Axes:
 
     Attributes:
         limits: Of x and of y; None: what was added, with a twentieth of room on either side.
-        ticks: (value, text) of y; None: round numbers.
         labels: Of x and of y.
     """
 
-    def __init__(self, height_pt: float = HEIGHT_PT, left_pt: float = 56.0) -> None:
-        self.height_pt = height_pt
-        self.box = left_pt, 7.2, WIDTH_PT - 5.8, height_pt - 36.0  # left, top, right, bottom
+    def __init__(self) -> None:
+        self.box = 56.0, 7.2, WIDTH_PT - 5.8, HEIGHT_PT - 36.0  # left, top, right, bottom
         self.limits: list[tuple[float, float] | None] = [None, None]
-        self.ticks: Sequence[tuple[float, str]] | None = None
         self.labels = ["", ""]
         self._values: tuple[list[float], list[float]] = ([], [])
         self._lines: list[Callable[[], str]] = []
@@ -112,11 +108,11 @@ class Axes:
         left, top, right, bottom = self.box
         text = f"fill:{MUTED};font-size:{FONT_PT:g}px;text-anchor"
         x_ticks = round_ticks(*self.range(0))
-        y_ticks = round_ticks(*sorted(self.range(1))) if self.ticks is None else self.ticks
+        y_ticks = round_ticks(*self.range(1))
         xs = self._place(0, [value for value, _ in x_ticks])
         ys = self._place(1, [value for value, _ in y_ticks])
         grid = [f"M{x:.2f} {top:g}V{bottom:g}" for x in xs]
-        grid += [f"M{left:g} {y:.2f}H{right:g}" for y in ys if self.ticks is None]
+        grid += [f"M{left:g} {y:.2f}H{right:g}" for y in ys]
         parts = [f'<path d="{"".join(grid)}" style="fill:none;stroke:{GRID};stroke-width:0.8"/>']
         for x, (_, label) in zip(xs, x_ticks, strict=True):
             parts.append(
@@ -125,7 +121,7 @@ class Axes:
         for y, (_, label) in zip(ys, y_ticks, strict=True):
             place = f'x="{left - 3.5:g}" y="{y + 3.5:.2f}"'
             parts.append(f'<text {place} style="{text}:end">{escape(label)}</text>')
-        place = f'x="{right:g}" y="{self.height_pt - 6:g}"'
+        place = f'x="{right:g}" y="{HEIGHT_PT - 6:g}"'
         parts.append(f'<text {place} style="{text}:end">{escape(self.labels[0])}</text>')
         place = f'transform="translate(10 {(top + bottom) / 2:g}) rotate(-90)"'
         parts.append(f'<text {place} style="{text}:middle">{escape(self.labels[1])}</text>')
@@ -135,7 +131,7 @@ class Axes:
         parts += [f"<svg {inner} {box}>", *(draw() for draw in self._lines), "</svg>"]
         parts += [draw() for draw in self._markers]
         label = escape(f"{title}. {note}")
-        view = f'viewBox="0 0 {WIDTH_PT:g} {self.height_pt:g}"'
+        view = f'viewBox="0 0 {WIDTH_PT:g} {HEIGHT_PT:g}"'
         svg = f'<svg {view} role="img" aria-label="{label}" class="chart">{"".join(parts)}</svg>'
         return Chart(title, note, Markup(svg))
 

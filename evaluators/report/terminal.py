@@ -98,8 +98,9 @@ def metric_lines(
         unit = "" if row.name.endswith(f"_{row.unit}") else row.unit
         facts = ", ".join(part for part in (unit, row.arrow_word) if part)
         lines.append(escape(row.name) + (f" ({facts})" if facts else ""))
+        digits = max(len(cell.text) for cell in row.cells)
         for name, cell in zip(names, row.cells, strict=True):
-            text = f"  {name.ljust(width)}  {cell.text}"
+            text = f"  {name.ljust(width)}  {cell.text.rjust(digits)}"
             lines.append(
                 f"{text}  {cell.detail or cell.note}" if cell.detail or cell.missing else text
             )

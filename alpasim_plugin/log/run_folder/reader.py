@@ -90,16 +90,6 @@ class Run:
         return list(dict.fromkeys([*(self.info.get(axis) or ()), *seen]))
 
     @property
-    def scenes_asked(self) -> list[str]:
-        """List what the command named as scenarios, or, where no command did, paths that one may
-        name.
-        """
-        refs = [scene.get("ref") or {} for scene in (self.info.get("scenes") or {}).values()]
-        return self.info.get("asked") or list(
-            dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path"))
-        )
-
-    @property
     def variants(self) -> list[str]:
         """List the columns of the result tables: the keys under which ``summary.json`` holds
         metrics.
