@@ -172,7 +172,7 @@ def _grid(shown: Overview, width: int) -> list[Text]:
 
 
 def _line(cells: Sequence[str], widths: Sequence[int], styles: Sequence[str]) -> Text:
-    line = Text(cells[0].ljust(widths[0]), styles[0], end="")
+    line = Text(cells[0].ljust(widths[0]), styles[0])
     for cell, width, style in zip(cells[1:], widths[1:], styles[1:], strict=True):
         line.append(f" {cell.rjust(width)}", style)
     return line

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
@@ -101,6 +102,13 @@ def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
     lines = [line.plain for line in overview_lines(shown, width)]
     assert all(len(line) <= width for line in lines)
     assert all(any(name in line for line in lines) for name in names)
+
+
+def test_every_line_is_printed_on_its_own(three: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = overview_lines(overview_of(read_run(three)), 80)
+    show(False, {}, *lines)
+    printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert printed == [line.plain.rstrip() for line in lines]
 
 
 @pytest.mark.parametrize("renderers", [(), ("clean",), ("clean", "3dgs", "onefixer")])
