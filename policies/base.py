@@ -60,7 +60,7 @@ def seconds(times_us: I64) -> F64:
     """Return the seconds ``(T,)`` from the first of the times; the difference is taken in
     integers.
     """
-    return np.asarray((times_us - times_us[0]).astype(np.float64) * 1e-6)
+    return (times_us - times_us[0]).astype(np.float64) * 1e-6
 
 
 def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
@@ -193,7 +193,7 @@ def shifted(line: F64, left_m: float) -> F64:
         np.stack([-step[:, 1], step[:, 0]], axis=1)
         / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     )
-    return np.asarray(line + left_m * normal)
+    return line + left_m * normal
 
 
 def curve_speeds(
@@ -207,7 +207,7 @@ def curve_speeds(
     # Backward pass: v_i^2 <= v_j^2 + 2 a (s_j - s_i) for every j > i.
     reach = 2 * brake_mps2 * Path.SPACING_M * np.arange(len(limit))
     squared = np.minimum.accumulate((limit**2 + reach)[::-1])[::-1] - reach
-    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+    return np.sqrt(np.maximum(squared, 0.0))
 
 
 def speed_profile(

@@ -159,7 +159,7 @@ class LaneCamera(Policy):
         foot = None
         if not_road is not None:
             not_road[crosswalk] = 0
-            reach = min(OBSTACLE_RANGE_M, _range_of(path))
+            reach = min(OBSTACLE_RANGE_M, float(_increasing(path[1:])[0][-1]))
             foot = find_foot(not_road, self.grid, centre_y, float(self.grid.x_m[0]), reach)
         self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
         free_m = self.obstacle.distance_m if self.obstacle is not None else np.inf
@@ -305,7 +305,7 @@ def _moved(lane: LaneState, T_world_old: F64, T_world_new: F64) -> LaneState:
 def _points_in(points: F64, T_world_a: F64, T_world_b: F64) -> F64:
     """Return points (M, 2) given in rig pose a as seen from rig pose b, in the plane."""
     T = inverse(T_world_b) @ T_world_a
-    return np.asarray(points @ T[:2, :2].T + T[:2, 3])
+    return points @ T[:2, :2].T + T[:2, 3]
 
 
 def _increasing(points: F64) -> tuple[F64, F64]:
@@ -316,10 +316,3 @@ def _increasing(points: F64) -> tuple[F64, F64]:
     back = x[1:] - x[:-1] <= 0.05
     stop = int(np.argmax(back)) + 1 if back.any() else len(x)
     return x[:stop], points[:stop, 1]
-
-
-def _range_of(path: F64) -> float:
-    """Return how far ahead the path stays within 60 degrees of the view; beyond that a corridor
-    over x has no meaning.
-    """
-    return float(_increasing(path[1:])[0][-1])

@@ -47,7 +47,7 @@ class LaneState:
 
     def centre(self, x_m: F64) -> F64:
         """Return the lateral position (K,) of the lane's centre at distances (K,)."""
-        return np.asarray(_basis(x_m) @ self.mean[:4])
+        return _basis(x_m) @ self.mean[:4]
 
     def sigma(self, x_m: F64) -> F64:
         """Return the standard deviation (K,) of `centre`, growing beyond the paint that was
@@ -56,14 +56,14 @@ class LaneState:
         basis = _basis(x_m)
         var = np.einsum("ki,ij,kj->k", basis, self.cov[:4, :4], basis)
         beyond = np.maximum(x_m - self.seen_to_m, 0.0)
-        return np.asarray(
-            np.sqrt(np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2)
+        return np.sqrt(
+            np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2
         )
 
     def slope(self, x_m: F64 | float) -> F64:
         """Return dy/dx (K,) of the centre, or () at one distance."""
         _, heading, curvature, bend, _ = self.mean.tolist()
-        return np.asarray(heading + curvature * x_m + 0.5 * bend * (x_m * x_m))
+        return heading + curvature * x_m + 0.5 * bend * (x_m * x_m)
 
 
 def start(

@@ -96,7 +96,7 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     step = np.gradient(points, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     x, y = points[:, 0], points[:, 1]
-    usable = _prefix((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
+    usable = np.logical_and.accumulate((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
     sigma = lane.sigma(np.maximum(x, 0.0))
     apart = np.abs((y - y_lane) - (y[0] - y_lane[0])) > LEAVE_M
@@ -178,7 +178,7 @@ def correlated_noise(before: F64 | None, dt_s: float, random: np.random.Generato
     if before is None:
         return np.asarray(fresh)
     keep = float(np.exp(-dt_s / NOISE_S))
-    return np.asarray(keep * before + np.sqrt(1 - keep**2) * fresh)
+    return keep * before + np.sqrt(1 - keep**2) * fresh
 
 
 def sample_sigma_m(lane_sigma_m: float) -> float:
@@ -250,8 +250,3 @@ def _straight_beyond(lane: LaneState, x: F64, limit_m: float) -> F64:
     """
     inside = np.minimum(np.maximum(x, 0.0), limit_m)
     return lane.centre(inside) + (x - inside) * lane.slope(inside)
-
-
-def _prefix(flags: np.ndarray) -> np.ndarray:
-    """Return the flags up to the first false one."""
-    return np.asarray(np.logical_and.accumulate(flags))

@@ -68,7 +68,7 @@ def view_homography(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     rotation = camera.T_rig_camera[:3, :3].T @ turn @ _RIG_FROM_LEVEL_CAMERA
-    return np.asarray(camera.K @ rotation @ np.linalg.inv(_K))
+    return camera.K @ rotation @ np.linalg.inv(_K)
 
 
 def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:

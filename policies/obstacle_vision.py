@@ -94,7 +94,7 @@ def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
         cv2.LUT(channel, column)
         for channel, column in zip(cv2.split(lab), np.ascontiguousarray(table.T), strict=True)
     )
-    return np.asarray(cv2.max(light, cv2.max(a, b)) * grid.inside.view(np.uint8))
+    return cv2.max(light, cv2.max(a, b)) * grid.inside.view(np.uint8)
 
 
 def find_foot(
@@ -173,7 +173,7 @@ def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:
     bar = np.ones((1, round(width_m / CELL_M) | 1), dtype=np.uint8)
     seen = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
     table = cv2.integral(seen, sdepth=cv2.CV_64F)
-    return np.asarray(np.divide(table, 255.0, out=table))
+    return np.divide(table, 255.0, out=table)
 
 
 def _box_mean(
@@ -195,7 +195,7 @@ def _box_mean(
     total = (
         table.take(b + right) - table.take(a + right) - table.take(b + left) + table.take(a + left)
     )
-    return np.asarray(total / np.maximum((last - first) * (right - left), 1))
+    return total / np.maximum((last - first) * (right - left), 1)
 
 
 @dataclass(frozen=True)

@@ -58,15 +58,13 @@ class GroundGrid:
 
     def warp(self, image: U8) -> U8:
         """Return the image over the grid ``(R, C, 3)`` or ``(R, C)``; 0 outside the image."""
-        return np.asarray(
-            cv2.remap(
-                image,
-                self.map_u,
-                self.map_v,
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=0,
-            )
+        return cv2.remap(
+            image,
+            self.map_u,
+            self.map_v,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=0,
         )
 
     def sight_column(self, y_m: F64, rows: npt.NDArray[np.intp]) -> F64:
@@ -74,13 +72,11 @@ class GroundGrid:
         positions (N, K) on rows (N,).
         """
         distance = (self.x_m - self.camera_xz[0])[rows][:, None]
-        return np.asarray(
-            self.sight_index.shape[1] / 2 - (y_m - self.camera_y) / distance * self.focal_px
-        )
+        return self.sight_index.shape[1] / 2 - (y_m - self.camera_y) / distance * self.focal_px
 
     def column_of(self, y_m: F64) -> F64:
         """Return fractional columns of lateral positions; may lie outside the grid."""
-        return np.asarray((self.y_m[0] - y_m) / CELL_M)
+        return (self.y_m[0] - y_m) / CELL_M
 
 
 def make_grid(camera: CameraSpec) -> GroundGrid:
@@ -143,7 +139,7 @@ def _project(camera: CameraSpec, T_camera_rig: F64, points: F64) -> F64:
     at = points @ T_camera_rig[:3, :3].T + T_camera_rig[:3, 3]
     z = np.where(at[:, 2] > 0.1, at[:, 2], np.nan)
     uvw = at @ camera.K.T
-    return np.asarray(uvw[:, :2] / z[:, None] - 0.5)
+    return uvw[:, :2] / z[:, None] - 0.5
 
 
 @dataclass(frozen=True)
@@ -160,7 +156,7 @@ def brightness(ground: U8) -> U8:
     """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of
     red and green.
     """
-    return np.asarray(cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0))
+    return cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0)
 
 
 class RidgeFilter:
@@ -216,15 +212,13 @@ class RidgeFilter:
 
         def mean(first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]) -> F32:
             a, b = np.minimum(np.maximum(first, 0), n), np.minimum(np.maximum(last + 1, 0), n)
-            return np.asarray(
-                (total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(np.float32)
+            return (total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(
+                np.float32
             )
 
-        return np.asarray(
-            np.maximum(
-                mean(columns - gap - beside, columns - gap),
-                mean(columns + gap, columns + gap + beside),
-            )
+        return np.maximum(
+            mean(columns - gap - beside, columns - gap),
+            mean(columns + gap, columns + gap + beside),
         )
 
 
@@ -233,14 +227,14 @@ def _running_sums(value: U8) -> F32:
     all 72 x 321 bytes of a grid.
     """
     table = cv2.integral(value, sdepth=cv2.CV_32F)
-    return np.asarray(table[1:] - table[:-1])
+    return table[1:] - table[:-1]
 
 
 def _means(total: F32, width: int) -> F32:
     """Return the means ``(R, C + 1 - width)`` over ``width`` cells, by the first of them, of
     `_running_sums` ``(R, C + 1)``.
     """
-    return np.asarray((total[:, width:] - total[:, :-width]) * np.float32(1.0 / width))
+    return (total[:, width:] - total[:, :-width]) * np.float32(1.0 / width)
 
 
 def find_paint(
@@ -305,7 +299,7 @@ def _cells_around(
         mask = np.asarray(
             cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
         )
-    return np.asarray(mask > 0)
+    return mask > 0
 
 
 def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:
@@ -325,4 +319,4 @@ def _erode_rows(inside: Bool, reach: F64) -> Bool:
     first = np.where(any_inside, np.argmax(inside, axis=1), n)
     last = np.where(any_inside, n - 1 - np.argmax(inside[:, ::-1], axis=1), -1)
     column = np.arange(n)[None, :]
-    return np.asarray((column >= (first + reach)[:, None]) & (column <= (last - reach)[:, None]))
+    return (column >= (first + reach)[:, None]) & (column <= (last - reach)[:, None])

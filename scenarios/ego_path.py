@@ -83,7 +83,15 @@ def make_ego_path(
     s = arc_lengths(line)
     begins = np.cumsum([0] + [len(p) - 1 for p in parts])
     for shift in shifts:
-        line = _shift(line, s, shift)
+        share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep(
+            (shift.end_m + shift.ramp_m - s) / shift.ramp_m
+        )
+        d = np.gradient(line[:, :2], s, axis=0)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        out = line.copy()
+        out[:, 0] -= shift.shift_m * share * d[:, 1]
+        out[:, 1] += shift.shift_m * share * d[:, 0]
+        line = out
     return EgoPath(
         smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins)
     )
@@ -122,18 +130,6 @@ def _change(
         out.append(goal)
         new_chain.append((lane_id, k))
     return out, new_chain
-
-
-def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
-    share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep(
-        (shift.end_m + shift.ramp_m - s) / shift.ramp_m
-    )
-    d = np.gradient(line[:, :2], s, axis=0)
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    out = line.copy()
-    out[:, 0] -= shift.shift_m * share * d[:, 1]
-    out[:, 1] += shift.shift_m * share * d[:, 0]
-    return out
 
 
 def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> tuple[str, ...]:
@@ -214,7 +210,7 @@ def speed_profile(t_us: I64, rows: Sequence[tuple[float, float]]) -> F64:
     """
     t_s = (t_us - t_us[0]).astype(np.float64) * 1e-6
     times, values = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
-    return np.asarray(np.interp(t_s, times, values))
+    return np.interp(t_s, times, values)
 
 
 def brake_rows(

@@ -273,9 +273,7 @@ def speed_limits(path: Path, style: ExpertStyle) -> F64:
     v2 = np.minimum(style.cruise_mps**2, style.max_lateral_accel_mps2 / np.maximum(k, 1e-6))
     # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
     rising = v2 + 2 * COMFORT_BRAKE_MPS2 * path.s
-    return np.asarray(
-        np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
-    )
+    return np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
 
 
 class _Expert:

@@ -238,7 +238,7 @@ def _rotation(roll_pitch_yaw_deg: Any) -> F64:
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return np.asarray(z @ y @ x)
+    return z @ y @ x
 
 
 def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:

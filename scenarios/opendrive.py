@@ -374,8 +374,8 @@ def _outer(lane: OdrLane, sign: int, s: F64, inner_t: F64, middle: F64) -> F64:
     it has those instead.
     """
     if lane.borders and not lane.widths:
-        return np.asarray(middle + cubics_at(lane.borders, s))
-    return np.asarray(inner_t + sign * np.maximum(cubics_at(lane.widths, s), 0.0))
+        return middle + cubics_at(lane.borders, s)
+    return inner_t + sign * np.maximum(cubics_at(lane.widths, s), 0.0)
 
 
 def _stations(road: Road, section: Section) -> F64:

@@ -101,7 +101,7 @@ class Geometry:
         table_u = np.linspace(0.0, reach, _TABLE)  # an arc is never shorter than its u
 
         def slope(u: F64) -> F64:
-            return np.asarray(b + u * (2 * c + 3 * d * u))
+            return b + u * (2 * c + 3 * d * u)
 
         half = 0.5 * np.diff(table_u)[:, None]
         nodes = 0.5 * (table_u[1:] + table_u[:-1])[:, None] + half * _NODES
@@ -204,7 +204,7 @@ def cubics_at(records: Sequence[Cubic], s_m: F64) -> F64:
         np.clip(np.searchsorted(table[:, 0], s_m, side="right") - 1, 0, len(records) - 1)
     ].T
     ds = s_m - s0
-    return np.asarray(a + ds * (b + ds * (c + d * ds)))
+    return a + ds * (b + ds * (c + d * ds))
 
 
 def beside(line: F64, t_m: F64) -> F64:

@@ -225,46 +225,24 @@ def _parked(placer: _Placer, actor: ParkedActor, box: Box) -> list[Actor]:
                 "move it",
             )
         name = actor.id if actor.count == 1 else f"{actor.id}-{n}"
+        # Put a vehicle beside the outer lane of one side; the clearance counts from the lane's edge
+        # to the nearest side of the body.
+        yaw_rad = np.deg2rad(actor.yaw_deg)
+        path, d, turned = outer_edge(placer.road, placer.ego_path, at, actor.side)
+        reach = 0.5 * (abs(np.cos(yaw_rad)) * box.width_m + abs(np.sin(yaw_rad)) * box.length_m)
+        sign = 1.0 if actor.side == "left" else -1.0
+        xyz, yaw = path.at(at, d + sign * (actor.clearance_m + reach))
+        heading = float(yaw) + (np.pi if turned else 0.0) + yaw_rad
         out.append(
-            _stand(
-                placer,
+            Actor(
                 name,
                 actor.label,
                 box,
-                at,
-                actor.side,
-                actor.clearance_m,
-                np.deg2rad(actor.yaw_deg),
+                standing_track(xyz[0], xyz[1], xyz[2], heading, placer.t_us, box),
+                is_static=True,
             )
         )
     return out
-
-
-def _stand(
-    placer: _Placer,
-    name: str,
-    label: str,
-    box: Box,
-    at: float,
-    side: str,
-    clearance_m: float,
-    yaw_rad: float,
-) -> Actor:
-    """Put a vehicle beside the outer lane of one side; the clearance counts from the lane's edge to
-    the nearest side of the body.
-    """
-    path, d, turned = outer_edge(placer.road, placer.ego_path, at, side)
-    reach = 0.5 * (abs(np.cos(yaw_rad)) * box.width_m + abs(np.sin(yaw_rad)) * box.length_m)
-    sign = 1.0 if side == "left" else -1.0
-    xyz, yaw = path.at(at, d + sign * (clearance_m + reach))
-    heading = float(yaw) + (np.pi if turned else 0.0) + yaw_rad
-    return Actor(
-        name,
-        label,
-        box,
-        standing_track(xyz[0], xyz[1], xyz[2], heading, placer.t_us, box),
-        is_static=True,
-    )
 
 
 def outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tuple[Path, float, bool]:

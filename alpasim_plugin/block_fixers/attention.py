@@ -93,10 +93,6 @@ class Rope3D:
         """Return ``cos`` and ``sin`` of a block's tokens in (t, h, w) order, each ``(frames * rows
         * columns, head_width / 2)`` float32.
         """
-        half = self._half(start, frames, rows, columns).reshape(-1, self.head_width // 2)
-        return half.cos().float().to(device), half.sin().float().to(device)
-
-    def _half(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
         t = (
             torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None]
             * self.freq_t
@@ -104,14 +100,15 @@ class Rope3D:
         h = torch.arange(rows, dtype=torch.float64, device="cpu")[:, None] * self.freq_h
         w = torch.arange(columns, dtype=torch.float64, device="cpu")[:, None] * self.freq_w
         shape = (frames, rows, columns, -1)
-        return torch.cat(
+        half = torch.cat(
             [
                 t[:, None, None].expand(shape),
                 h[None, :, None].expand(shape),
                 w[None, None].expand(shape),
             ],
             dim=-1,
-        )
+        ).reshape(-1, self.head_width // 2)
+        return half.cos().float().to(device), half.sin().float().to(device)
 
 
 def rotate(x: Tensor, table: RopeTable) -> Tensor:

@@ -192,7 +192,22 @@ class CosmosCausalDiT(nn.Module):
             ``(B, C, T, H, W)`` velocity; without gradients unless the cache keeps them.
         """
         self._check(x_block, t_block, text, hdmap_block, x_block.shape[2])
-        self._check_cache(x_block, cache)
+        found = [cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios]
+        expected = [
+            x_block.shape[0],
+            x_block.shape[3],
+            x_block.shape[4],
+            self.sizes.head_width,
+            self.rope_ratios,
+        ]
+        if isinstance(cache, RollingCache):
+            found += cache.layout
+            expected += [self.sizes.blocks, self.sizes.heads, self.dtype]
+        if found != expected:
+            raise InputError(
+                f"a cache for batch, sizes and network {found}, not {expected}",
+                "make the cache with this network's new_cache for this batch and latent size",
+            )
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):
             table = cache.begin(x_block.shape[2])
 
@@ -319,16 +334,4 @@ class CosmosCausalDiT(nn.Module):
             raise InputError(
                 f"text: shape {list(text.shape)}",
                 f"give (batch or 1, tokens, {self.sizes.text_width})",
-            )
-
-    def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
-        found = [cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios]
-        expected = [x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios]
-        if isinstance(cache, RollingCache):
-            found += cache.layout
-            expected += [self.sizes.blocks, self.sizes.heads, self.dtype]
-        if found != expected:
-            raise InputError(
-                f"a cache for batch, sizes and network {found}, not {expected}",
-                "make the cache with this network's new_cache for this batch and latent size",
             )

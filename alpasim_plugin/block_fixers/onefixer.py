@@ -152,7 +152,11 @@ class OneFixer(Fixer):
             RendererError: An opacity that is not a number or outside [0, 1].
         """
         views = self._views(block, maps)
-        if not self._is_pending(views):
+        pending = [block.views for block in self._pending]
+        if not (
+            len(pending) == len(views)
+            and all(view.equals(before) for view, before in zip(views, pending, strict=True))
+        ):
             self._pending = tuple(
                 self._fix(view, history) for view, history in zip(views, self._history, strict=True)
             )
@@ -198,12 +202,6 @@ class OneFixer(Fixer):
         height, width = (side + -side % TOKEN_PX for side in view.shape)
         return ViewsHistory(
             view.cameras, view.shape, self.pipeline.start(len(view.cameras), height, width)
-        )
-
-    def _is_pending(self, views: Sequence[Views]) -> bool:
-        pending = [block.views for block in self._pending]
-        return len(pending) == len(views) and all(
-            view.equals(before) for view, before in zip(views, pending, strict=True)
         )
 
     def _fix(self, view: Views, history: ViewsHistory) -> PendingBlock:

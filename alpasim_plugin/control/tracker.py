@@ -145,7 +145,7 @@ class ReferencePath:
         """Return the progress (K,) planned for times (K,); the first and last pose are held outside
         the plan.
         """
-        return np.asarray(np.interp(t_s, self.t_s, self.s_m))
+        return np.interp(t_s, self.t_s, self.s_m)
 
     def at(self, s_m: F64) -> tuple[F64, F64]:
         """Return points (K, 2) and left normals (K, 2) of the path at progress (K,), straight
@@ -255,7 +255,10 @@ class PlanTracker(Controller):
         direction = -1.0 if goes_back and now.speed_mps < HOLD_SPEED_MPS else 1.0
         if direction * to_go[-1] < HOLD_MOVE_M and abs(now.speed_mps) < HOLD_SPEED_MPS:
             return Command(now.steer_rad, 0.0, self.vehicle.max_brake_mps2 / 2)
-        accel = _fit_acceleration(to_go[:-1], now.speed_mps)
+        # The constant acceleration whose motion best meets the progress ``to_go`` (K,) at
+        # ``PREVIEW_S``.
+        basis = 0.5 * PREVIEW_S**2
+        accel = float(basis @ (to_go[:-1] - now.speed_mps * PREVIEW_S) / (basis @ basis))
         target = self.steer_target(now, reference, s_now, direction)
         return (
             Command(target, 0.0, abs(accel))
@@ -319,11 +322,3 @@ def _lateral_errors(
     # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
     lever = np.where(_UP_TO, ds * (normal @ left.T), 0.0)
     return error, lever @ d_yaw
-
-
-def _fit_acceleration(to_go: F64, speed: float) -> float:
-    """Return the constant acceleration whose motion best meets the progress ``to_go`` (K,) at
-    ``PREVIEW_S``.
-    """
-    basis = 0.5 * PREVIEW_S**2
-    return float(basis @ (to_go - speed * PREVIEW_S) / (basis @ basis))

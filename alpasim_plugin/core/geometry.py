@@ -21,7 +21,7 @@ def wrap_angle(angle_rad: npt.ArrayLike) -> F64:
         >>> float(wrap_angle(3 * np.pi / 2)) == -np.pi / 2
         True
     """
-    return np.asarray((np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi)
+    return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
 
 
 def quat_from_yaw(yaw_rad: npt.ArrayLike) -> F64:
@@ -37,7 +37,7 @@ def yaw_from_quat(quat: npt.ArrayLike) -> F64:
     xy plane.
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
-    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def matrix_from_quat(quat: npt.ArrayLike) -> F64:
@@ -110,7 +110,7 @@ def inverse(transform: F64) -> F64:
 
 def transform_points(transform: F64, points: F64) -> F64:
     """Map ``(N, 3)`` points by a ``(4, 4)`` transform."""
-    return np.asarray(points @ transform[:3, :3].T + transform[:3, 3])
+    return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def yaw_of(transform: F64) -> float:
@@ -132,7 +132,7 @@ def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
     w0 = np.where(small, 1 - f, np.sin((1 - f) * angle) / safe)
     w1 = np.where(small, f, np.sin(f * angle) / safe)
     out = w0 * q0 + w1 * q1
-    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
 def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
@@ -287,4 +287,4 @@ def speeds(track: Trajectory) -> F64:
         return np.zeros(len(track))
     t_s = (track.t_us - track.t_us[0]).astype(np.float64) * 1e-6
     v = np.gradient(track.xyz[:, :2], t_s, axis=0)
-    return np.asarray(np.hypot(v[:, 0], v[:, 1]))
+    return np.hypot(v[:, 0], v[:, 1])

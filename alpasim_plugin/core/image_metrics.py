@@ -71,9 +71,7 @@ def gaussian_blur(image: F32) -> F32:
     import cv2  # not for those who only ask whether a picture is black
 
     window = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
-    return np.asarray(
-        cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT)
-    )
+    return cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT)
 
 
 def is_black(rgb: U8) -> bool:

@@ -178,7 +178,7 @@ def motion_px(request: RenderRequest) -> float:
 
 def angle_between(a: F64, b: F64) -> F64:
     """Return the angles, radians, between directions ``(N, 3)``."""
-    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
 
 
 def rolling(width: int, height: int, along: Along, backwards: bool) -> F32:

@@ -113,7 +113,7 @@ class GroundStrip:
         path it goes on level.
         """
         s, left, z = self.frame.place(xy)
-        return np.asarray(
+        return (
             z
             + np.interp(s, self.knots, self.below)
             + np.interp(s, self.tilt_knots, self.tilt) * np.clip(left, -widest, widest)
@@ -164,9 +164,12 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
         spread[near] ** 2 + NOISE**2
     )
     coefficients, kept = fitted.solve(s[near], left[near], h[near], weight)
-    errors = _section_errors(
-        s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near]
-    )
+    # The median error of every section of the strip under the wheels that has eight good points.
+    error = h[near] - fitted.value(s[near], left[near], coefficients)
+    under = (np.abs(left[near]) < WHEELS) & (spread[near] < 0.03) & (np.abs(error) < LOOSE)
+    section = np.floor(s[near] / SECTION).astype(np.int64)
+    groups = [error[under & (section == one)] for one in np.unique(section[under])]
+    errors = np.array([np.median(group) for group in groups if len(group) >= 8])
     below, tilt, _ = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
     own = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
     return GroundStrip(
@@ -247,7 +250,7 @@ class _Strip:
 
     def value(self, s: F64, left: F64, coefficients: F64) -> F64:
         """Return the heights at points."""
-        return np.asarray(self.rows(s, left) @ coefficients)
+        return self.rows(s, left) @ coefficients
 
     def solve(self, s: F64, left: F64, h: F64, weight: F64) -> tuple[F64, Bool]:
         """Return the coefficients, and which points carry them: Tukey's weights, ever tighter."""
@@ -282,16 +285,6 @@ def _hats(s: F64, knots: F64) -> scipy.sparse.csr_matrix:
         (values, (np.concatenate([rows, rows]), np.concatenate([low, low + 1]))),
         shape=(len(s), len(knots)),
     )
-
-
-def _section_errors(s: F64, left: F64, error: F64, spread: F64) -> F64:
-    """Return the median error of every section of the strip under the wheels that has eight good
-    points.
-    """
-    under = (np.abs(left) < WHEELS) & (spread < 0.03) & (np.abs(error) < LOOSE)
-    section = np.floor(s / SECTION).astype(np.int64)
-    groups = [error[under & (section == one)] for one in np.unique(section[under])]
-    return np.array([np.median(group) for group in groups if len(group) >= 8])
 
 
 def _extended(path: F64, by: float, unit: float) -> F64:

@@ -98,7 +98,7 @@ def standing_obstacles(
 def _disc(radius_m: float) -> Bool:
     n = int(radius_m / CELL_M)
     x, y = np.mgrid[-n : n + 1, -n : n + 1]
-    return np.asarray(np.hypot(x, y) <= radius_m / CELL_M)
+    return np.hypot(x, y) <= radius_m / CELL_M
 
 
 def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:

@@ -185,7 +185,7 @@ def _normal(strip: GroundStrip) -> F64:
     A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
     slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
     normal = np.array([-slope[0], -slope[1], 1.0])
-    return np.asarray(normal / np.linalg.norm(normal))
+    return normal / np.linalg.norm(normal)
 
 
 def _scale(

@@ -105,7 +105,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
 
 def _colour(view: PosedView, at: F64) -> F64:
     row, column = min(int(at[1]), view.camera.height - 1), min(int(at[0]), view.camera.width - 1)
-    return np.asarray(view.rgb[row, column] / 255.0)
+    return view.rgb[row, column] / 255.0
 
 
 def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F64:
@@ -115,7 +115,7 @@ def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F
     J = slope @ R[tracks.view]
     H = np.zeros((tracks.count, 3, 3))
     np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
-    return np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2)
+    return np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2
 
 
 def _matched(views: Sequence[PosedView]) -> Tracks:

@@ -63,12 +63,12 @@ class Points:
     @property
     def rise_spread(self) -> F64:
         """Return the standard deviation of the third coordinate, ``(N,)``."""
-        return np.asarray(np.sqrt(np.maximum(self.covariance[:, 2, 2], 0.0)))
+        return np.sqrt(np.maximum(self.covariance[:, 2, 2], 0.0))
 
     @property
     def spread(self) -> F64:
         """Return the standard deviation of the place, all directions together, ``(N,)``."""
-        return np.asarray(np.sqrt(np.maximum(np.trace(self.covariance, axis1=1, axis2=2), 0.0)))
+        return np.sqrt(np.maximum(np.trace(self.covariance, axis1=1, axis2=2), 0.0))
 
 
 @dataclass(frozen=True, eq=False)

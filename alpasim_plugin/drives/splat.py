@@ -130,7 +130,9 @@ def _in_frame(
     Raises:
         InputError: The poses see too little of the model.
     """
-    places = [folder / TRAINED for folder in (file.parent, _folder_of(poses))]
+    places = [
+        folder / TRAINED for folder in (file.parent, (poses if poses.is_dir() else poses.parent))
+    ]
     stated = next((place for place in places if place.is_file()), None)
     notes: tuple[str, ...] = ()
     if stated is None:
@@ -149,10 +151,6 @@ def _in_frame(
             f"Give the poses in the model's own frame and unit; {TRAINED} of nerfstudio is read where it lies beside the model.",
         )
     return moved, notes
-
-
-def _folder_of(poses: Path) -> Path:
-    return poses if poses.is_dir() else poses.parent
 
 
 def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:

@@ -258,7 +258,7 @@ class GaussianCloud:
     def covariances(self) -> F64:
         """Return ``(N, 3, 3)`` float64 covariances ``(R diag s)(R diag s)^T``, metres^2."""
         factor = self.rotations() * self.scales.astype(np.float64)[:, None, :]
-        return np.asarray(factor @ np.swapaxes(factor, 1, 2))
+        return factor @ np.swapaxes(factor, 1, 2)
 
     @staticmethod
     def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:

@@ -72,7 +72,7 @@ def sh_colours(sh: npt.NDArray[np.floating], directions: npt.ArrayLike) -> F64:
     clamped at 0 below, not above.
     """
     basis = sh_basis(directions, sh.shape[1])
-    return np.asarray(np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, sh.astype(np.float64)), 0.0))
+    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, sh.astype(np.float64)), 0.0)
 
 
 def dc_from_rgb(rgb: npt.ArrayLike) -> F64:
@@ -106,7 +106,7 @@ def sh_rotation(rotation: F64, degree: int) -> F64:
     """
     directions, inverses = _sample_directions()
     turned = sh_basis(directions @ rotation)[:, degree * degree : (degree + 1) ** 2]
-    return np.asarray(inverses[degree] @ turned)
+    return inverses[degree] @ turned
 
 
 def rotate_sh(sh: npt.NDArray[np.floating], rotation: F64) -> npt.NDArray[np.floating]:

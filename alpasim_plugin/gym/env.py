@@ -198,7 +198,13 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             else Trajectories(vehicle, horizon_us, step_us)
         )
         self.action_space = self._actions.space
-        self.observation_space = self._space()
+        spaces: dict[str, Any] = {
+            "speed": Box(-SPEED_MPS, SPEED_MPS, (1,), np.float32),
+            "route": Box(-ROUTE_M, ROUTE_M, (ROUTE_POINTS, 3), np.float32),
+        }
+        if self._camera is not None:
+            spaces["camera"] = Box(0, 255, (self._camera.height, self._camera.width, 3), np.uint8)
+        self.observation_space = Dict(spaces)
         self._episode: _Episode | None = None
         self._over = True
         self._observation: Observation | None = None
@@ -244,7 +250,15 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         observation = next(driving)
         while observation.t_us < scenario.start_us + scenario.warmup_us:
             # The recording is forced: nothing to decide.
-            observation = driving.send(_straight_on(observation))
+            # A plan that keeps heading and speed for two seconds.
+            times = observation.t_us + np.arange(
+                0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64
+            )
+            ahead = observation.ego.speed_mps * (times - times[0]) * 1e-6
+            still = np.zeros(len(times))
+            observation = driving.send(
+                Plan(observation.t_us, times, np.column_stack([ahead, still]), still)
+            )
         self._observation = observation
         *_, facts = scorer.judge(recorder.taken())
         info = {"seed": seed, "scene": scenario.scene_id, "t_us": observation.t_us, **facts}
@@ -309,15 +323,6 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             for name, entry in scored["metrics"].items()
         }
 
-    def _space(self) -> Dict:
-        spaces: dict[str, Any] = {
-            "speed": Box(-SPEED_MPS, SPEED_MPS, (1,), np.float32),
-            "route": Box(-ROUTE_M, ROUTE_M, (ROUTE_POINTS, 3), np.float32),
-        }
-        if self._camera is not None:
-            spaces["camera"] = Box(0, 255, (self._camera.height, self._camera.width, 3), np.uint8)
-        return Dict(spaces)
-
     def _seen(self) -> dict[str, Any]:
         observation = self.observation
         speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
@@ -342,14 +347,6 @@ class _Watching(Recorder):
         """Return the instants since the last call."""
         new, self._new = self._new, []
         return new
-
-
-def _straight_on(observation: Observation) -> Plan:
-    """Return a plan that keeps heading and speed for two seconds."""
-    times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64)
-    ahead = observation.ego.speed_mps * (times - times[0]) * 1e-6
-    still = np.zeros(len(times))
-    return Plan(observation.t_us, times, np.column_stack([ahead, still]), still)
 
 
 def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:

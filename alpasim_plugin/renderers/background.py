@@ -57,17 +57,13 @@ def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
         cloud: In world coordinates.
         path: ``(N, 3)`` metres, world: the recorded drive.
     """
-    points = _bulk(cloud)
+    points = np.asarray(cloud.means[cloud.opacities > VISIBLE], dtype=np.float64)
     if not len(points):
         return Coverage(np.full(3, np.nan), np.full(3, np.nan), 0.0)
     low, high = np.percentile(points, BULK, axis=0)
     at = _along(path)
     covered = [_count_near(points, one) >= FEWEST for one in at]
     return Coverage(low, high, float(np.mean(covered)))
-
-
-def _bulk(cloud: GaussianCloud) -> F64:
-    return np.asarray(cloud.means[cloud.opacities > VISIBLE], dtype=np.float64)
 
 
 def _along(path: F64) -> F64:

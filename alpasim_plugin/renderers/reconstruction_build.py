@@ -18,7 +18,7 @@ import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, Box, Scenario
+from alpasim_plugin.core.types import Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -166,24 +166,23 @@ def rough_start(
     for view in views:
         if view.depth is not None and view.t_us in instants:
             rng = stream(scene_id, splat.seed, f"reconstruction.range.{view.name}")
-            wrong = view.depth * _factors(view, recipe.range_error, rng)
+            # By what the depth of every pixel ``(H, W)`` is multiplied: smooth over a patch, of
+            # this spread about one.
+            height, width = view.rgb.shape[:2]
+            cell = max(2.0, PATCH_SHARE * width)
+            coarse = rng.standard_normal((int(height / cell) + 2, int(width / cell) + 2)).astype(
+                np.float32
+            )
+            smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+            wrong = view.depth * np.asarray(
+                np.clip(1 + np.float32(recipe.range_error) * smooth, LEAST, MOST), dtype=np.float32
+            )
             chosen.append(replace(view, depth=wrong))
     start = start_from_depth(chosen, boxes, splat.points, scene_id, splat.seed)
     return Start(
         _sized(start.background, recipe),
         {name: _sized(cloud, recipe) for name, cloud in start.actors.items()},
     )
-
-
-def _factors(view: PosedView, spread: float, rng: np.random.Generator) -> F32:
-    """Return by what the depth of every pixel ``(H, W)`` is multiplied: smooth over a patch, of
-    this spread about one.
-    """
-    height, width = view.rgb.shape[:2]
-    cell = max(2.0, PATCH_SHARE * width)
-    coarse = rng.standard_normal((int(height / cell) + 2, int(width / cell) + 2)).astype(np.float32)
-    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.asarray(np.clip(1 + np.float32(spread) * smooth, LEAST, MOST), dtype=np.float32)
 
 
 def _sized(cloud: GaussianCloud, recipe: ReconstructionRecipe) -> GaussianCloud:

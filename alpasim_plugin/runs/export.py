@@ -32,7 +32,6 @@ from alpasim_plugin.core.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.parts import require_installed
 from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.core.types import (
-    RolloutLog,
     Scenario,
 )
 from alpasim_plugin.log import read_asl
@@ -304,11 +303,7 @@ def _export_rollout(
     target.mkdir(parents=True)
     copy_log(source, target / LOG_NAME, Renaming(uuid, names))
     (target / COMPLETE).touch()
-    _note_plans(rollout, run)
-
-
-def _note_plans(rollout: RolloutLog, run: ExportedRun) -> None:
-    """Note what AlpaSim's minADE will lack."""
+    # Note what AlpaSim's minADE will lack.
     reach_us = [
         int(sample.t_us[-1]) - plan.now_us for plan in rollout.plans for sample in plan.samples
     ]

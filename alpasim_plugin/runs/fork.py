@@ -234,7 +234,11 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     began = time.perf_counter()
     options = replace(past.options, baseline=past.cell.renderer.name)
     then = change.apply(past.cell, options.fixer)
-    original = _copied(past, root)
+    # Copy the original rollout's folder and return its manifest.
+    folder = root / past.cell.folder
+    shutil.copytree(past.folder, folder, dirs_exist_ok=True)
+    original = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
+    write_manifest(folder, original)
     key = digest(
         [
             past.cell.rollout_key,
@@ -277,15 +281,6 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
     summary = finish_run(root, [original, manifest], {"pool": pool})
     return RunResult(root, summary, 2, summary["failures"]["n_failed"])
-
-
-def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
-    """Copy the original rollout's folder and return its manifest."""
-    folder = root / past.cell.folder
-    shutil.copytree(past.folder, folder, dirs_exist_ok=True)
-    manifest = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
-    write_manifest(folder, manifest)
-    return manifest
 
 
 def _parts(

@@ -255,7 +255,7 @@ def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
     last is at ``t_us``.
     """
     start_us = max(t_us - camera.shutter_us, int(history.t_us[0]))
-    return np.asarray(interpolate(history, np.array([start_us, t_us])) @ camera.T_rig_camera)
+    return interpolate(history, np.array([start_us, t_us])) @ camera.T_rig_camera
 
 
 class Forecaster:

@@ -184,7 +184,13 @@ def make_plan(
     """
     options = replace(options, device=require_device(options.device))
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
-        _check_named_once(what, values)
+        if not values:
+            raise InputError(f"no {what} is named", f"Name at least one {what}.")
+        for value, count in Counter(values).items():
+            if count > 1:
+                raise InputError(
+                    f"{what} {value} is named {count} times", f"Name every {what} once."
+                )
     rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
@@ -235,14 +241,6 @@ def make_plan(
                 )
             )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
-
-
-def _check_named_once(what: str, values: Sequence[object]) -> None:
-    if not values:
-        raise InputError(f"no {what} is named", f"Name at least one {what}.")
-    for value, count in Counter(values).items():
-        if count > 1:
-            raise InputError(f"{what} {value} is named {count} times", f"Name every {what} once.")
 
 
 def _check_fixer_settings(

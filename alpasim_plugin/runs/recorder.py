@@ -195,23 +195,20 @@ class Recorder:
         """Log one camera frame."""
         if not self._only_watched:
             with self.stage("log"):
-                self._log_frame(frame, request)
+                if self._images != "none":
+                    self._log.render_request([request], self._images)
+                    self._log.camera_image(frame, self._images, request.camera.shutter_us)
+                opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
+                facts = {
+                    "t_us": frame.t_us,
+                    "camera": frame.camera,
+                    "opacity_mean": opacity,
+                    "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
+                    "events": " ".join(frame.events),
+                }
+                self._frames.append(facts | dict(frame.facts))
         if self._pictures is not None:
             self._pictures.add(frame)
-
-    def _log_frame(self, frame: Frame, request: RenderRequest) -> None:
-        if self._images != "none":
-            self._log.render_request([request], self._images)
-            self._log.camera_image(frame, self._images, request.camera.shutter_us)
-        opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
-        facts = {
-            "t_us": frame.t_us,
-            "camera": frame.camera,
-            "opacity_mean": opacity,
-            "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
-            "events": " ".join(frame.events),
-        }
-        self._frames.append(facts | dict(frame.facts))
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""

@@ -325,7 +325,18 @@ class KnownScenes:
             InputError: None of the places has it, or it cannot be read.
         """
         if scene_id not in self._read and scene_id in self._archives:
-            self._read[scene_id] = _from_archive(self._archives[scene_id], self._rails)
+            record = read_usdz(self._archives[scene_id], self._rails, needs_map=False)
+            scene = Scene(
+                record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
+            )
+            self._read[scene_id] = LoggedScene(
+                scene,
+                record.source,
+                record.content_hash,
+                record.notes,
+                record.actors,
+                record.world_origin,
+            )
         elif scene_id not in self._read:
             self._search(scene_id)
         if scene_id not in self._read:
@@ -358,16 +369,6 @@ def _scene_files(place: str) -> list[str]:
     if archives:
         return [str(one) for one in archives]
     return [ref.path for ref in load_suite(place)]
-
-
-def _from_archive(path: Path, rails: bool) -> LoggedScene:
-    record = read_usdz(path, rails, needs_map=False)
-    scene = Scene(
-        record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
-    )
-    return LoggedScene(
-        scene, record.source, record.content_hash, record.notes, record.actors, record.world_origin
-    )
 
 
 def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:

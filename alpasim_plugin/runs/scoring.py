@@ -79,7 +79,19 @@ def tabulate(
         ):
             row = _row(t_us, one.name, None if np.isnan(value) else value)
             rows.append(row | {"valid": valid, "reason": "" if valid else reason})
-    rows += _state_rows(rollout)
+    # Rows of the ego's state, for plots and stratified results.
+    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    state: Mapping[str, F64] = {
+        "ego_x_m": rig.xyz[:, 0],
+        "ego_y_m": rig.xyz[:, 1],
+        "ego_yaw_rad": yaw_from_quat(rig.quat),
+        "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
+    }
+    rows += [
+        _row(t, name, float(v))
+        for name, values in state.items()
+        for t, v in zip(rig.t_us.tolist(), values, strict=True)
+    ]
     for facts in frames:
         opacity = facts["opacity_mean"]
         rows.append(_row(facts["t_us"], "opacity_mean", opacity, "the renderer gives no opacity"))
@@ -102,22 +114,6 @@ def _row(t_us: int | None, metric: str, value: Any, why_missing: str = "") -> di
         "valid": not is_missing,
         "reason": why_missing if is_missing else "",
     }
-
-
-def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
-    """Return rows of the ego's state, for plots and stratified results."""
-    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    state: Mapping[str, F64] = {
-        "ego_x_m": rig.xyz[:, 0],
-        "ego_y_m": rig.xyz[:, 1],
-        "ego_yaw_rad": yaw_from_quat(rig.quat),
-        "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
-    }
-    return [
-        _row(t, name, float(v))
-        for name, values in state.items()
-        for t, v in zip(rig.t_us.tolist(), values, strict=True)
-    ]
 
 
 def _speeds(t_us: I64, xyz: F64) -> F64:

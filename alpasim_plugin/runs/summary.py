@@ -63,12 +63,20 @@ def write_summary(
     tables = tables or root
     rollouts = write_tables(root, manifests, tables)
     done = [m for m in manifests if m["status"] == "ok"]
+    failed = [m for m in manifests if m["status"] != "ok"]
+    by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
+    cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
     summary = {
         "preset": preset,
         "outcomes": outcome_table(*rollouts_of(manifests)),
         **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
-        "failures": _failures(manifests),
+        "failures": {
+            "n_failed": len(failed),
+            "n_rollouts": len(manifests),
+            "by_class": by_class,
+            "cells": cells,
+        },
         "fixers": by_policy(_of_policies(done), fixers),
         "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
         **more,
@@ -167,18 +175,6 @@ def pool_of(
         "wall_s": round(wall_s, 3),
         "frames": frames,
         "frames_per_s_total": round(frames / wall_s, 2) if frames and wall_s > 0 else None,
-    }
-
-
-def _failures(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    failed = [m for m in manifests if m["status"] != "ok"]
-    by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
-    cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
-    return {
-        "n_failed": len(failed),
-        "n_rollouts": len(manifests),
-        "by_class": by_class,
-        "cells": cells,
     }
 
 

@@ -130,7 +130,15 @@ class Actors:
     def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
         dt_s = (to_us - from_us) * 1e-6 / n
-        fixed = concatenate([_ego_bodies(ego, self.vehicle), self.replay.bodies(poses)])
+        yaw = yaw_of(ego.T_world_rig)
+        direction = np.array([np.cos(yaw), np.sin(yaw)])
+        centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
+        fixed = concatenate(
+            [
+                bodies_from(centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction),
+                self.replay.bodies(poses),
+            ]
+        )
         for driver in self.drivers:
             driver.close(from_us, to_us)
         for _ in range(n):
@@ -186,13 +194,6 @@ def make_actors(scenario: Scenario) -> Actors:
     """Return the actors of a scenario; the loop closes at ``start_us + warmup_us``."""
     closed_us = scenario.start_us + scenario.warmup_us
     return Actors(scenario.actors, scenario.vehicle, closed_us, scenario.lane_map, scenario.ground)
-
-
-def _ego_bodies(ego: EgoState, vehicle: Vehicle) -> Bodies:
-    yaw = yaw_of(ego.T_world_rig)
-    direction = np.array([np.cos(yaw), np.sin(yaw)])
-    centre = ego.T_world_rig[:2, 3] + vehicle.rear_axle_to_centre_m * direction
-    return bodies_from(centre, np.array([yaw]), [vehicle.box], ego.speed_mps * direction)
 
 
 class _Replay:
@@ -271,7 +272,7 @@ class _Standing:
 
     def present(self, t_us: int) -> Bool:
         """Return which of them are there."""
-        return np.asarray((self.first <= t_us) & (t_us <= self.last))
+        return (self.first <= t_us) & (t_us <= self.last)
 
     def on(self, path: Path) -> Spans | None:
         """Return their places on a line."""
@@ -372,7 +373,7 @@ class _Driver:
         if self.ground is None:
             return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))
-        return np.asarray(T @ se3([0.0, 0.0, self.actor.box.height_m / 2], [1.0, 0.0, 0.0, 0.0]))
+        return T @ se3([0.0, 0.0, self.actor.box.height_m / 2], [1.0, 0.0, 0.0, 0.0])
 
 
 def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:

@@ -62,15 +62,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
             f"{len(xyz)} points, cell {cell_m} m: a grid of {nx} x {ny} nodes, more than {MAX_NODES}",
             "check the extent, or use a larger cell",
         )
-    means = _cell_means(xyz, low, cell_m, nx)
-    xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
-    nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
-    z = _interpolate(means, nodes)
-    return HeightField(float(low[0]), float(low[1]), float(cell_m), z.reshape(ny, nx))
-
-
-def _cell_means(xyz: F64, low: F64, cell_m: float, nx: int) -> F64:
-    """Return the mean point ``(M, 3)`` of each occupied cell."""
+    # The mean point ``(M, 3)`` of each occupied cell.
     ij = np.floor((xyz[:, :2] - low) / cell_m).astype(np.int64)
     _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
@@ -78,7 +70,11 @@ def _cell_means(xyz: F64, low: F64, cell_m: float, nx: int) -> F64:
     sums = np.stack(
         [np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)], axis=1
     )
-    return np.asarray(sums / count[:, None] + xyz[0])
+    means = sums / count[:, None] + xyz[0]
+    xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
+    nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
+    z = _interpolate(means, nodes)
+    return HeightField(float(low[0]), float(low[1]), float(cell_m), z.reshape(ny, nx))
 
 
 def _interpolate(samples: F64, nodes: F64) -> F64:
@@ -87,7 +83,7 @@ def _interpolate(samples: F64, nodes: F64) -> F64:
     if len(samples) < 3 or np.linalg.matrix_rank(local, tol=1e-6) < 2:
         return np.asarray(nearest)  # a line of points spans no triangle
     z = scipy.interpolate.LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
-    return np.asarray(np.where(np.isnan(z), nearest, z))
+    return np.where(np.isnan(z), nearest, z)
 
 
 def height_at(field: HeightField, xy: F64) -> F64:
@@ -104,7 +100,7 @@ def height_at(field: HeightField, xy: F64) -> F64:
     fu, fv = u - i, v - j
     low = field.z[j, i] * (1 - fu) + field.z[j, i1] * fu
     high = field.z[j1, i] * (1 - fu) + field.z[j1, i1] * fu
-    return np.asarray(low * (1 - fv) + high * fv)
+    return low * (1 - fv) + high * fv
 
 
 def ground_pose(field: HeightField, x: float, y: float, yaw: float) -> F64:

@@ -22,7 +22,7 @@ def smoothstep(x: npt.ArrayLike) -> F64:
     outside [0, 1].
     """
     t = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
-    return np.asarray(t * t * t * (10.0 + t * (6.0 * t - 15.0)))
+    return t * t * t * (10.0 + t * (6.0 * t - 15.0))
 
 
 def sample_clothoid(
@@ -63,7 +63,7 @@ def sample_clothoid(
     x0, y0, yaw0 = start
 
     def heading(at: F64) -> F64:
-        return np.asarray(yaw0 + at * (start_curvature_per_m + 0.5 * rate * at))
+        return yaw0 + at * (start_curvature_per_m + 0.5 * rate * at)
 
     half = 0.5 * np.diff(s)[:, None]
     yaw_at_nodes = heading(0.5 * (s[1:] + s[:-1])[:, None] + half * _NODES)  # (N - 1, 8)

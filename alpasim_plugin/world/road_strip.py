@@ -184,7 +184,18 @@ def build_strip(
     Raises:
         InputError: The curve is tighter than the road is wide.
     """
-    _check_width(name, curve, profile)
+    tight = float(
+        np.max(
+            np.maximum(
+                curve[:, 3] * profile.left_extent_m(), -curve[:, 3] * profile.right_extent_m()
+            )
+        )
+    )
+    if tight > 0.9:
+        raise InputError(
+            f"{name}: curvature {float(np.max(np.abs(curve[:, 3]))):.4f} per m on a road {profile.left_extent_m():.1f} m wide to the left and {profile.right_extent_m():.1f} m to the right: its inner edge would fold",
+            "use a smaller curvature or fewer or narrower lanes",
+        )
     lines = make_lines(curve, profile)
     if joint is not None:
         for key, line in lines.items():
@@ -289,21 +300,6 @@ def _lane(
         right_paint=profile.edge_paint if outermost else profile.lane_paint,
         speed_limit_mps=profile.speed_limit_mps,
     )
-
-
-def _check_width(name: str, curve: F64, profile: Profile) -> None:
-    tight = float(
-        np.max(
-            np.maximum(
-                curve[:, 3] * profile.left_extent_m(), -curve[:, 3] * profile.right_extent_m()
-            )
-        )
-    )
-    if tight > 0.9:
-        raise InputError(
-            f"{name}: curvature {float(np.max(np.abs(curve[:, 3]))):.4f} per m on a road {profile.left_extent_m():.1f} m wide to the left and {profile.right_extent_m():.1f} m to the right: its inner edge would fold",
-            "use a smaller curvature or fewer or narrower lanes",
-        )
 
 
 def build_taper(

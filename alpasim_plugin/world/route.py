@@ -190,7 +190,15 @@ def route_from_log(
     if len(ego_log) == 0 or not np.isfinite(ego_log.xyz).all():
         found = "no poses" if len(ego_log) == 0 else "positions that are not finite"
         raise InputError(f"the recorded drive: {found}", "use a log with at least one finite pose")
-    driven = _thin(ego_log.xyz)
+    # Drop points nearer than `MIN_STEP_M` to the last kept one; the last point stays.
+    xyz = ego_log.xyz
+    kept = [0]
+    for i in range(1, len(xyz)):
+        if np.linalg.norm(xyz[i, :2] - xyz[kept[-1], :2]) >= MIN_STEP_M:
+            kept.append(i)
+    if kept[-1] != len(xyz) - 1 and np.linalg.norm(xyz[-1, :2] - xyz[kept[-1], :2]) > 0.05:
+        kept.append(len(xyz) - 1)
+    driven = np.asarray(xyz[kept], dtype=np.float64)
     index = LaneIndex(lane_map)
     if len(driven) < 2:
         driven = np.concatenate([driven, driven])
@@ -301,23 +309,18 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     if len(line) < 2:
         return out
     along = arc_lengths(line)
-    begin = _project_ahead(line, along, T_world_rig[:2, 3], yaw_of(T_world_rig))
+    # The arc length of the point of the route that is nearest in place and direction; ``along`` are
+    # those of its points.
+    step, share, offset = _on_segments(line, T_world_rig[:2, 3])
+    distance = np.linalg.norm(offset, axis=1)
+    error = np.abs(wrap_angle(np.arctan2(step[:, 1], step[:, 0]) - yaw_of(T_world_rig)))
+    i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
+    begin = float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
     at = begin + spacing_m * np.arange(n)
     seen = at <= along[-1] + 1e-9
     out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen], along))
     out[seen, 2] = 0.0
     return out
-
-
-def _project_ahead(line: F64, along: F64, xy: F64, yaw: float) -> float:
-    """Return the arc length of the point of the route that is nearest in place and direction;
-    ``along`` are those of its points.
-    """
-    step, share, offset = _on_segments(line, xy)
-    distance = np.linalg.norm(offset, axis=1)
-    error = np.abs(wrap_angle(np.arctan2(step[:, 1], step[:, 0]) - yaw))
-    i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
-    return float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
 
 
 def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
@@ -328,14 +331,3 @@ def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
     length2 = np.maximum(np.sum(step * step, axis=1), 1e-300)
     share = np.minimum(np.maximum(np.sum((xy - start) * step, axis=1) / length2, 0.0), 1.0)
     return step, share, xy - (start + share[:, None] * step)
-
-
-def _thin(xyz: F64) -> F64:
-    """Drop points nearer than `MIN_STEP_M` to the last kept one; the last point stays."""
-    kept = [0]
-    for i in range(1, len(xyz)):
-        if np.linalg.norm(xyz[i, :2] - xyz[kept[-1], :2]) >= MIN_STEP_M:
-            kept.append(i)
-    if kept[-1] != len(xyz) - 1 and np.linalg.norm(xyz[-1, :2] - xyz[kept[-1], :2]) > 0.05:
-        kept.append(len(xyz) - 1)
-    return np.asarray(xyz[kept], dtype=np.float64)

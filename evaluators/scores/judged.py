@@ -137,7 +137,7 @@ class Judged:
         first = np.searchsorted(
             self.ego.t_us, self.ego.t_us - round(nuplan.AGAINST_S * 1e6), side="right"
         )
-        return np.asarray(total[1:] - total[first])
+        return total[1:] - total[first]
 
     def direction(self) -> Part:
         """Return nuPlan's score of driving with the traffic."""

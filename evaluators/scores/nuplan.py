@@ -71,7 +71,7 @@ def bearing(ego: EgoStates, step: I64, points: F64) -> F64:
     """
     to = points - ego.rear_xy[step]
     along = np.sum(to * ego.heading[step], axis=1) / np.maximum(np.hypot(to[:, 0], to[:, 1]), 1e-12)
-    return np.asarray(np.arccos(np.clip(along, -1.0, 1.0)))
+    return np.arccos(np.clip(along, -1.0, 1.0))
 
 
 def collisions(ego: EgoStates, tracks: Tracks, astray: Bool | None = None) -> list[Collision]:

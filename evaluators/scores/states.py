@@ -55,7 +55,7 @@ class EgoStates:
     @property
     def speed(self) -> F64:
         """Give the speed ``(T,)``, m/s, without a sign."""
-        return np.asarray(np.hypot(self.velocity[:, 0], self.velocity[:, 1]))
+        return np.hypot(self.velocity[:, 0], self.velocity[:, 1])
 
     @property
     def heading(self) -> F64:
@@ -65,7 +65,7 @@ class EgoStates:
     @property
     def centre(self) -> F64:
         """Give the centres ``(T, 2)`` of the box."""
-        return np.asarray(self.rear_xy + self.ahead_m * self.heading)
+        return self.rear_xy + self.ahead_m * self.heading
 
     def boxes(self, xy: F64, yaw: F64) -> Footprints:
         """Return the ego's box at centres ``(N, 2)`` and headings ``(N,)``."""
@@ -94,7 +94,7 @@ class Tracks:
     @property
     def speed(self) -> F64:
         """Give the speeds ``(A, T)``, m/s."""
-        return np.asarray(np.hypot(self.velocity[..., 0], self.velocity[..., 1]))
+        return np.hypot(self.velocity[..., 0], self.velocity[..., 1])
 
     def boxes(self, actor: I64, step: I64, after_s: float = 0.0) -> Footprints:
         """Return the boxes of pairs ``(M,)`` of actor and step, moved on at their velocity for some

@@ -39,7 +39,12 @@ class NreRenderer(Renderer):
         self._scene = place.options.get("scene", scenario.scene_id)
         self._service = Service("SensorsimService", place.target, RendererError, retries=True)
         self._version = self._service.version()
-        self._check_scene()
+        scenes = self._service.call("get_available_scenes", common_pb2.Empty(), READY_S).scene_ids
+        if "*" not in scenes and self._scene not in scenes:
+            raise InputError(
+                f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}",
+                "give the service that scene, or name one of its own with ?scene=ID",
+            )
         self._names = self._camera_names(scenario, place.options.get("cameras"))
 
     def render(self, request: RenderRequest) -> Frame:
@@ -98,14 +103,6 @@ class NreRenderer(Renderer):
                 "see the service's log",
             ) from error
         return Frame(request.t_us, request.camera.name, rgb)
-
-    def _check_scene(self) -> None:
-        scenes = self._service.call("get_available_scenes", common_pb2.Empty(), READY_S).scene_ids
-        if "*" not in scenes and self._scene not in scenes:
-            raise InputError(
-                f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}",
-                "give the service that scene, or name one of its own with ?scene=ID",
-            )
 
     def _camera_names(self, scenario: Scenario, text: str | None) -> dict[str, str]:
         """Return the service's name of each of the scenario's cameras."""

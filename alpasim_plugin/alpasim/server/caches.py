@@ -170,7 +170,17 @@ class SceneCache:
         self._lock, self._loading = threading.Lock(), threading.Lock()
         for place in places:
             for source in sources_in(place):
-                self._enter(source)
+                scene_id = (
+                    usdz_scene_id(source)
+                    if str(source).endswith(".usdz")
+                    else load_scenario(source).scene_id
+                )
+                if scene_id in self._sources:
+                    raise InputError(
+                        f"scene {scene_id!r}: both {self._sources[scene_id]} and {source} have this id",
+                        "remove one",
+                    )
+                self._sources[scene_id] = source
 
     @property
     def ids(self) -> list[str]:
@@ -249,19 +259,6 @@ class SceneCache:
             renderer,
             references,
         )
-
-    def _enter(self, source: str | Path) -> None:
-        scene_id = (
-            usdz_scene_id(source)
-            if str(source).endswith(".usdz")
-            else load_scenario(source).scene_id
-        )
-        if scene_id in self._sources:
-            raise InputError(
-                f"scene {scene_id!r}: both {self._sources[scene_id]} and {source} have this id",
-                "remove one",
-            )
-        self._sources[scene_id] = source
 
 
 def sources_in(place: str | Path) -> list[str | Path]:

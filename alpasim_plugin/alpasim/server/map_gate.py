@@ -162,7 +162,7 @@ def line_pixels(drawn: U8) -> Bool:
     red, green, blue = (drawn[..., c].astype(np.int16) for c in range(3))
     top = np.maximum(np.maximum(red, green), blue)
     both = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
-    return np.asarray(both & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2)))
+    return both & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2))
 
 
 def top_hat(rgb: U8) -> U8:
@@ -171,7 +171,7 @@ def top_hat(rgb: U8) -> U8:
     """
     side = max(5, int(rgb.shape[1] * MARKING_SHARE) | 1)
     bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow markings alike
-    return np.asarray(cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8)))
+    return cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8))
 
 
 def pieces_of(lines: Bool) -> Pieces:

@@ -383,4 +383,4 @@ def _is_one_surface(inverse: F64) -> Bool:
     step = np.abs(np.diff(inverse, axis=0))
     beside = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)
     alike = step <= ONE_SURFACE * np.fmax(inverse[1:], inverse[:-1])
-    return np.asarray(alike | (step <= EVEN_STEP * np.fmin(beside[:-2], beside[2:])))
+    return alike | (step <= EVEN_STEP * np.fmin(beside[:-2], beside[2:]))

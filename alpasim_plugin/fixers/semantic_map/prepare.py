@@ -117,7 +117,15 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     outlines += [(name, line) for name, _, line in lines]
     outlines += [("crosswalk", ring) for ring in lane_map.crosswalks]
     for name, outline in outlines:
-        _require_points(name, outline)
+        if outline.ndim != 2 or outline.shape[1] != 3:
+            raise InputError(
+                f"{name}: an array of shape {outline.shape}", "give points (N, 3), metres, world"
+            )
+        if not np.isfinite(outline).all():
+            at = int(np.flatnonzero(~np.isfinite(outline).all(axis=1))[0])
+            raise InputError(
+                f"{name}: point {at} is {outline[at].tolist()}", "repair or drop this line"
+            )
     for pose, box in lane_map.signs:
         require_box("sign", pose, box)
     points = [outline for _, outline in outlines] + [
@@ -144,7 +152,7 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
 def box_corners(pose: F64, box: Box, origin: F64) -> F64:
     """Return the eight corners ``(8, 3)`` of a box relative to ``origin``."""
     sizes = np.array([box.length_m, box.width_m, box.height_m])
-    return np.asarray((CORNERS * sizes) @ pose[:3, :3].T + (pose[:3, 3] - origin))
+    return (CORNERS * sizes) @ pose[:3, :3].T + (pose[:3, 3] - origin)
 
 
 def require_box(name: str, pose: F64, box: Box) -> None:
@@ -155,16 +163,6 @@ def require_box(name: str, pose: F64, box: Box) -> None:
         raise InputError(
             f"{name}: a box of {sizes} m", "give finite sizes, length, width and height"
         )
-
-
-def _require_points(name: str, xyz: F64) -> None:
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise InputError(
-            f"{name}: an array of shape {xyz.shape}", "give points (N, 3), metres, world"
-        )
-    if not np.isfinite(xyz).all():
-        at = int(np.flatnonzero(~np.isfinite(xyz).all(axis=1))[0])
-        raise InputError(f"{name}: point {at} is {xyz[at].tolist()}", "repair or drop this line")
 
 
 def _pole(line: F64) -> F64:

@@ -163,4 +163,4 @@ def _morton_codes(points: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:
         (2, 0x249249249249),
     ):
         cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
-    return np.asarray(cell[0] | (cell[1] << np.uint64(1)) | (cell[2] << np.uint64(2)))
+    return cell[0] | (cell[1] << np.uint64(1)) | (cell[2] << np.uint64(2))

@@ -141,14 +141,12 @@ def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int,
     shift = (low - site.low) / CELL_M + 0.5 * scale - 0.5
     matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(
-            raster.astype(np.float32),
-            matrix,
-            (shape[1], shape[0]),
-            flags=flags,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+    return cv2.warpAffine(
+        raster.astype(np.float32),
+        matrix,
+        (shape[1], shape[0]),
+        flags=flags,
+        borderMode=cv2.BORDER_REPLICATE,
     )
 
 
@@ -220,7 +218,7 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
     soft: U8 = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
     if cell_m < CELL_M:
         _patches_and_cracks(site, soft, low, cell_m)
-    return np.asarray(soft.astype(np.float32) / 255.0)
+    return soft.astype(np.float32) / 255.0
 
 
 def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
@@ -287,7 +285,7 @@ def _coverage(
         cv2.fillConvexPoly(
             mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS
         )
-    return np.asarray(mask.astype(np.float32) / 255.0)
+    return mask.astype(np.float32) / 255.0
 
 
 FINE_M, COARSE_M = 0.125, 0.5
@@ -319,7 +317,7 @@ def _corridor(site: Site) -> Bool:
     h, w = -(-d.shape[0] // n), -(-d.shape[1] // n)
     padded = np.full((h * n, w * n), np.inf, dtype=np.float32)
     padded[: d.shape[0], : d.shape[1]] = d
-    return np.asarray(padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M)
+    return padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
 
 
 def _window(site: Site, tiles: Bool, cell_m: float) -> tuple[int, int, int, int]:

@@ -91,7 +91,7 @@ def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000
     more from one row of tiles to the next.
     """
     tile = np.floor(xy / size_m).astype(np.int64)
-    return np.asarray(tile[:, 1] * row + tile[:, 0])
+    return tile[:, 1] * row + tile[:, 0]
 
 
 def nodes_by_tile(

@@ -52,7 +52,7 @@ class GroundFrame:
         """Map ground coordinates ``(N, 2)`` to world points ``(N, 2)``."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         x, y = plan[:, 0], plan[:, 1]
-        return np.asarray(np.stack([c * x - s * y, s * x + c * y], axis=1) + self.origin_xy)
+        return np.stack([c * x - s * y, s * x + c * y], axis=1) + self.origin_xy
 
     def turned(self, plan: F64) -> F64:
         """Turn ground directions ``(N, 2)`` to level world directions ``(N, 3)``."""
@@ -142,9 +142,7 @@ def distance_m(mask: Bool) -> F32:
     """
     if not mask.any():
         return np.full(mask.shape, 1.0e3, dtype=np.float32)
-    return np.asarray(
-        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M)
-    )
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M)
 
 
 def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
@@ -338,7 +336,7 @@ def places(line: F64, spacing_m: float, first_m: float = 0.0) -> Roadside:
 
 def unit(vectors: F64) -> F64:
     """Return rows ``(N, D)`` of length one; a row of zeros stays."""
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
 def left_of(along: F64) -> F64:

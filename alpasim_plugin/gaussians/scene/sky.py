@@ -86,9 +86,7 @@ class Sky:
             columns < 0
         )  # all lie within a turn of column 0: what % would give, in a tenth of its time
         rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
-        return np.asarray(
-            cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
-        )
+        return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
 
 
 def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
