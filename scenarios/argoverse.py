@@ -66,6 +66,7 @@ RASTER_BLOCK = 5
 GROUND_CELL_M = 1.5
 
 EGO_CATEGORY = "EGO_VEHICLE"
+NOBODY = "no annotations of other road users, as in the test split: the ego drives alone"
 # Ford Fusion Hybrid of the recording fleet; size as annotated in logs that carry EGO_VEHICLE rows.
 VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheelbase_m=2.85)
 # The recorded frame sits in the rear axle, one wheel radius above the road: measured against the
@@ -294,8 +295,8 @@ class EgoPoses:
 def read_argoverse(path: str | Path) -> RecordedLog:
     """Read one log folder.
 
-    The folder holds ``city_SE3_egovehicle.feather``, ``annotations*.feather`` and ``map/`` with the
-    vector map, the ground raster and its transform. Cuboids come in the ego frame of their sweep
+    The folder holds ``city_SE3_egovehicle.feather``, ``map/`` with the vector map, the ground
+    raster and its transform, and, except in the test split, ``annotations*.feather``. Cuboids come in the ego frame of their sweep
     and are brought to the world with the pose of exactly that time.
 
     Raises:
@@ -304,16 +305,19 @@ def read_argoverse(path: str | Path) -> RecordedLog:
     folder = Path(path)
     files = SourceFiles()
     pose_path = files.only(folder, ("city_SE3_egovehicle.feather",), "the ego poses")
-    box_path = files.only(
-        folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
-    )
     map_path = files.only(folder / "map", ("log_map_archive_*.json",), "the vector map")
     poses = read_ego_poses(files, pose_path)
     origin = np.round(poses.xyz[0])  # whole metres: the subtraction loses nothing
     ego_log, dropped = _rig_log(files, pose_path, poses, origin)
     lane_map, notes = read_map(files, map_path, origin)
     ground = read_ground(files, folder / "map", lane_map, ego_log.xyz, origin)
-    actors, actor_notes = read_actors(files, box_path, poses, origin)
+    actors: tuple[Actor, ...] = ()
+    actor_notes: tuple[str, ...] = (NOBODY,)
+    if any(folder.glob("annotations*.feather")):
+        box_path = files.only(
+            folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
+        )
+        actors, actor_notes = read_actors(files, box_path, poses, origin)
     own = (
         [f"{dropped} ego poses share their microsecond with the pose before and were dropped"]
         if dropped
@@ -375,7 +379,7 @@ def read_actors(
     ego itself are left out.
 
     Raises:
-        InputError: No cuboid, a sweep without an ego pose at its time, a bad size, or a track whose
+        InputError: A sweep without an ego pose at its time, a bad size, or a track whose
             times do not increase.
     """
     sizes = ("length_m", "width_m", "height_m")
@@ -387,7 +391,7 @@ def read_actors(
     uuid, category = table["track_uuid"].astype(str), table["category"].astype(str)
     others = np.nonzero(category != EGO_CATEGORY)[0]
     if len(others) == 0:
-        raise files.fail(path, "no cuboids of other road users", "use a log with annotations")
+        return (), (NOBODY,)
     row = np.searchsorted(poses.t_ns, t_ns)
     row = np.minimum(row, len(poses.t_ns) - 1)
     lost = poses.t_ns[row] != t_ns

@@ -21,6 +21,7 @@ from alpasim_plugin.core.types import I64, U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
+SQUARE = 1e-3  # by how much a turn may miss a quarter
 BT601, BT709 = 5, 1  # matrices of ITU-T H.273
 WRITABLE = {
     UNSPECIFIED: BT601,
@@ -73,7 +74,7 @@ class TimedFrame(NamedTuple):
 @dataclass(frozen=True)
 class VideoFormat:
     """What a video states about itself; pictures are upright, so width and height are those after
-    the rotation in its metadata.
+    the quarter turns and mirrors of its display matrix.
 
     Attributes:
         width, height: Pixels.
@@ -82,7 +83,7 @@ class VideoFormat:
         frames: Number of frames that the container claims, None where it claims none.
         pixel_aspect: Width of a pixel over its height.
         colour: Matrix, primaries and transfer as numbered by ITU-T H.273; 2 where not stated.
-        audio: Whether sound comes with it.
+        left_out: What the file holds besides and is not read.
     """
 
     width: int
@@ -92,7 +93,7 @@ class VideoFormat:
     frames: int | None
     pixel_aspect: Fraction
     colour: tuple[int, int, int]
-    audio: bool
+    left_out: tuple[str, ...]
 
 
 class VideoReader:
@@ -168,7 +169,8 @@ class VideoReader:
         if not self._container.streams.video:
             kinds = ", ".join(sorted({stream.type for stream in self._container.streams}))
             raise self._refusal(f"no video stream ({kinds} only)" if kinds else "no streams at all")
-        self._stream = self._container.streams.video[0]
+        # The track that players choose: neither a cover nor a preview.
+        self._stream = self._container.streams.best("video")
         self._stream.thread_type = "AUTO"
         self._decoded = self._decode()
         first = next(self._decoded, None)
@@ -186,8 +188,13 @@ class VideoReader:
             frames=self._stream.frames or None,
             pixel_aspect=1 / aspect if turned else aspect,
             colour=(int(first.colorspace), int(first.color_primaries), int(first.color_trc)),
-            audio=bool(self._container.streams.audio),
+            left_out=self._left_out(),
         )
+
+    def _left_out(self) -> tuple[str, ...]:
+        others = [one for one in self._container.streams.video if one.index != self._stream.index]
+        tracks = [f"video track {one.index} ({one.width}x{one.height})" for one in others]
+        return (*tracks, "sound") if self._container.streams.audio else tuple(tracks)
 
     def _check_end(self, count: int, reached: int) -> None:
         """Refuse a file that was cut short: fewer frames than it claims, and an end well before the
@@ -221,8 +228,27 @@ class VideoReader:
         image: U8 = frame.to_ndarray(
             format="rgb24", interpolation=exact_conversion(self._av), threads=1
         )
-        turns = round(frame.rotation / 90) % 4  # counter-clockwise
-        return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
+        return np.ascontiguousarray(self._displayed(frame, image))
+
+    def _displayed(self, frame: Any, image: U8) -> U8:
+        """Return an image under the frame's display matrix: quarter turns and mirrors.
+
+        The matrix, of 32 bits fixed point, takes a pixel (x, y) to (a x + c y, b x + d y).
+        """
+        stated = frame.side_data.get("DISPLAYMATRIX")
+        if stated is None:
+            return image
+        matrix = np.frombuffer(bytes(stated), dtype=np.int32).reshape(3, 3)[:2, :2]
+        turn = matrix / max(int(np.abs(matrix).max()), 1)
+        (a, b), (c, d) = np.rint(turn).tolist()
+        if np.abs(turn - np.rint(turn)).max() > SQUARE or abs(a * d - b * c) != 1:
+            raise self._refusal(
+                f"a display matrix {turn.round(3).tolist()}, which is neither a quarter turn nor a mirror",
+                "rewrite it upright, for example with ffmpeg -i IN OUT",
+            )
+        if a == 0:
+            image, a, d = image.swapaxes(0, 1), c, b
+        return image[:: int(d), :: int(a)]
 
     def _refusal(self, found: str, do: str = GIVE) -> InputError:
         return InputError(f"{self.path}: {found}", do)

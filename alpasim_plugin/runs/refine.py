@@ -58,7 +58,7 @@ class PictureFolderReader:
         height, width = self._read(self.names[0]).shape[:2]
         unstated = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED)
         self.format = VideoFormat(
-            width, height, None, PERIOD, len(self.names), Fraction(1), unstated, False
+            width, height, None, PERIOD, len(self.names), Fraction(1), unstated, ()
         )
 
     def __enter__(self) -> Self:
@@ -201,7 +201,7 @@ class RefineSummary:
         events: Number of frames that a guard replaced by the unrefined ones, by event.
         refused_psnr_db: Where the fixer changed a frame beyond the limit, that frame's PSNR against
             the source; from there on the source's frames were written as they are.
-        audio_left_out: Whether the source has sound; the result has none.
+        left_out: What the source holds besides, such as sound; the result has none of it.
     """
 
     fixer: str
@@ -219,7 +219,7 @@ class RefineSummary:
     max_levels: int
     events: Mapping[str, int]
     refused_psnr_db: float | None
-    audio_left_out: bool
+    left_out: tuple[str, ...]
 
 
 def refine_video(
@@ -291,7 +291,7 @@ def _summary(fixer: Fixer, source: VideoFormat, stats: StreamStats, wall_s: floa
         max_levels=difference.max_levels,
         events=dict(stats.events),
         refused_psnr_db=stats.refused_psnr_db,
-        audio_left_out=source.audio,
+        left_out=source.left_out,
     )
 
 

@@ -38,7 +38,6 @@ def test_folder_that_is_not_there(tmp_path):
     "name",
     [
         "city_SE3_egovehicle.feather",
-        "annotations.feather",
         "map/log_map_archive_x____PIT_city_1.json",
         "map/x___img_Sim2_city.json",
     ],
@@ -167,13 +166,6 @@ def test_map_without_what_every_map_has(tmp_path, document, found):
     error = refused(write_argoverse(tmp_path / "x", document=document))
     assert found in error.message
     assert "log_map_archive" in error.message
-
-
-def test_log_without_cuboids(tmp_path):
-    empty = {k: np.array(v)[:0] for k, v in cuboids(TRACKS).items()}
-    error = refused(write_argoverse(tmp_path / "x", annotations=empty))
-    assert "no cuboids of other road users" in error.message
-    assert "annotations.feather" in error.message
 
 
 def test_log_of_one_pose(tmp_path):
