@@ -1,0 +1,237 @@
+"""A CUDA device pretended on the CPU: tensors that say ``cuda:0``, compute on the CPU, refuse to be
+mixed with tensors of the host, and count launches, copies and waits.
+
+What cannot be pretended: speed, memory, rounding, and kernels that run at the same time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+DEVICE = torch.device("cuda:0")
+HOST = torch.device("cpu")
+# Operations whose result the host must wait for, since it is a number or decides a size.
+WAITS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal", "is_nonzero"}
+# Operations that make no kernel run.
+VIEWS = {
+    "alias", "as_strided", "detach", "diagonal", "empty", "empty_strided", "expand", "permute",
+    "select", "slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind",
+    "unsqueeze", "view", "_unsafe_view", "_reshape_alias", "unfold", "lift_fresh", "new_empty",
+    "empty_like",
+}  # fmt: skip
+
+
+@dataclass
+class Traffic:
+    """What a device did since `reset`."""
+
+    launches: int = 0
+    waits: Counter[str] = field(default_factory=Counter)
+    bytes_up: int = 0
+    bytes_down: int = 0
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.launches = self.bytes_up = self.bytes_down = 0
+        self.waits.clear()
+
+
+traffic = Traffic()
+
+
+class OnDevice(torch.Tensor):
+    """A tensor of the pretended device; ``held`` is the tensor of the host that it computes with."""
+
+    held: torch.Tensor
+
+    @staticmethod
+    def __new__(cls, held: torch.Tensor) -> OnDevice:
+        made = torch.Tensor._make_wrapper_subclass(
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=HOST,
+        )
+        made.held = held
+        return made
+
+    def __repr__(self, *, tensor_contents: Any = None) -> str:
+        return f"OnDevice({tuple(self.shape)}, {self.dtype})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+
+def _wrap(value: Any) -> Any:
+    is_host = isinstance(value, torch.Tensor) and not isinstance(value, OnDevice)
+    return OnDevice(value) if is_host else value
+
+
+def _unwrap(value: Any) -> Any:
+    if isinstance(value, OnDevice):
+        return value.held
+    return HOST if isinstance(value, torch.device) else value
+
+
+def _run(func: Any, args: Any, kwargs: Any) -> Any:
+    """Run an operation, on the device if a tensor of it takes part or it is asked for there."""
+    name = func.overloadpacket.__name__
+    flat, _ = tree_flatten((args, kwargs))
+    ours = [x for x in flat if isinstance(x, OnDevice)]
+    theirs = [x for x in flat if isinstance(x, torch.Tensor) and not isinstance(x, OnDevice)]
+    asked = [x for x in flat if isinstance(x, torch.device)]
+    wants_device = any(device.type == "cuda" for device in asked)
+    wants_host = any(device.type == "cpu" for device in asked)
+    result = func(*tree_map(_unwrap, args), **tree_map(_unwrap, kwargs))
+    if name == "_to_copy" and ours and wants_host:
+        return _downloaded(result)
+    if name == "_to_copy" and theirs and wants_device:
+        return _uploaded(result)
+    if name == "copy_" and ours and theirs:
+        target_is_ours = isinstance(args[0], OnDevice)
+        _uploaded(theirs[0]) if target_is_ours else _downloaded(ours[0].held)
+        return args[0]
+    if not ours and not wants_device:
+        return result
+    mixed = [tensor for tensor in theirs if tensor.ndim > 0]
+    if mixed:
+        raise RuntimeError(
+            f"{func}: a tensor of the host {tuple(mixed[0].shape)} beside the device"
+        )
+    if name in WAITS:
+        traffic.waits[name] += 1
+        return tree_map(_wrap, result) if name != "_local_scalar_dense" else result
+    if name not in VIEWS:
+        traffic.launches += 1
+    written = func._schema.arguments[0].alias_info if func._schema.arguments else None
+    if written is not None and written.is_write and result is ours[0].held:
+        return args[0]
+    return tree_map(_wrap, result)
+
+
+def _downloaded(tensor: torch.Tensor) -> torch.Tensor:
+    traffic.bytes_down += tensor.nbytes
+    traffic.waits["copy to the host"] += 1
+    return tensor
+
+
+def _uploaded(tensor: torch.Tensor) -> OnDevice:
+    traffic.bytes_up += tensor.nbytes
+    return OnDevice(tensor.clone())
+
+
+class _Dispatch(TorchDispatchMode):
+    """Take operations that no tensor of the device takes part in: those that make one."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+
+class _Functions(TorchFunctionMode):
+    """Answer what torch would ask a real device before it dispatches."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = getattr(func, "__name__", "")
+        first = args[0] if args else None
+        asked = [*args[1:], *kwargs.values()]
+        device = next((d for d in map(_device_of, asked) if d is not None), None)
+        if name == "__get__" and isinstance(first, OnDevice):
+            attribute = getattr(getattr(func, "__self__", None), "__name__", "")
+            if attribute in ("device", "is_cuda", "is_cpu"):
+                return {"device": DEVICE, "is_cuda": True, "is_cpu": False}[attribute]
+        if name == "numpy" and isinstance(first, OnDevice):
+            raise TypeError("a tensor of the device has no array: copy it to the host first")
+        if name in ("to", "cpu", "cuda") and isinstance(first, torch.Tensor):
+            return _moved(first, HOST if name == "cpu" else device, func, args, kwargs)
+        if device is not None and device.type == "cuda" and name != "_parse_to":
+            kwargs = {key: value for key, value in kwargs.items() if key != "device"}
+            return tree_map(_wrap, func(*args, **kwargs))
+        return func(*args, **kwargs)
+
+
+def _moved(
+    tensor: torch.Tensor, device: torch.device | None, func: Any, args: Any, kwargs: Any
+) -> Any:
+    """Move a tensor, then convert its type if that was asked for as well."""
+    if device is None or (device.type == "cuda") == isinstance(tensor, OnDevice):
+        rest = [value for value in args[1:] if _device_of(value) is None]
+        others = {key: value for key, value in kwargs.items() if key != "device"}
+        return func(tensor, *rest, **others) if rest or others else tensor
+    moved = _uploaded(tensor) if device.type == "cuda" else _downloaded(tensor.held.clone())  # type: ignore[attr-defined]
+    types = [value for value in (*args[1:], *kwargs.values()) if isinstance(value, torch.dtype)]
+    return moved.to(types[0]) if types else moved
+
+
+def _device_of(value: Any) -> torch.device | None:
+    if isinstance(value, torch.device):
+        return value
+    if isinstance(value, str) and value.partition(":")[0] in ("cpu", "cuda"):
+        return torch.device(value)
+    return None
+
+
+class _Launches:
+    """A Triton kernel that takes tensors of the device, and is interpreted on the host."""
+
+    def __init__(self, kernel: Any) -> None:
+        self.kernel = kernel
+
+    def __getitem__(self, grid: tuple[int, ...]) -> Any:
+        def launch(*args: Any, **constants: Any) -> None:
+            if any(isinstance(x, torch.Tensor) and not isinstance(x, OnDevice) for x in args):
+                raise RuntimeError("a kernel was given a tensor of the host")
+            traffic.launches += 1
+            with torch.utils._python_dispatch._disable_current_modes():
+                self.kernel[grid](*map(_unwrap, args), **constants)
+
+        return launch
+
+
+class _Kernels:
+    """The module of Triton kernels, for the pretended device."""
+
+    def __init__(self, module: Any) -> None:
+        self.module = module
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.module, name)
+        return _Launches(value) if hasattr(value, "__getitem__") else value
+
+
+@contextmanager
+def pretended_device(patch: Any) -> Iterator[Traffic]:
+    """Let torch have one CUDA device for a while.
+
+    Args:
+        patch: pytest's ``monkeypatch``.
+    """
+    from alpasim_plugin.fixers import pixel_fixer
+    from alpasim_plugin.gaussians.raster import rasterize_triton, triton_kernels
+
+    patch.setattr(torch.cuda, "is_available", lambda: True)
+    patch.setattr(torch.cuda, "device_count", lambda: 1)
+    patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
+    # Subclasses of tensors do not work in inference mode; gradients are off in either.
+    plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]
+    patch.setattr(pixel_fixer, "fix_frame", plain)
+    overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
+    torch.__future__.set_overwrite_module_params_on_conversion(True)
+    traffic.reset()
+    try:
+        with _Functions(), _Dispatch():
+            yield traffic
+    finally:
+        torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
