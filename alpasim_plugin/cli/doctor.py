@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -13,7 +14,9 @@ import typer
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core import places
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.runs.provenance import hardware, versions
 
@@ -21,9 +24,14 @@ EPILOG = "Example: `simrun doctor --json`"
 
 
 def doctor(
+    gpu: Annotated[
+        bool, Flag("Compare the first CUDA device with the CPU, then time it.", "--gpu")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Test each part on a small case and report what works, what does not, and what to do."""
+    if gpu:
+        _check_gpu(as_json)
     rows = []
     for name, check in CHECKS.items():
         row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}
@@ -41,6 +49,21 @@ def doctor(
     facts = {"hardware": hardware(), "versions": versions(), "checks": rows}
     show(as_json, facts, *lines)
     raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
+
+
+def _check_gpu(as_json: bool) -> None:
+    """Print one line a section as it ends, then exit: 0 if the card agrees with the CPU."""
+    from alpasim_plugin.runs.gpu_check import check_gpu
+
+    device = require_device("cuda")
+    sections = {}
+    for name, facts in check_gpu(device):
+        sections[name] = facts
+        if not as_json:
+            show(False, facts, f"{name:>12}  {json.dumps(facts)}")
+    if as_json:
+        show(True, {"device": device, "sections": sections})
+    raise typer.Exit(0 if all(facts["ok"] for facts in sections.values()) else 4)
 
 
 def _raster(backend: Literal["cpu", "triton"]) -> str:

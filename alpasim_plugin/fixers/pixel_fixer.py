@@ -288,7 +288,7 @@ def _grey_levels(images: Tensor) -> Tensor:
 def download(*parts: Tensor) -> list[Any]:
     """Return tensors as arrays, brought to the host in one copy."""
     data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
-    pieces = data.cpu().split([part.nbytes for part in parts])
+    pieces = torch.split(data.cpu(), [part.nbytes for part in parts])
     return [
         piece.clone().view(part.dtype).view(part.shape).numpy()
         for piece, part in zip(pieces, parts, strict=True)

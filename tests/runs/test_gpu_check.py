@@ -1,0 +1,39 @@
+"""The check of a card, tried on the CPU: its sections, and how it reports those that fail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.runs import gpu_check
+
+
+def test_a_section_runs_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_check, "SECTIONS", {"card": gpu_check.card})
+    assert dict(gpu_check.check_gpu("cpu")) == {"card": {"ok": True, "torch": torch.__version__}}
+
+
+def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_check, "SECTIONS", {"unknown": gpu_check.card, "card": gpu_check.card})
+    facts = dict(gpu_check.check_gpu("cpu"))
+    assert not facts["unknown"]["ok"]
+    assert "unknown" in facts["unknown"]["why"]
+    assert facts["card"]["ok"]
+    late = dict(gpu_check.check_gpu("cpu", budget_s=0.0))
+    assert not any(section["ok"] for section in late.values())
+
+
+def test_images_that_differ_fail_the_section() -> None:
+    image = np.zeros((10, 10, 3), np.uint8)
+    same = gpu_check.compared(lambda: image, lambda: image)
+    other = gpu_check.compared(lambda: image + 9, lambda: image)
+    assert (same["levels"], other["levels"]) == (0, 9)
+    assert gpu_check._judged({"ok": True, "1x1": same})["ok"]
+    assert not gpu_check._judged({"ok": True, "1x1": other})["ok"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
+def test_without_a_card_the_check_ends_with_an_error_of_the_machine() -> None:
+    assert run_command(["doctor", "--gpu"]) == 4
