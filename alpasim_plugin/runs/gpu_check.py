@@ -21,6 +21,7 @@ import numpy as np
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.gaussians.scene.log_views import log_actors
@@ -173,7 +174,7 @@ def _rendered(renderer: Renderer, request: RenderRequest) -> Any:
 def _streaming(device: str, width: int, height: int) -> Callable[[], Any]:
     """Return a call that fixes the next frame of a drawn clip."""
     session = make_fixer("onefixer", scene_id="gpu-check", device=device)
-    rng = np.random.default_rng(0)
+    rng = stream("gpu-check", 0, "clip")
     image = rng.integers(0, 255, (height, width, 4), dtype=np.uint8)
     opacity = rng.random((height, width)).astype(np.float32)
     times_us = iter(range(0, 10**9, 100_000))
