@@ -23,17 +23,19 @@ from alpasim_plugin.world.idm import (
     bodies_from,
     concatenate,
     find_leader,
+    find_leaders,
     idm_acceleration,
     moved_on,
     nearest_ahead,
     spans,
 )
-from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.path import Lines, Path
 from scenarios.ego_path import track_on_path
 
 LOOKAHEAD_S = tuple(float(t) for t in np.arange(0.5, 4.01, 0.5))
 TIMES_S = np.array([0.0, *LOOKAHEAD_S])
 HORIZON_M = 80.0
+FOLLOWED_M = 120.0  # reactive traffic looks so far ahead
 SIDE_M = 0.3
 STANDING_M = 0.05  # a track that never moves farther than this stands
 
@@ -234,6 +236,12 @@ def drive(
         for f in followers
     }
     cars = [_Car(f, standing[id(f.path)]) for f in followers]
+    paths = {id(f.path): f.path for f in followers}
+    number = {key: i for i, key in enumerate(paths)}
+    lines = Lines(list(paths.values())) if paths else None
+    line = np.array([number[id(f.path)] for f in followers], dtype=np.int64)
+    half_widths = np.array([f.box.width_m / 2 for f in followers])
+    horizons = np.full(len(cars), FOLLOWED_M)
     log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
@@ -244,10 +252,12 @@ def drive(
         own_row = {
             id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))
         }
-        for car in cars:
-            half_width_m = car.f.box.width_m / 2
-            row = own_row.get(id(car), -1)
-            car.decide(find_leader(car.f.path, car.front_s, half_width_m, everybody, own_row=row))
+        if lines is not None:
+            rows = np.array([own_row.get(id(car), -1) for car in cars], dtype=np.int64)
+            fronts = np.array([car.front_s for car in cars])
+            found = find_leaders(lines, line, fronts, half_widths, everybody, horizons, rows)
+            for car, leader in zip(cars, found, strict=True):
+                car.decide(leader)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)

@@ -14,7 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    quat_from_yaw,
+    se2,
+    se3,
+    slerp,
+    wrap_angle,
+    yaw_of,
+)
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -26,22 +34,23 @@ from alpasim_plugin.core.types import (
     Scenario,
     Vehicle,
 )
-from alpasim_plugin.world.ground import ground_pose
+from alpasim_plugin.world.ground import ground_pose, ground_poses
 from alpasim_plugin.world.idm import (
     NO_BODIES,
     Bodies,
     IdmParams,
+    Leader,
     Spans,
     bodies_from,
     concatenate,
-    find_leader,
+    find_leaders,
     idm_acceleration,
     moved_on,
     nearest_ahead,
     spans,
     wanted_gap_m,
 )
-from alpasim_plugin.world.path import Path, polyline_path, smoothstep
+from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep
 from alpasim_plugin.world.route import LaneIndex
 
 MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
@@ -80,6 +89,10 @@ class Actors:
             else None
         )
         self.drivers = [_Driver(a, index, ground) for a in actors if a.behaviour.kind == "idm"]
+        paths = [driver.path for driver in self.drivers if driver.path is not None]
+        self._lines = Lines(paths) if paths else None
+        numbered = (driver for driver in self.drivers if driver.path is not None)
+        self._line = {id(driver): number for number, driver in enumerate(numbered)}
         self.replay = _Replay([a for a in actors if a.behaviour.kind != "idm"])
         self.standing = _Standing([a for a in actors if a.behaviour.kind != "idm" and a.is_static])
         self.reset()
@@ -109,8 +122,12 @@ class Actors:
         if self.drivers:
             if self.t_us is not None and t_us > self.closed_us:
                 self._advance(max(self.t_us, self.closed_us), t_us, ego, poses)
+            driving = [driver for driver in self.drivers if driver.motion is not None]
+            placed = dict(zip(map(id, driving), self._poses(driving), strict=True))
             for driver in self.drivers:
-                pose = driver.pose(t_us, self.closed_us, driver.motion)
+                pose = placed.get(id(driver))
+                if pose is None:
+                    pose = driver.pose(t_us, self.closed_us, None)
                 if pose is not None:
                     poses[driver.actor.actor_id] = pose
         self.t_us = t_us
@@ -143,12 +160,49 @@ class Actors:
             driver.close(from_us, to_us)
         for _ in range(n):
             driving = [d for d in self.drivers if d.motion is not None]
+            if not driving or self._lines is None:
+                return
             present = self.standing.present(to_us)
-            everybody = concatenate([fixed, *(d.bodies() for d in driving)])
-            for row, driver in enumerate(driving, start=len(fixed.xy)):
-                driver.decide(everybody, row, self.standing, present)
+            line, s_m, offset_m, speed = self._where(driving)
+            xyz, yaw = self._lines.at(line, s_m, offset_m)
+            velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+            boxes = [driver.actor.box for driver in driving]
+            everybody = concatenate([fixed, bodies_from(xyz[:, :2], yaw, boxes, velocity)])
+            found = find_leaders(
+                self._lines,
+                line,
+                s_m + [box.length_m / 2 for box in boxes],
+                np.array([box.width_m / 2 for box in boxes]),
+                everybody,
+                np.array([driver.horizon_m() for driver in driving]),
+                np.arange(len(fixed.xy), len(everybody.xy)),
+            )
+            for driver, leader in zip(driving, found, strict=True):
+                driver.decide(leader, self.standing, present)
             for driver in driving:
                 driver.advance(dt_s)
+
+    def _where(self, driving: Sequence[_Driver]) -> tuple[I64, F64, F64, F64]:
+        """Return line, arc length, offset and speed ``(N,)`` of drivers that have taken over."""
+        line = np.array([self._line[id(driver)] for driver in driving], dtype=np.int64)
+        states = [driver.driving()[1] for driver in driving]
+        s_m, offset_m, speed = (
+            np.array([(m.s_m, m.offset_m, m.speed_mps) for m in states]).reshape(-1, 3).T
+        )
+        return line, s_m, offset_m, speed
+
+    def _poses(self, driving: Sequence[_Driver]) -> F64:
+        """Return the poses ``(N, 4, 4)`` of the boxes of drivers that have taken over."""
+        if not driving or self._lines is None:
+            return np.zeros((0, 4, 4))
+        line, s_m, offset_m, _ = self._where(driving)
+        xyz, yaw = self._lines.at(line, s_m, offset_m)
+        ground = driving[0].ground
+        if ground is None:
+            return se3(xyz, quat_from_yaw(yaw))
+        up = np.broadcast_to(np.eye(4), (len(driving), 4, 4)).copy()
+        up[:, 2, 3] = [driver.actor.box.height_m / 2 for driver in driving]
+        return np.asarray(ground_poses(ground, xyz[:, :2], yaw) @ up)
 
 
 @dataclass(frozen=True)
@@ -319,41 +373,36 @@ class _Driver:
         speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
         self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
 
-    def _driving(self) -> tuple[Path, _Motion]:
+    def driving(self) -> tuple[Path, _Motion]:
         """Return line and state of a driver that has taken over from its track."""
         assert self.path is not None
         assert self.motion is not None
         return self.path, self.motion
 
-    def bodies(self) -> Bodies:
-        path, m = self._driving()
-        xyz, yaw = path.at(m.s_m, m.offset_m)
-        direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
-        return bodies_from(xyz[:2], yaw, [self.actor.box], m.speed_mps * direction)
+    def horizon_m(self) -> float:
+        """Return how far the driver looks: twice the wanted gap behind a standing leader, beyond
+        which the interaction is below a quarter of the own acceleration.
+        """
+        speed_mps = self.driving()[1].speed_mps
+        return 20.0 + 2.0 * wanted_gap_m(speed_mps, speed_mps, self.params)
 
-    def decide(self, everybody: Bodies, own_row: int, standing: _Standing, present: Bool) -> None:
-        """Choose the acceleration for the next step."""
-        path, m = self._driving()
+    def decide(self, leader: Leader, standing: _Standing, present: Bool) -> None:
+        """Choose the acceleration for the next step, behind a moving leader."""
+        path, m = self.driving()
         if not self.knows_standing:
             self.standing, self.knows_standing = standing.on(path), True
-        front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
-        # Twice the wanted gap behind a standing leader: beyond it the interaction is below a
-        # quarter of the own acceleration.
-        horizon_m = 20.0 + 2.0 * wanted_gap_m(m.speed_mps, m.speed_mps, self.params)
-        leaders = [find_leader(path, front, half, everybody, horizon_m, own_row=own_row)]
+        leaders = [leader]
         if self.standing is not None:
-            leaders.append(
-                nearest_ahead(
-                    self.standing.only(present[self.standing.index]), front, half, horizon_m
-                )
-            )
+            front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
+            there = self.standing.only(present[self.standing.index])
+            leaders.append(nearest_ahead(there, front, half, self.horizon_m()))
         m.accel_mps2 = min(
             idm_acceleration(m.speed_mps, o.gap_m, m.speed_mps - o.speed_mps, self.params)
             for o in leaders
         )
 
     def advance(self, dt_s: float) -> None:
-        path, m = self._driving()
+        path, m = self.driving()
         m.s_m, m.speed_mps = moved_on(m.s_m, m.speed_mps, m.accel_mps2, dt_s)
         if m.s_m > path.length_m:
             self.present, self.motion = False, None

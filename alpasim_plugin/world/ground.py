@@ -104,22 +104,28 @@ def height_at(field: HeightField, xy: F64) -> F64:
 
 
 def ground_pose(field: HeightField, x: float, y: float, yaw: float) -> F64:
-    """Return ``T_world_rig (4, 4)`` standing on the ground with exactly this heading.
+    """Return ``T_world_rig (4, 4)`` standing on the ground with exactly this heading; see
+    `ground_poses`.
+    """
+    return ground_poses(field, np.array([[x, y]]), np.array([yaw]))[0]
+
+
+def ground_poses(field: HeightField, xy: F64, yaw: F64) -> F64:
+    """Return ``T_world_rig (N, 4, 4)`` standing on the ground with exactly these headings.
 
     Pitch and roll follow the surface: slopes are central differences over `SLOPE_SPAN_M` along and
     across the heading, about what four wheels feel, so a step in the grid does not kick the body.
     """
-    c = np.cos(yaw)
-    s = np.sin(yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
     h = SLOPE_SPAN_M
-    offsets = np.array(
-        [[0.0, 0.0], [c * h, s * h], [-c * h, -s * h], [-s * h, c * h], [s * h, -c * h]]
-    )
-    z = height_at(field, np.array([x, y]) + offsets)
+    ahead, left = np.stack([c * h, s * h], axis=1), np.stack([-s * h, c * h], axis=1)
+    at = np.concatenate([xy, xy + ahead, xy - ahead, xy + left, xy - left])
+    z = height_at(field, at).reshape(5, -1)
     along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
-    ex = np.array([c, s, along]) / np.sqrt(1 + along * along)
-    ez = np.cross(ex, np.array([-s, c, across]))
-    ez /= np.linalg.norm(ez)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = ex, np.cross(ez, ex), ez, (x, y, z[0])
-    return pose
+    ex = np.stack([c, s, along], axis=1) / np.sqrt(1 + along * along)[:, None]
+    ez = np.cross(ex, np.stack([-s, c, across], axis=1))
+    ez /= np.linalg.norm(ez, axis=1, keepdims=True)
+    poses = np.zeros((len(yaw), 4, 4))
+    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = ex, np.cross(ez, ex), ez
+    poses[:, :2, 3], poses[:, 2, 3], poses[:, 3, 3] = xy, z[0], 1.0
+    return poses

@@ -7,6 +7,7 @@ Physical Review E 62 (2000), equations 2 and 3.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool, Box
-from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.path import Lines, Path
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class IdmParams:
 def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:
     """Return the gap that the driver wants at a speed and a closing speed (equation 3)."""
     dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (
-        2.0 * float(np.sqrt(p.accel_mps2 * p.brake_mps2))
+        2.0 * math.sqrt(p.accel_mps2 * p.brake_mps2)
     )
     return p.min_gap_m + max(0.0, dynamic)
 
@@ -72,10 +73,10 @@ def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmP
     free = 1.0 - (speed_mps / v0) ** 4
     interaction = (
         0.0
-        if np.isinf(gap_m)
+        if math.isinf(gap_m)
         else (wanted_gap_m(speed_mps, closing_mps, p) / max(gap_m, 0.01)) ** 2
     )
-    return float(np.clip(p.accel_mps2 * (free - interaction), -p.hard_brake_mps2, p.accel_mps2))
+    return min(max(p.accel_mps2 * (free - interaction), -p.hard_brake_mps2), p.accel_mps2)
 
 
 def moved_on(s_m: float, speed_mps: float, accel_mps2: float, dt_s: float) -> tuple[float, float]:
@@ -108,6 +109,7 @@ class Leader:
 
 NO_LEADER = Leader(float("inf"), 0.0, -1)
 
+BEHIND_M = 15.0  # a body is looked for so far behind the own front bumper
 _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -127,10 +129,20 @@ class Spans:
         return Spans(*(column[keep] for column in vars(self).values()))
 
 
+def _outlines(bodies: Bodies, rows: I64) -> F64:
+    """Return corners and middles of the long sides ``(m, 6, 2)`` of some bodies."""
+    c, s = np.cos(bodies.yaw[rows])[:, None], np.sin(bodies.yaw[rows])[:, None]
+    ax = _OUTLINE[:, 0] * bodies.half_length_m[rows, None]  # (m, 6)
+    ay = _OUTLINE[:, 1] * bodies.half_width_m[rows, None]
+    return np.stack(
+        [bodies.xy[rows, 0:1] + c * ax - s * ay, bodies.xy[rows, 1:2] + s * ax + c * ay], axis=-1
+    )
+
+
 def spans(
     path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True
 ) -> Spans | None:
-    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None
+    """Return where bodies lie on a path, from `BEHIND_M` behind ``from_s_m`` to ``horizon_m`` ahead; None
     where there is none.
 
     Without ``window`` the whole path is searched, for static bodies that are queried repeatedly.
@@ -143,14 +155,9 @@ def spans(
     )
     if len(near) == 0:
         return None
-    c, s = np.cos(bodies.yaw[near])[:, None], np.sin(bodies.yaw[near])[:, None]
-    ax = _OUTLINE[:, 0] * bodies.half_length_m[near, None]  # (m, 6)
-    ay = _OUTLINE[:, 1] * bodies.half_width_m[near, None]
-    outline = np.stack(
-        [bodies.xy[near, 0:1] + c * ax - s * ay, bodies.xy[near, 1:2] + s * ax + c * ay], axis=-1
-    )
     along, across = path.project(
-        outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m) if window else None
+        _outlines(bodies, near).reshape(-1, 2),
+        (from_s_m - BEHIND_M, from_s_m + horizon_m) if window else None,
     )
     along, across = along.reshape(-1, 6), across.reshape(-1, 6)
     rear = along.min(axis=1)
@@ -191,6 +198,67 @@ def find_leader(
         margin_m,
         own_row,
     )
+
+
+def find_leaders(
+    lines: Lines,
+    line: I64,
+    front_s_m: F64,
+    half_width_m: F64,
+    bodies: Bodies,
+    horizon_m: F64,
+    own_row: I64,
+    margin_m: float = 0.2,
+) -> list[Leader]:
+    """Return the leader of each of many drivers; see `find_leader`.
+
+    Args:
+        lines: All lines.
+        line: ``(N,)`` the one of each driver.
+        front_s_m: ``(N,)`` arc lengths of the front bumpers.
+        half_width_m: ``(N,)`` of the drivers' bodies.
+        bodies: Everybody.
+        horizon_m: ``(N,)`` how far each driver looks.
+        own_row: ``(N,)`` rows of the drivers in ``bodies``, -1 where they are not among them.
+        margin_m: Added to the half width.
+    """
+    start, _ = lines.at(line, front_s_m, np.zeros(len(line)))
+    delta = bodies.xy - start[:, None, :2]
+    reaches = horizon_m[:, None] + bodies.half_length_m + 5.0
+    near = np.hypot(delta[..., 0], delta[..., 1]) < reaches
+    near[np.flatnonzero(own_row >= 0), own_row[own_row >= 0]] = False
+    driver, body = np.nonzero(near)
+    half = np.stack([bodies.half_length_m, bodies.half_width_m], axis=1)[body]
+    low, high = lines.stations(line, front_s_m - BEHIND_M, front_s_m + horizon_m)
+    reach = half_width_m + margin_m
+    may = lines.may_overlap(
+        line[driver],
+        bodies.xy[body],
+        bodies.yaw[body],
+        half,
+        reach[driver],
+        low[driver],
+        high[driver],
+    )
+    driver, body = driver[may], body[may]
+    out = [NO_LEADER] * len(line)
+    if len(driver) == 0:
+        return out
+    every = np.repeat(driver, len(_OUTLINE))
+    along, across = lines.project(
+        line[every], _outlines(bodies, body).reshape(-1, 2), low[every], high[every]
+    )
+    along, across = along.reshape(-1, len(_OUTLINE)), across.reshape(-1, len(_OUTLINE))
+    rear = along.min(axis=1)
+    ahead = (across.min(axis=1) < reach[driver]) & (across.max(axis=1) > -reach[driver])
+    ahead &= (rear > front_s_m[driver] - 2.0) & (rear < (front_s_m + horizon_m)[driver])
+    driver, body, rear = driver[ahead], body[ahead], rear[ahead]
+    _, yaw = lines.at(line[driver], rear, np.zeros(len(driver)))
+    speed = bodies.velocity[body, 0] * np.cos(yaw) + bodies.velocity[body, 1] * np.sin(yaw)
+    for k in np.lexsort((body, rear))[::-1].tolist():  # the nearest last
+        gap_m = float(rear[k] - front_s_m[driver[k]])
+        out[driver[k]] = Leader(gap_m, max(float(speed[k]), 0.0), int(body[k]))
+    return out
 
 
 def nearest_ahead(

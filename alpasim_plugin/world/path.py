@@ -4,6 +4,7 @@ curvature and fast projection onto them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.core.types import F64, I64, Bool
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -222,18 +223,147 @@ class Path:
             hi = min(len(self.s), int(np.searchsorted(self.s, window_m[1])) + 1)
             lo, hi = min(lo, len(self.s) - 2), max(hi, lo + 2)
         i = lo + nearest(np.asarray(xy, dtype=np.float64)[:, :2], self.xyz[lo:hi, :2])
-        rest = xy[:, :2] - self.xyz[i, :2]
-        c, s = np.cos(self.yaw[i]), np.sin(self.yaw[i])
-        along, across = c * rest[:, 0] + s * rest[:, 1], c * rest[:, 1] - s * rest[:, 0]
-        # On the circle of curvature k through the nearest station; a straight tangent beyond the
-        # ends.
-        beyond = ((i == 0) & (along < 0)) | ((i == len(self.s) - 1) & (along > 0))
-        k = np.where(beyond | (np.abs(self.curvature[i]) < 1e-9), 1e-9, self.curvature[i])
-        radial = 1.0 - k * across
-        distance = (k * across * (2.0 - k * across) - (k * along) ** 2) / (
-            k * (1.0 + np.hypot(k * along, radial))
+        along, across = _from_station(
+            xy[:, :2] - self.xyz[i, :2],
+            self.yaw[i],
+            self.curvature[i],
+            i == 0,
+            i == len(self.s) - 1,
         )
-        return self.s[i] + np.arctan2(k * along, radial) / k, np.where(beyond, across, distance)
+        return self.s[i] + along, across
+
+
+def _from_station(
+    rest: F64, yaw: F64, curvature: F64, is_first: Bool, is_last: Bool
+) -> tuple[F64, F64]:
+    """Return arc length and signed distance, both from the nearest station, of points at ``rest``
+    from it: on the circle of its curvature, and on its straight tangent beyond the path's ends.
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    along, across = c * rest[:, 0] + s * rest[:, 1], c * rest[:, 1] - s * rest[:, 0]
+    beyond = (is_first & (along < 0)) | (is_last & (along > 0))
+    k = np.where(beyond | (np.abs(curvature) < 1e-9), 1e-9, curvature)
+    radial = 1.0 - k * across
+    distance = (k * across * (2.0 - k * across) - (k * along) ** 2) / (
+        k * (1.0 + np.hypot(k * along, radial))
+    )
+    return np.arctan2(k * along, radial) / k, np.where(beyond, across, distance)
+
+
+COARSE = 4  # every so many stations are looked at first ...
+DENSE_M = 2.5  # ... of lines whose stations are no farther apart
+
+
+class Lines:
+    """Many paths in one array, for the projection of many points onto them at once.
+
+    A row of an argument ``line (P,)`` is the number of a path.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        counts = np.array([len(path.s) for path in paths], dtype=np.int64)
+        self.end = np.cumsum(counts)
+        self.begin = self.end - counts
+        self.length_m = np.array([path.length_m for path in paths])
+        self._base = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
+        joined = [np.concatenate(columns) for columns in zip(*(
+            (path.s, path.xyz, path.yaw, path.curvature) for path in paths), strict=True)]  # fmt: skip
+        self.s, self.xyz, self.yaw, self.curvature = joined
+        self._x, self._y = np.ascontiguousarray(self.xyz[:, :2].T)
+        self._key = self.s + np.repeat(self._base, counts)  # increases over all paths
+        self.sharpest = np.maximum.reduceat(np.abs(self.curvature), self.begin)
+        self.gap_m = np.array([float(np.diff(path.s).max()) for path in paths])
+        self._coarse = COARSE if self.gap_m.max() <= DENSE_M else 1
+
+    def at(self, line: I64, s_m: F64, offset_m: F64) -> tuple[F64, F64]:
+        """Return points ``(P, 3)`` and headings ``(P,)``; see `Path.at`."""
+        s = np.clip(s_m, 0.0, self.length_m[line])
+        i = np.searchsorted(self._key, s + self._base[line], side="right") - 1
+        i = np.clip(i, self.begin[line], self.end[line] - 2)
+        f = (s - self.s[i]) / (self.s[i + 1] - self.s[i])
+        yaw = self.yaw[i] + f * (self.yaw[i + 1] - self.yaw[i])
+        xyz = self.xyz[i] + f[:, None] * (self.xyz[i + 1] - self.xyz[i])
+        xyz[:, 0] -= offset_m * np.sin(yaw)
+        xyz[:, 1] += offset_m * np.cos(yaw)
+        return xyz, yaw
+
+    def stations(self, line: I64, low_m: F64, high_m: F64) -> tuple[I64, I64]:
+        """Return the first station and the one after the last of ranges of arc length; at least
+        two.
+        """
+        low = np.searchsorted(self._key, np.maximum(low_m, -0.5) + self._base[line]) - 1
+        top = np.minimum(high_m, self.length_m[line] + 0.25)
+        high = np.searchsorted(self._key, top + self._base[line]) + 1
+        low = np.minimum(np.maximum(low, self.begin[line]), self.end[line] - 2)
+        return low, np.maximum(np.minimum(high, self.end[line]), low + 2)
+
+    def project(self, line: I64, xy: F64, low: I64, high: I64) -> tuple[F64, F64]:
+        """Return arc lengths and signed distances of points ``(P, 2)``, each onto its line between
+        two stations; see `Path.project`.
+        """
+        coarse = low + self._coarse * self._squares(xy, low, high, self._coarse).argmin(axis=1)
+        low = np.maximum(low, coarse - self._coarse)
+        high = np.minimum(high, coarse + self._coarse + 1)
+        i = low + self._squares(xy, low, high, 1).argmin(axis=1)
+        along, across = _from_station(
+            xy - self.xyz[i, :2],
+            self.yaw[i],
+            self.curvature[i],
+            i == self.begin[line],
+            i == self.end[line] - 1,
+        )
+        return self.s[i] + along, across
+
+    def may_overlap(
+        self, line: I64, xy: F64, yaw: F64, half: F64, reach_m: F64, low: I64, high: I64
+    ) -> Bool:
+        """Return which bodies ``(P,)`` may reach into the corridor of a line; errs only towards
+        True.
+
+        Args:
+            line: Of each body.
+            xy: Their middles ``(P, 2)``.
+            yaw: Their headings.
+            half: Half lengths and widths ``(P, 2)``.
+            reach_m: Half the corridor's width.
+            low, high: Stations of the line that count.
+        """
+        across_m = half.max(axis=1) + 0.5 * self._coarse * self.gap_m[line]
+        slack = 0.5 + self.sharpest[line] * across_m**2
+        far_m = reach_m + np.hypot(*half.T) + across_m + slack
+        close = self._squares(xy, low, high, self._coarse) <= far_m[:, None] ** 2
+        body, number = np.nonzero(close)
+        at = np.minimum(low[body] + self._coarse * number, high[body] - 1)
+        # A line goes on beyond its ends: bodies there are near none of its stations.
+        first, last = (
+            np.flatnonzero(ends) for ends in (low == self.begin[line], high == self.end[line])
+        )
+        body = np.concatenate([body, first, last])
+        at = np.concatenate([at, low[first], high[last] - 1])
+        rest, turn = xy[body] - self.xyz[at, :2], yaw[body] - self.yaw[at]
+        c, s = np.cos(self.yaw[at]), np.sin(self.yaw[at])
+        across = np.abs(c * rest[:, 1] - s * rest[:, 0])
+        along = np.abs(c * rest[:, 0] + s * rest[:, 1])
+        extent = np.abs(np.sin(turn)) * half[body, 0] + np.abs(np.cos(turn)) * half[body, 1]
+        there = across <= (reach_m + slack)[body] + extent
+        there &= (along <= (across_m + slack)[body]) | (
+            np.arange(len(body)) >= len(body) - len(first) - len(last)
+        )
+        may = np.zeros(len(line), dtype=np.bool_)
+        may[body[there]] = True
+        return may
+
+    def _squares(self, xy: F64, low: I64, high: I64, every: int) -> F64:
+        """Return the squared distances ``(P, n)`` of points to every n-th station of a range; the
+        last station stands for those beyond it.
+        """
+        at = self._every(low, high, every)
+        dx, dy = xy[:, :1] - self._x[at], xy[:, 1:] - self._y[at]
+        return np.asarray(dx * dx + dy * dy)
+
+    def _every(self, low: I64, high: I64, every: int) -> I64:
+        count = -(-int((high - low).max(initial=0)) // every)
+        return np.minimum(low[:, None] + every * np.arange(count), high[:, None] - 1)
 
 
 def nearest(xy: F64, stations: F64) -> I64:

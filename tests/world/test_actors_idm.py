@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import densify
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.idm import (
     NO_BODIES,
@@ -16,11 +17,12 @@ from alpasim_plugin.world.idm import (
     bodies_from,
     concatenate,
     find_leader,
+    find_leaders,
     idm_acceleration,
     nearest_ahead,
     spans,
 )
-from alpasim_plugin.world.path import polyline_path
+from alpasim_plugin.world.path import Lines, polyline_path
 
 P = IdmParams(desired_speed_mps=20.0, headway_s=1.5, min_gap_m=2.0, accel_mps2=1.0, brake_mps2=1.5)
 ROAD = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros(201), np.zeros(201)]))
@@ -133,3 +135,34 @@ def test_known_places_of_standing_bodies_give_the_same_leader() -> None:
     whole = spans(ROAD, 0.0, bodies, 300.0, window=False)
     for front in (5.0, 40.0, 63.0, 80.0):
         assert nearest_ahead(whole, front, 0.95) == find_leader(ROAD, front, 0.95, bodies)
+
+
+def test_the_leaders_of_many_drivers_are_those_of_each() -> None:
+    random = np.random.default_rng(0)
+    angle = np.linspace(0, 1.9 * np.pi, 400)
+    circle = polyline_path(np.stack([30 * np.cos(angle), 30 * np.sin(angle)], axis=1))
+    corners = np.array([[0, 0], [80, 0], [84, 2], [84, 4], [80, 6], [0, 6.0]])
+    sparse, dense = polyline_path(corners), polyline_path(densify(corners, 1.0))
+    met = 0
+    for number in range(60):
+        paths = [ROAD, circle, dense if number % 2 else sparse]
+        lines = Lines(paths)
+        count = 30
+        boxes = [Box(*random.uniform([1, 0.6, 1], [12, 2.5, 3])) for _ in range(count)]
+        xy, yaw = random.uniform(-40, 90, (count, 2)), random.uniform(-np.pi, np.pi, count)
+        xy[:20, 1] = random.normal(0, 3, 20)
+        everybody = bodies_from(xy, yaw, boxes, random.normal(0, 8, (count, 2)))
+        line = random.integers(0, 3, 12)
+        front, horizon = random.uniform(-5, 120, 12), random.uniform(20, 120, 12)
+        half, own = random.uniform(0.4, 1.3, 12), random.integers(-1, count, 12)
+        found = find_leaders(lines, line, front, half, everybody, horizon, own)
+        for k, leader in enumerate(found):
+            driver = paths[line[k]], front[k], half[k], everybody, horizon[k]
+            alone = find_leader(*driver, own_row=int(own[k]))
+            assert leader.index == alone.index
+            assert leader.gap_m == pytest.approx(alone.gap_m, abs=1e-9)
+            assert leader.speed_mps == pytest.approx(alone.speed_mps, abs=1e-9)
+            met += alone.index >= 0
+    assert met > 100
+    none, nobody = np.zeros(0), np.zeros(0, dtype=np.int64)
+    assert find_leaders(lines, nobody, none, none, NO_BODIES, none, nobody) == []
