@@ -282,11 +282,11 @@ def compare(
     if bounds is None:
         return entry | {"reason": interval.reason}
     reach = reach_of(metric, margin)
-    is_cut = reach > 0.0 and not math.isfinite(max(metric.difference_range))
+    rare = beyond_share(metric, margin)
     notes = [interval.note] if interval.note else []
     both = _both(bounds, guarded)
-    if is_cut:
-        entry["beyond"] = _beyond(pairs, metric, reach)
+    if rare:
+        entry["beyond"] = _beyond(pairs, metric, reach) | {"margin": rare}
     if n < LEAST_SCENES:
         notes.append(f"{n} scenes: a verdict needs at least {LEAST_SCENES}")
     elif guarded is None:
@@ -300,17 +300,17 @@ def compare(
             turned = "worse" if seen == "non-inferior" else "better"
             by = f"{reach:g} {metric.unit}".rstrip()
             notes.append(f"{n} scenes cannot exclude that a few others are {turned} by up to {by}")
-        if entry["verdict"] == "non-inferior" and is_cut and entry["beyond"]["at_most"] >= BEYOND:
+        if entry["verdict"] == "non-inferior" and rare and entry["beyond"]["at_most"] >= rare:
             entry["verdict"] = "undecided"
-            rare = f"{entry['beyond']['event']} in more than {BEYOND:.0%} of others"
-            notes.append(f"{n} scenes cannot exclude {rare}")
+            what = f"{entry['beyond']['event']} in more than {100 * rare:.3g} % of others"
+            notes.append(f"{n} scenes cannot exclude {what}")
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
         worse = abs(entry["diff"])
         if metric.direction != "none":
             worse, _ = harm([entry["diff"]] * 2, metric.direction)
-        entry["more_scenes"] = more_scenes(worse, spread, n, margin, reach or None, is_cut)
+        entry["more_scenes"] = more_scenes(worse, spread, n, margin, reach or None, rare)
     return entry
 
 
@@ -410,13 +410,22 @@ def reach_of(metric: MetricInfo, margin: float) -> float:
     return REACH * (metric.accepted or margin) if metric.cap is None else metric.cap
 
 
+def beyond_share(metric: MetricInfo, margin: float) -> float:
+    """Return in how many more scenes a metric may differ by more than `reach_of` and still be
+    non-inferior: if these are worse by `BEYOND` times as much, the margin holds. 0 where none can.
+    """
+    reach = reach_of(metric, margin)
+    if reach == 0.0 or math.isfinite(max(metric.difference_range)):
+        return 0.0
+    return max(margin, metric.accepted) / (BEYOND * reach)
+
+
 def least_scenes(metric: MetricInfo, margin: float) -> int | None:
     """Return how many scenes without any difference `non-inferior` takes; None where none do."""
     reach = reach_of(metric, margin)
     needed = scenes_without_event(margin, reach) if reach else None
-    if needed is None or math.isfinite(max(metric.difference_range)):
-        return needed
-    return max(needed, scenes_without_event(BEYOND) or 0)
+    rare = scenes_without_event(beyond_share(metric, margin))
+    return needed if needed is None or rare is None else max(needed, rare)
 
 
 class Pairs:

@@ -121,7 +121,7 @@ ALPHA = 0.05
 LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
 # margins: a scene's difference in a quantity without bounds or a cap of its own counts up to so much
 REACH = 40.0
-BEYOND = 0.01  # share of scenes that may differ by more than what counts of a scene
+BEYOND = 2.5  # what lies beyond may be worse by so many times what counts, and the margin holds
 FLIPS = 9_999  # drawn where not all of them are counted
 FLIPPED = 10_000_000  # signs that are drawn at most
 
@@ -326,7 +326,7 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
 
 
 def more_scenes(
-    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None, is_cut: bool
+    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None, rare: float
 ) -> int | None:
     """Return how many more scenes would decide an undecided verdict at the least: with 80 %
     probability if what was seen is true, and no other scene is far worse.
@@ -337,7 +337,7 @@ def more_scenes(
         n_scenes: Scenes so far.
         margin: As for the verdict.
         reach: The most that counts of a scene; None where nothing is known of it.
-        is_cut: Scenes may differ by more.
+        rare: Share of scenes that may differ by more; 0 where none can.
 
     Returns:
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
@@ -348,7 +348,7 @@ def more_scenes(
         unseen = scenes_without_event(
             abs(margin - harm), reach - harm if harm < margin else reach + harm
         )
-        beyond = scenes_without_event(BEYOND) if is_cut and harm < margin else 0
+        beyond = scenes_without_event(rare) if rare > 0.0 and harm < margin else 0
         needed = None if unseen is None or beyond is None else max(needed, unseen, beyond)
     return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 
