@@ -229,7 +229,10 @@ def uncomfortable(series: dict[str, F64]) -> Bool:
     """Return where ``(T,)`` one of the bounds of comfort is broken, from what `motion` gives."""
     return np.asarray(
         np.any(
-            [(series[name] < low) | (series[name] > high) for name, (low, high) in COMFORT.items()],
+            [
+                (series[name] <= low) | (series[name] >= high)
+                for name, (low, high) in COMFORT.items()
+            ],
             axis=0,
         )
     )

@@ -143,21 +143,3 @@ def mean_interval(means: F64, metric: MetricInfo) -> Interval:
     if metric.cap is not None:
         low, high = min(low, *(seen.bounds or [centre])), max(high, *(seen.bounds or [centre]))
     return within(Interval(centre, low, high, method=method), least, most)
-
-
-def scenes_to_exclude(distance: float, reach: float, tail: float = TAIL) -> int:
-    """Return how many scenes that are all alike show that the mean is not ``distance`` worse than
-    they are.
-
-    Args:
-        distance: From what the scenes show to the margin, above 0.
-        reach: From what they show to the worst that a scene can show, above 0.
-        tail: Chance of a wrong answer.
-
-    Example:
-        >>> scenes_to_exclude(0.05, 1.0), scenes_to_exclude(0.1, 4.0)
-        (72, 146)
-    """
-    if distance >= reach:
-        return 2
-    return max(2, math.ceil(math.log(tail) / math.log1p(-distance / reach)))

@@ -9,7 +9,7 @@ docs/experiments/verdict-error.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -188,35 +188,6 @@ def exact_rate(k: float, n: int) -> tuple[float, float]:
     return low, float(scipy.special.betaincinv(k + 1, n - k, 1 - TAIL)) if k < n else 1.0
 
 
-def wilson_rate(k: int, n: int) -> tuple[float, float]:
-    """Return the Wilson score bounds of k of n independent trials.
-
-    Example:
-        >>> [round(b, 3) for b in wilson_rate(3, 10)]
-        [0.108, 0.603]
-    """
-    p = k / n
-    scale = 1 + Z95**2 / n
-    centre = (p + Z95**2 / (2 * n)) / scale
-    half = Z95 * float(np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n * n))) / scale
-    # Where k is 0 or n the bound is the edge itself; rounding would leave it slightly inside.
-    return 0.0 if k == 0 else max(0.0, centre - half), 1.0 if k == n else min(1.0, centre + half)
-
-
-def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float | None:
-    """Return how many times larger the variance of the mean is with scenes as clusters than by the
-    paper's formula.
-
-    None where either has no spread. 4 means that the paper's interval is half as long as it should
-    be.
-    """
-    x, _ = scaled(np.asarray(values, dtype=np.float64))
-    means, _ = cluster_means(x, clusters)
-    if len(means) < 2 or are_alike(x):
-        return None
-    return float(np.var(means, ddof=1) / len(means) / (np.var(x, ddof=1) / len(x)))
-
-
 def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
     """Return Tango's score bounds of a difference of rates from ``n`` pairs, of which some gained
     and some lost the event.
@@ -244,45 +215,3 @@ def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
     if score(1 - 1e-9) < -Z95:
         high = scipy.optimize.brentq(lambda d: score(d) + Z95, seen, 1 - 1e-9)
     return float(low), float(high)
-
-
-DRAWS = 2000
-
-
-def redraws(scenes: int, generator: np.random.Generator, draws: int = DRAWS) -> I64:
-    """Return draws ``(draws, scenes)`` of as many scenes as there are, with replacement, by
-    number.
-    """
-    return generator.integers(0, scenes, size=(draws, scenes))
-
-
-def cluster_bootstrap(
-    values: npt.ArrayLike, clusters: Sequence[str] | I64, drawn: Callable[[int], I64]
-) -> Interval:
-    """Return the percentile interval of the mean over scenes.
-
-    Too short where scenes are few (docs/experiments/verdict-error.md); it is a second opinion
-    that assumes no shape, not the default.
-
-    Args:
-        values: ``(N,)``.
-        clusters: Scene of each value.
-        drawn: Gives the draws of a number of scenes, as `redraws` does; of at least two.
-
-    Example:
-        >>> g = np.random.Generator(np.random.Philox(1))
-        >>> drawn = cluster_bootstrap([0.0, 1.0, 2.0, 3.0], ["a", "b", "c", "d"], lambda scenes: redraws(scenes, g))
-        >>> 0.0 <= drawn.low < 1.5 < drawn.high <= 3.0
-        True
-    """
-    means, scale = scaled(cluster_means(values, clusters)[0])
-    centre = float(np.mean(means)) * scale
-    if len(means) < 2:
-        return Interval(centre, reason=f"needs at least two scenes, found {len(means)}")
-    places = drawn(len(means))
-    if are_alike(means):
-        return Interval(centre, reason=NO_SPREAD.format(len(means), "scenes"))
-    low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL]) * scale
-    return Interval(
-        centre, float(low), float(high), method=f"cluster bootstrap, {len(places)} draws"
-    )

@@ -45,6 +45,7 @@ from evaluators.statistics.variants import Variant, axis_bases, variants_in
 from evaluators.statistics.verdicts import (
     BEYOND,
     LEAST_SCENES,
+    MOST_SCENES,
     REACH,
     difference,
     harm,
@@ -422,10 +423,10 @@ def beyond_share(metric: MetricInfo, margin: float) -> float:
 
 def least_scenes(metric: MetricInfo, margin: float) -> int | None:
     """Return how many scenes without any difference `non-inferior` takes; None where none do."""
-    reach = reach_of(metric, margin)
-    needed = scenes_without_event(margin, reach) if reach else None
-    rare = scenes_without_event(beyond_share(metric, margin))
-    return needed if needed is None or rare is None else max(needed, rare)
+    rare = beyond_share(metric, margin)
+    needed = scenes_without_event(margin, reach_of(metric, margin) or math.inf)
+    needed = max(needed, scenes_without_event(rare) if rare else 0)
+    return int(needed) if needed <= MOST_SCENES else None
 
 
 class Pairs:

@@ -6,13 +6,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
     RolloutTable,
@@ -26,20 +24,13 @@ from alpasim_plugin.log.run_folder.sides import (
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.bounded import mean_interval
 from evaluators.statistics.intervals import (
-    cluster_bootstrap,
     cluster_means,
-    design_effect,
-    exact_rate,
     mean_of,
     n_clusters,
     normal_half_width,
     rate_interval,
-    redraws,
-    wilson_rate,
 )
 from evaluators.statistics.paired import Table, compare_pairs, pairs_within
-
-BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
 
 def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
@@ -54,12 +45,10 @@ def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
 
     Returns:
         RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered``
-        ([low, high], scenes as clusters) and its ``ci95_clustered_method``, ``ci95_bootstrap``
-        ([low, high], scenes redrawn), ``design_effect``, ``n_rollouts``, ``n_scenes``,
-        ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``, ``ci95_wilson`` and
-        ``ci95_exact`` (both as if rollouts were independent). What does not exist is None, with
-        ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
-        ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
+        ([low, high], scenes as clusters) and its ``ci95_clustered_method``,
+        ``n_rollouts``, ``n_scenes``, ``n_invalid``, ``unit``, ``direction``; for rates also
+        ``n_events``. What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` /
+        ``ci95_clustered_reason``; ``note`` qualifies the clustered interval.
     """
     return aggregate_sides(by_renderer(rows), metric_names(rows), known)
 
@@ -92,8 +81,6 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
         "ci95": None,
         "ci95_clustered": None,
         "ci95_clustered_method": None,
-        "ci95_bootstrap": None,
-        "design_effect": None,
         "n_rollouts": n,
         "n_scenes": n_clusters(scenes),
         "n_invalid": max(n_ran - n, 0),
@@ -113,7 +100,6 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
         interval.bounds,
         interval.method or None,
     )
-    entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:
         entry["ci95_clustered_reason"] = interval.reason
     notes = [interval.note] if interval.note else []
@@ -123,32 +109,9 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
         )
     if notes:
         entry["note"] = "; ".join(notes)
-    if entry["n_scenes"] > BOOTSTRAP_SCENES:
-        why = f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"
-    else:
-        bootstrap = cluster_bootstrap(values, scenes, partial(_redraws, metric.name))
-        entry["ci95_bootstrap"], why = bootstrap.bounds, bootstrap.reason
-    if why:
-        entry["ci95_bootstrap_reason"] = why
     if metric.is_flag:
-        k = int(np.sum(values > 0))
-        entry |= {"n_events": k, "ci95_wilson": None, "ci95_exact": None}
-        if bool(
-            np.all((values == 0.0) | (values == 1.0))
-        ):  # as if rollouts were independent trials
-            entry["ci95_wilson"], entry["ci95_exact"] = (
-                list(wilson_rate(k, n)),
-                list(exact_rate(k, n)),
-            )
+        entry["n_events"] = int(np.sum(values > 0))
     return entry
-
-
-@lru_cache(maxsize=1)
-def _redraws(metric: str, scenes: int) -> I64:
-    """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the
-    same ones.
-    """
-    return redraws(scenes, stream(metric, 0, "aggregate/bootstrap"))
 
 
 STEP_RULES = (

@@ -5,7 +5,6 @@ of a run with its exit code.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,6 @@ import scipy  # its submodules load on first use; scipy.stats would take a secon
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Direction
-from evaluators.statistics.bounded import scenes_to_exclude
 from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
 
 Cause = Literal[
@@ -279,50 +277,38 @@ POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 
 
-def scenes_needed(distance: float, spread: float) -> int | None:
-    """Return the number of scenes at which a 95 % t interval leaves out the margin with probability
-    `POWER`.
-
-    N is the least with N >= ((t(0.975, N-1) + t(POWER, N-1)) spread / distance)^2, the usual sample
-    size of a one-sample t test.
+def scenes_needed(distance: float, spread: float) -> float:
+    """Return the number of scenes at which a 95 % interval leaves out the margin with probability
+    `POWER`: the sample size of a one-sample test.
 
     Args:
         distance: Of the true difference from the margin, in the metric's unit.
         spread: Standard deviation of the difference between scenes (seeds averaged), same unit.
 
-    Returns:
-        At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on
-        the margin.
-
     Example:
-        >>> scenes_needed(distance=0.5, spread=1.0)
-        34
+        >>> round(scenes_needed(distance=0.5, spread=1.0), 1)
+        31.4
     """
-    if spread == 0.0 and distance != 0.0:
-        return 2
-    if distance == 0.0 or not math.isfinite(spread / distance):
-        return None
-    numbers = range(2, MOST_SCENES + 1)
-    index = bisect_left(numbers, True, key=lambda n: _decides(n, distance, spread))
-    return numbers[index] if index < len(numbers) else None
+    if distance == 0.0:
+        return math.inf
+    return float((np.sum(scipy.special.ndtri([1 - TAIL, POWER])) * spread / distance) ** 2)
 
 
-def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
-    """Return how many scenes without a single difference show that the mean is not worse by the
-    margin (exact bound).
+def scenes_without_event(margin: float, reach: float = 1.0) -> float:
+    """Return how many scenes that are all alike show that the mean is not worse by the margin than
+    they are (exact bound).
 
     Args:
         margin: How much worse is accepted.
-        reach: The most that a scene can be worse.
+        reach: How much worse than what was seen a scene can be.
 
     Example:
         >>> scenes_without_event(0.05), scenes_without_event(0.1, 4.0)
         (72, 146)
     """
-    if margin <= 0.0 or margin / reach < 1.0 / MOST_SCENES:
-        return None
-    needed = scenes_to_exclude(margin, reach)
-    return needed if needed <= MOST_SCENES else None
+    if margin <= 0.0:
+        return math.inf
+    return 2 if margin >= reach else max(2, math.ceil(math.log(TAIL) / math.log1p(-margin / reach)))
 
 
 def more_scenes(
@@ -343,16 +329,10 @@ def more_scenes(
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
         needed.
     """
-    needed = scenes_needed(abs(harm - margin), spread)
-    if needed is not None and reach is not None:  # as many again as show that nothing was missed
-        unseen = scenes_without_event(
-            abs(margin - harm), reach - harm if harm < margin else reach + harm
-        )
-        beyond = scenes_without_event(rare) if rare > 0.0 and harm < margin else 0
-        needed = None if unseen is None or beyond is None else max(needed, unseen, beyond)
-    return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
-
-
-def _decides(n: int, distance: float, spread: float) -> bool:
-    quantiles = float(np.sum(scipy.special.stdtrit(n - 1, [1 - TAIL, POWER])))
-    return math.sqrt(n) * abs(distance) >= quantiles * spread
+    needed = max(scenes_needed(abs(harm - margin), spread), LEAST_SCENES)
+    if reach is not None:  # as many again as show that nothing was missed
+        worst = reach - harm if harm < margin else reach + harm
+        needed = max(needed, scenes_without_event(abs(margin - harm), worst))
+    if rare > 0.0 and harm < margin:
+        needed = max(needed, scenes_without_event(rare))
+    return None if needed > MOST_SCENES else max(1, math.ceil(needed) - n_scenes)

@@ -14,9 +14,9 @@ from evaluators.statistics.bounded import (
     BINS,
     chance_above,
     mean_bounds,
-    scenes_to_exclude,
     upper_bound,
 )
+from evaluators.statistics.verdicts import scenes_without_event
 from tests.examples import examples
 
 
@@ -89,6 +89,6 @@ def test_the_unit_does_not_matter_up_to_the_ends_of_the_numbers(scale: float) ->
 
 def test_the_fewest_scenes_are_those_at_which_the_bound_reaches_the_margin() -> None:
     for distance, reach in ((0.05, 1.0), (0.02, 1.0), (0.1, 4.0)):
-        n = scenes_to_exclude(distance, reach)
+        n = scenes_without_event(distance, reach)
         assert upper_bound(np.zeros(n), reach) < distance <= upper_bound(np.zeros(n - 1), reach)
-    assert scenes_to_exclude(2.0, 1.0) == 2
+    assert scenes_without_event(2.0, 1.0) == 2

@@ -11,27 +11,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.seeding import stream
-from evaluators import aggregate
 from evaluators.statistics.intervals import (
-    cluster_bootstrap,
     cluster_means,
-    design_effect,
     exact_rate,
     paired_rate,
     rate_interval,
-    redraws,
-    t_interval,
-    wilson_rate,
 )
-from tests.evaluators.test_tables_over_rollouts import rows_of
 from tests.examples import examples
-
-
-def by_key(key: str):
-    """Draw by a stream of its own."""
-    return lambda scenes: redraws(scenes, stream(key, 0, "test"))
-
 
 shares = st.lists(st.sampled_from([0.0, 0.2, 1 / 3, 0.5, 0.8, 1.0]), min_size=2, max_size=40)
 
@@ -106,8 +92,6 @@ def test_below_ten_scenes_a_rate_has_the_bounds_of_clopper_and_pearson_and_a_pai
 def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
     one = rate_interval(np.array([2 / 3]))
     assert (one.bounds, one.reason) == (None, "needs at least two scenes, found 1")
-    drawn = cluster_bootstrap([0.0, 1.0, 1.0], ["a"] * 3, by_key("x"))
-    assert (drawn.bounds, drawn.reason) == (None, "needs at least two scenes, found 1")
 
 
 def test_unequal_seeds_do_not_let_one_scene_outweigh_the_others():
@@ -122,51 +106,7 @@ def test_values_that_are_no_fractions_are_refused_as_rates():
         rate_interval(np.array([0.0, 12.5]))
 
 
-def test_wilson_and_exact_stay_at_the_edges():
+def test_exact_bounds_stay_at_the_edges():
     for n in (1, 7, 300):
-        assert wilson_rate(0, n)[0] == 0.0
-        assert wilson_rate(n, n)[1] == 1.0
         assert exact_rate(0, n)[0] == 0.0
         assert exact_rate(n, n)[1] == 1.0
-
-
-def test_a_rate_carries_wilson_and_exact_bounds_as_if_rollouts_were_independent():
-    found = aggregate(rows_of([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]], "offroad"))["3dgs"]["offroad"]
-    assert found["ci95_wilson"] == pytest.approx(list(wilson_rate(2, 6)))
-    assert found["ci95_exact"] == pytest.approx(list(exact_rate(2, 6)))
-    shares_of_time = aggregate(rows_of([[0.25, 0.0], [0.0, 1.0]], "open_loop_collision"))["3dgs"][
-        "open_loop_collision"
-    ]
-    assert (shares_of_time["ci95_wilson"], shares_of_time["ci95_exact"]) == (None, None)
-
-
-def test_the_bootstrap_follows_its_generator_and_nears_t_where_scenes_are_many():
-    rng = np.random.Generator(np.random.Philox(3))
-    values = rng.normal(2.0, 1.0, 400)
-    scenes = [f"s{i // 2:03d}" for i in range(400)]
-    one = cluster_bootstrap(values, scenes, by_key("x"))
-    assert one == cluster_bootstrap(values, scenes, by_key("x"))
-    assert one != cluster_bootstrap(values, scenes, by_key("y"))
-    t = t_interval(cluster_means(values, scenes)[0])
-    assert (one.low, one.high) == pytest.approx((t.low, t.high), abs=0.02)
-
-
-def test_bootstrap_draws_scenes_and_not_rollouts():
-    values, scenes = np.repeat([0.0, 10.0], 100), ["a"] * 100 + ["b"] * 100
-    one = cluster_bootstrap(values, scenes, by_key("x"))
-    assert (one.low, one.high) == (
-        0.0,
-        10.0,
-    )  # both draws the same scene in a quarter of the draws each
-
-
-def test_design_effect_is_the_number_of_seeds_where_seeds_are_copies_and_about_one_where_they_are_independent():
-    rng = np.random.Generator(np.random.Philox(4))
-    scenes = np.repeat(np.arange(300), 5)
-    assert design_effect(np.repeat(rng.normal(size=300), 5), scenes) == pytest.approx(5.0, rel=0.02)
-    assert design_effect(rng.normal(size=1500), scenes) == pytest.approx(1.0, abs=0.2)
-    assert design_effect([0.0, 0.0, 1e-308, 0.0], [0, 0, 1, 1]) == pytest.approx(
-        design_effect([0.0, 0.0, 1.0, 0.0], [0, 0, 1, 1])
-    )
-    assert design_effect([1.0, 1.0], ["a", "b"]) is None
-    assert design_effect([1.0, 2.0], ["a", "a"]) is None
