@@ -69,12 +69,32 @@ class RolloutParts:
 PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
 
 
-def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
-    """Build the parts that a cell names."""
+class NotAsked(Renderer):
+    """Stand in for the renderer of a policy without a camera: no image changes its rollout."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Refuse."""
+        raise AssertionError("a renderer that was not built is asked for a frame")
+
+    def facts(self) -> Mapping[str, Any]:
+        """Say that the renderer was left out."""
+        return {"built": False, "why": "the policy has no camera"}
+
+
+def build_parts(
+    cell: Cell, options: RunOptions, scenario: Scenario, threads: int, is_shown: bool = False
+) -> RolloutParts:
+    """Build the parts that a cell names; of a policy without a camera, whose rollout no renderer
+    changes, no renderer unless its frames are kept or ``is_shown``.
+    """
     name, fixer = cell.renderer.name, cell.renderer.fixer
+    policy = build(cell.policy, scenario=scenario)
+    renderer: Renderer = NotAsked()
+    if is_shown or options.video != "none" or complete(policy, Policy).sensors:
+        renderer = make_renderer(cell.renderer, scenario, cell.seed, options.device, threads)
     return RolloutParts(
-        make_renderer(cell.renderer, scenario, cell.seed, options.device, threads),
-        build(cell.policy, scenario=scenario),
+        renderer,
+        policy,
         cell.rollout_key,
         {
             "sensorsim": name if fixer is None else f"{name} ({fixer.label})",

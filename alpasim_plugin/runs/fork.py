@@ -296,8 +296,8 @@ def _parts(
     part is one object.
     """
     at_us = scenario.start_us + change.after_us
-    before = build_parts(own, options, scenario, threads)
-    after = before if then == own else build_parts(then, options, scenario, threads)
+    before = build_parts(own, options, scenario, threads, is_shown=True)
+    after = before if then == own else build_parts(then, options, scenario, threads, is_shown=True)
     same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
     same_policy = (then.policy, then.seed) == (own.policy, own.seed)
     next_policy = before.policy if same_policy else after.policy
