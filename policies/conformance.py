@@ -280,7 +280,8 @@ class Report:
         ]
         lines += [f"note {note.name}: {note.sentence}" for note in self.notes]
         median_ms, worst_ms = self.latency_ms
-        lines.append(f"plans in {median_ms:.1f} ms (median), {worst_ms:.1f} ms (worst)")
+        if worst_ms:
+            lines.append(f"plans in {median_ms:.1f} ms (median), {worst_ms:.1f} ms (worst)")
         return "\n".join(lines)
 
 
@@ -354,7 +355,7 @@ def check_policy(
     try:
         made = make_policy(policy, scenario)
     except PolicyError as error:
-        return Report((Check("made", False, error.message),))
+        return Report((Check("made", False, f"{error.message}; {error.hint}"),))
     report = _checked(made, scenario, latency_limit_ms)
     with suppress(SimrunError):  # what it did before is the result
         made.close()

@@ -18,6 +18,7 @@ from pydantic import Field
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
+from alpasim_plugin.core.parts import names as part_names
 from alpasim_plugin.core.reading import exists, read_text
 from scenarios.schema_parts import Part, within
 from scenarios.sources import import_advice, source_of
@@ -80,11 +81,16 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
         return InputError(f"{text}: {found}", "let this user search and read it")
     except (OSError, ValueError):
         pass
+    for part in ("renderer", "fixer", "policy"):
+        if text in part_names(part):
+            option = "--policy" if part == "policy" else "--renderer"
+            return InputError(f"{text}: a {part}, not a {kind}", f"Write {option} {text}.")
     name = text.removesuffix(".yaml")
     near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     if not near:
-        last_parts = [one.rsplit("/", 1)[-1] for one in names]
-        near = difflib.get_close_matches(name.rsplit("/", 1)[-1], last_parts, n=3, cutoff=0.5)
+        by_last = {one.rsplit("/", 1)[-1]: one for one in names}
+        last = name.rsplit("/", 1)[-1]
+        near = [by_last[one] for one in difflib.get_close_matches(last, by_last, 3, 0.6)]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     found = f"no such file or folder, and no shipped {kind} has that name"
     return InputError(

@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing, run_and_cell
+from alpasim_plugin.cli.options import (
+    Json,
+    Overwrite,
+    refuse_existing,
+    run_and_cell,
+    run_or_newest,
+)
 from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.cli.view import wanted_of
 from alpasim_plugin.core.errors import InputError
@@ -39,11 +45,11 @@ def export(
     items: Annotated[
         tuple[str, ...],
         Positional(
-            "A run folder, the folder of a rollout, or scenarios (--alpasim).",
+            "A run folder, the folder of a rollout, or scenarios (--alpasim); by default the newest run.",
             metavar="RUN|ROLLOUT|SCENARIO...",
         ),
-    ],
-    wanted: Wanted,
+    ] = (),
+    wanted: Wanted = Wanted(),
     alpasim: Annotated[
         Path | None, Flag("Write AlpaSim run folders; new or empty.", metavar="DIR")
     ] = None,
@@ -64,7 +70,8 @@ def export(
     renderer on one time line.
     """
     if (alpasim is None) == (mcap is None):
-        raise InputError(f"{' '.join(items)}: --alpasim or --mcap", "Give one of both.")
+        raise InputError("simrun export: --alpasim DIR or --mcap FILE", "Give one of both.")
+    items = items or (str(run_or_newest(None)),)
     if alpasim is not None:
         if not wanted.is_all:
             raise InputError(

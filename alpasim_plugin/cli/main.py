@@ -12,6 +12,7 @@ import difflib
 import errno
 import json
 import os
+import re
 import sys
 import traceback
 from functools import cache
@@ -107,6 +108,7 @@ PLUGIN_PANEL = "From installed packages"
 PLUGIN_GROUP = "simrun.commands"
 # Verbs that an optional package of ours brings.
 LABORATORY_VERBS = ("train", "bench")
+ANYWHERE = ("-j", "--json", "-q", "--quiet", "--debug")
 OWN_OPTIONS = ("--help", "-h", "--version", "--install-completion", "--show-completion")
 COMPLETION = "_SIMRUN_COMPLETE"  # set by a shell that asks what a Tab offers
 PIPE_CLOSED = 141  # as shells count a process that SIGPIPE ended
@@ -195,6 +197,29 @@ def own_options(
     """Take the options that stand before a verb."""
 
 
+def usual(args: list[str]) -> list[str]:
+    """Return a command line in one form: ``help VERB`` and ``version`` as options, a list with
+    spaces beside its commas as one word, ``-j`` and ``-q`` behind the verb.
+
+    Example:
+        >>> usual(["help", "list"]), usual(["--renderer", "clean,", "3dgs", "smoke/curve"])
+        (['list', '--help'], ['--renderer', 'clean,3dgs', 'smoke/curve'])
+    """
+    words: list[str] = []
+    for word in args:
+        if words and (words[-1].endswith(",") or word.startswith(",")):
+            words[-1] += word
+        else:
+            words.append(word)
+    if words[:1] == ["help"]:
+        return [*words[1:2], "--help"]
+    if words and words[0] in ("version", "-v", "-V"):
+        return ["--version", *words[1:]]
+    if len(words) > 1 and words[0] in ANYWHERE and words[1] in verbs():
+        return [words[1], words[0], *words[2:]]
+    return words
+
+
 def with_verb(args: list[str]) -> list[str]:
     """Insert the verb ``run`` if the first word is not a verb.
 
@@ -205,8 +230,8 @@ def with_verb(args: list[str]) -> list[str]:
         ['list', 'renderers']
 
     Raises:
-        InputError: The first word is no file and resembles a verb, or is the verb of a package that
-            is not installed.
+        InputError: The first word is neither a file nor a verb, or is the verb of a package that is
+            not installed.
     """
     if not args or args[0] in verbs() or args[0] in OWN_OPTIONS:
         return args
@@ -215,22 +240,28 @@ def with_verb(args: list[str]) -> list[str]:
             f"simrun {args[0]}: the verb is not installed",
             "Install the laboratory, which brings it: pip install alpasim-onefixer-lab.",
         )
-    if not args[0].startswith("-") and not Path(args[0]).exists():
-        near = difflib.get_close_matches(args[0], verbs(), 1, 0.7)
-        if near:
+    if re.fullmatch(r"[\w-]+", args[0]) and args[0][0] != "-" and not Path(args[0]).exists():
+        near = difflib.get_close_matches(args[0].lower(), verbs(), 1, 0.7)
+        guess = f"Type 'simrun {near[0]}'; the" if near else "The"
+        if near or len(args) == 1:
             raise InputError(
-                f"{args[0]}: neither a verb nor a scenario; {near[0]} is a verb",
-                f"Type 'simrun {near[0]}', or 'simrun --help' for all verbs.",
+                f"{args[0]}: neither a verb nor a scenario",
+                f"{guess} verbs are {', '.join(verbs())}.",
             )
     return ["run", *args]
 
 
 def _run(args: list[str]) -> int:
     """Parse and run one command line; errors of usage are `InputError`."""
+    args = usual(args)
     if args[:1] == ["--version"]:
         from alpasim_plugin import __version__
 
-        say(json.dumps({"version": __version__}) if "--json" in args else f"simrun {__version__}")
+        say(
+            json.dumps({"version": __version__})
+            if {"--json", "-j"} & {*args}
+            else f"simrun {__version__}"
+        )
         return 0
     words = with_verb(args) or ["--help"]
     if words[0] in verbs():
@@ -243,7 +274,7 @@ def _run(args: list[str]) -> int:
         return leaving.exit_code if args else InputError.exit_code
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
-        verb = f"simrun {words[0]}" if words[0] in verbs() else "simrun"
+        verb = error.ctx.command_path if error.ctx else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error
     return 0
 
@@ -275,7 +306,7 @@ def run_command(args: list[str]) -> int:
     if "--debug" in args and isinstance(failure, SimrunError):
         warn(*"".join(traceback.format_exception(failure)).splitlines())
     with contextlib.suppress(OSError):  # nobody can be told; the exit code still says it
-        if "--json" in args:
+        if {"--json", "-j"} & {*args}:
             facts = {"error": failure.as_dict(), "exit_code": failure.exit_code}
             say(json.dumps(facts))
         else:

@@ -18,13 +18,13 @@ from typer.core import TyperArgument
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.limits import SEED, SEEDS
-from alpasim_plugin.log.run_folder.schema import RUN_INFO
+from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 
 FIXER_PREFIX = "fixer."
 METAVARS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH", bool: " "}
 
 Run = Annotated[Path | None, Positional("A run folder; by default the newest below runs/.")]
-Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json")]
+Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json", also="-j")]
 Debug = Annotated[bool, Flag("Show tracebacks.", "--debug")]
 Overrides = Annotated[
     tuple[str, ...], Flag("Override a scenario key: key=value. Repeatable.", "--set")
@@ -248,17 +248,24 @@ def refuse_existing(path: Path | None, option: str, overwrite: bool = False) -> 
 
 
 def run_or_newest(run: Path | None) -> Path:
-    """Return the run folder that was named, or the newest one below ``runs/``.
+    """Return the run folder that was named, or the newest one below ``runs/``, a finished one if
+    there is any.
 
     Raises:
-        InputError: None was named and there is none.
+        InputError: What was named is no run folder, or none was named and there is none.
     """
     if run is not None:
-        return run
+        if (run / RUN_INFO).exists():
+            return run
+        raise InputError(f"{run}: not a run folder", "Name one that 'simrun list runs' shows.")
     infos = [*Path("runs").glob(f"*/{RUN_INFO}"), *Path("runs").glob(f"*/*/{RUN_INFO}")]
     if not infos:
         raise InputError("runs/: no run folder below it", "Name a run folder, or drive one first.")
-    return max(infos, key=lambda path: path.stat().st_mtime_ns).parent
+
+    def age(path: Path) -> tuple[bool, int]:
+        return path.with_name(SUMMARY).exists(), path.stat().st_mtime_ns
+
+    return max(infos, key=age).parent
 
 
 def run_and_cell(path: Path | None) -> tuple[Path, str]:
@@ -269,7 +276,8 @@ def run_and_cell(path: Path | None) -> tuple[Path, str]:
     Raises:
         InputError: No run folder is at or above the path.
     """
-    folder = run_or_newest(None if path == Path() and not Path(RUN_INFO).exists() else path)
+    is_newest = path is None or (path == Path() and not Path(RUN_INFO).exists())
+    folder = run_or_newest(None) if is_newest or path is None else path
     for root in (folder, *folder.parents):
         if (root / RUN_INFO).exists():
             return root, "/".join(folder.relative_to(root).parts).removeprefix("rollouts/")

@@ -154,7 +154,7 @@ def run(
     ] = False,
     dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,
-    quiet: Annotated[bool, Flag("Print only the result.", "--quiet")] = False,
+    quiet: Annotated[bool, Flag("Print only the result.", "--quiet", also="-q")] = False,
 ) -> None:
     """Drive scenarios behind one or more renderers, score the rollouts and write a report.
 

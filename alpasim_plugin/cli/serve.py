@@ -83,7 +83,8 @@ def serve(
     ] = "asked",
     host_policy: HostPolicy = HostPolicy(),
     as_json: Annotated[
-        bool, Flag("Print one JSON line when the port is open, and one at the end.", "--json")
+        bool,
+        Flag("Print one JSON line when the port is open, and one at the end.", "--json", also="-j"),
     ] = False,
     debug: Annotated[bool, Flag("Log every failed call with its traceback.")] = False,
 ) -> None:

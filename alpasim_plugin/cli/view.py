@@ -69,7 +69,7 @@ def view(
     a scenario shows its map, road users over time, and the camera along the recorded path.
     """
     refuse_existing(out, "--out")
-    path = run_or_newest(None if what is None else Path(what))
+    path = run_or_newest(None) if what is None else Path(what)
     if not any((folder / RUN_INFO).exists() for folder in (path, *path.parents)):
         _view_scenario(str(what), asked, overrides, out, as_json)
         return

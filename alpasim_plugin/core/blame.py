@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import sysconfig
 import traceback
+from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.places import PACKAGE
 
-LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_paths()["stdlib"], "<frozen ")
+PYTHON = ("<frozen ", sysconfig.get_paths()["stdlib"] + os.sep)
+LIBRARIES = ("site-packages", "dist-packages")
 OWN_CODE = tuple(f"{PACKAGE.parent / package}{os.sep}" for package in OWN_PACKAGES)
 
 
@@ -20,10 +22,27 @@ def raised(error: BaseException) -> str:
     Where all code is simrun's or a library's, it is the line that simrun called, or simrun's last.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    outside = [frame for frame in frames if not frame.filename.startswith(OWN_CODE)]
+    outside = [frame for frame in frames if not frame.filename.startswith((*OWN_CODE, *PYTHON))]
     users = [frame for frame in outside if not any(part in frame.filename for part in LIBRARIES)]
-    chosen = [*frames[-1:], *outside[:1], *users[-1:]]
+    chosen = [*outside[:1], *users[-1:]]
+    if not chosen and not isinstance(error, SyntaxError):
+        chosen = frames[-1:]
     where = ""
     if chosen:
         where = f" at {chosen[-1].filename}:{chosen[-1].lineno}, in {chosen[-1].name}"
     return f"{type(error).__name__}: {error}{where}"
+
+
+def is_own(part: Any) -> bool:
+    """Tell whether a part is one of simrun's."""
+    return type(part).__module__.partition(".")[0] in OWN_PACKAGES
+
+
+def defined(part: Any, method: str) -> str:
+    """Name the line at which a method of a user's part is defined: `` (mine.py:12)``; nothing for a
+    part of simrun's.
+    """
+    code = getattr(getattr(type(part), method, None), "__code__", None)
+    if is_own(part) or code is None:
+        return ""
+    return f" ({code.co_filename}:{code.co_firstlineno})"

@@ -165,10 +165,10 @@ def parse(text: str, file: str) -> Document:
         if "nesting depth" in str(error.problem):
             raise _too_deep(place) from error
         problem = " ".join(part for part in (error.context, error.problem) if part)
-        raise InputError(
-            f"{place}: not valid YAML: {problem}",
-            "correct the syntax (indentation, colon, quote or bracket)",
-        ) from error
+        hint = "correct the syntax (indentation, colon, quote or bracket)"
+        if mark is not None and "\t" in "".join(text.splitlines()[mark.line : mark.line + 1]):
+            hint = "indent with spaces: the line has a tab"
+        raise InputError(f"{place}: not valid YAML: {problem}", hint) from error
     except RecursionError as error:  # of the loader that is not compiled
         raise _too_deep(file) from error
     except yaml.YAMLError as error:
@@ -283,6 +283,8 @@ def apply_overrides(
             )
         loc = _assign(data, key.strip().split("."), parse(value, where).data, where)
         marks = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
+        for n in range(1, len(loc)):
+            marks.setdefault(loc[:n], Mark(where, 0, 0))
         marks[loc] = Mark(where, 0, 0)
     return Document(data, marks, document.path)
 

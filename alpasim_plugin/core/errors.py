@@ -67,16 +67,8 @@ class RendererError(InfrastructureError):
     failure_class: ClassVar[str] = "renderer"
 
 
-class FixerError(InfrastructureError):
-    """A fixer returned no usable frame, and the raw frame could not replace it."""
-
-    failure_class: ClassVar[str] = "fixer"
-
-
-class PolicyError(SimrunError):
-    """A policy raised, or broke its contract: a fault of what is under test, not of the machine."""
-
-    failure_class: ClassVar[str] = "policy"
+class FaultOfPart(SimrunError):
+    """A part of the user's own raised, or broke its contract."""
 
     @property
     def is_final(self) -> bool:
@@ -84,6 +76,25 @@ class PolicyError(SimrunError):
         package was missing.
         """
         return not isinstance(self.__cause__, OSError | MemoryError | ImportError)
+
+
+class RendererFault(FaultOfPart, RendererError):
+    """A renderer of the user's own raised, or broke its contract."""
+
+    exit_code: ClassVar[int] = 2
+    failure_class: ClassVar[str] = "renderer fault"
+
+
+class FixerError(InfrastructureError):
+    """A fixer returned no usable frame, and the raw frame could not replace it."""
+
+    failure_class: ClassVar[str] = "fixer"
+
+
+class PolicyError(FaultOfPart):
+    """A policy raised, or broke its contract: a fault of what is under test, not of the machine."""
+
+    failure_class: ClassVar[str] = "policy"
 
 
 class EvaluatorError(SimrunError):

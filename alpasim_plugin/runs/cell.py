@@ -15,7 +15,7 @@ import cv2
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.atomic import disk_error
-from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.errors import FaultOfPart, SimrunError
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
@@ -209,7 +209,7 @@ def _failure(error: Exception, folder: Path) -> dict[str, Any]:
     if isinstance(error, OSError):
         error = disk_error(folder, error)
     if isinstance(error, SimrunError):
-        facts["final"] = isinstance(error, PolicyError) and error.is_final
+        facts["final"] = isinstance(error, FaultOfPart) and error.is_final
         return facts | {"error": error.as_dict()}
     return facts | {
         "error": {

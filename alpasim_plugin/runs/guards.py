@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.blame import raised
-from alpasim_plugin.core.errors import PolicyError, RendererError, SimrunError
+from alpasim_plugin.core.blame import defined, is_own, raised
+from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault, SimrunError
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 
 CHECK = "simrun check policy finds all faults of a policy"
-TRACEBACK = "see the traceback in output.log of the rollout"
+TRACEBACK = "Correct that line; --debug, and output.log of a rollout, have the traceback."
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -24,46 +25,55 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
 
     Raises:
         RendererError: The renderer raised, or its frames do not match the requests in number, size,
-            type, time or camera.
+            type, time or camera; of a renderer of the user's own a `RendererFault`.
     """
     if not requests:
         return []
+    kind = RendererError if is_own(renderer) else RendererFault
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
     try:
         frames = list(renderer.render_batch(requests))
     except SimrunError:
         raise
     except Exception as error:
-        raise RendererError(f"{name}: {raised(error)}", TRACEBACK) from error
-    if len(frames) != len(requests):
-        raise RendererError(
-            f"{name}: {len(frames)} frames for {len(requests)} requests",
-            "return one frame for each request",
+        raise kind(f"{name}: {raised(error)}", TRACEBACK) from error
+    problem = f"{len(frames)} frames for {len(requests)} requests"
+    if len(frames) == len(requests):
+        problem = "; ".join(filter(None, map(_frame_problem, frames, requests)))
+    if problem:
+        where = defined(renderer, "render")
+        raise kind(
+            f"{name}: {problem}{where}", "Correct the renderer; its contract is types.Frame."
         )
     return [
-        _checked(type(renderer).__name__, frame, request)
-        for frame, request in zip(frames, requests, strict=True)
+        replace(frame, events=(*frame.events, "black"))
+        if "black" not in frame.events and is_black(frame.rgb)
+        else frame
+        for frame in frames
     ]
 
 
-def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
+def _frame_problem(frame: Any, request: RenderRequest) -> str:
+    """Say what is wrong with what a renderer returned for a request; empty if nothing."""
+    if not isinstance(frame, Frame):
+        return f"render returned {type(frame).__name__}, not a Frame"
     wanted = (request.camera.height, request.camera.width, 3)
-    problems = []
-    if frame.rgb.shape != wanted or frame.rgb.dtype != np.uint8:
-        problems.append(f"rgb is {frame.rgb.dtype} {frame.rgb.shape}, not uint8 {wanted}")
+    shape, dtype = getattr(frame.rgb, "shape", None), getattr(frame.rgb, "dtype", None)
+    if shape != wanted or dtype != np.uint8:
+        guess = ""
+        if shape == (3, *wanted[:2]):
+            guess = "; the channels come last"
+        elif shape == wanted:
+            guess = "; multiply 0..1 by 255"
+        return (
+            f"rgb is {dtype or type(frame.rgb).__name__} {shape or ''}, not uint8 {wanted}{guess}"
+        )
     if (frame.t_us, frame.camera) != (request.t_us, request.camera.name):
-        problems.append(f"it is stamped {frame.camera!r} at {frame.t_us} us")
+        return f"the frame is stamped {frame.camera!r} at {frame.t_us} us"
     for label, plane in (("alpha", frame.alpha), ("depth", frame.depth)):
         if plane is not None and (plane.shape != wanted[:2] or not np.isfinite(plane).all()):
-            problems.append(f"{label} has shape {plane.shape} or is not finite")
-    if problems:
-        raise RendererError(
-            f"{renderer}, camera {request.camera.name!r} at {request.t_us} us: {'; '.join(problems)}",
-            "fix the renderer; its contract is types.Frame",
-        )
-    if "black" not in frame.events and is_black(frame.rgb):
-        return replace(frame, events=(*frame.events, "black"))
-    return frame
+            return f"{label} has shape {plane.shape} or is not finite"
+    return ""
 
 
 def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
@@ -108,5 +118,5 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
         raise PolicyError(f"{name}: {raised(error)}", TRACEBACK) from error
     found = plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError(f"{name}: {found}", CHECK)
+        raise PolicyError(f"{name}: {found}{defined(policy, 'act')}", CHECK)
     return plan

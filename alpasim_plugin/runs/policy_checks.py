@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.spec import BUILTIN
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
@@ -34,6 +34,9 @@ def check_policies(
             again.
         how: Workers and the time limit of a rollout.
         noticed: Called with one line for each breach.
+
+    Raises:
+        PolicyError: No policy of the run can be made.
     """
     shipped = {target for target, _ in BUILTIN["policy"].values()}
     found: dict[str, Any] = {}
@@ -55,7 +58,11 @@ def check_policies(
                 "notes": [],
             }
         found[policy.name] = {"digest": policy.digest, **result}
-        for _, sentence in result["breaches"]:
+    unmade = [text for one in found.values() for name, text in one["breaches"] if name == "made"]
+    if len(unmade) == len(plan.policies):
+        raise PolicyError(unmade[0], "Correct the policy; nothing was driven.")
+    for policy in todo:
+        for _, sentence in found[policy.name]["breaches"]:
             noticed(f"check of {policy.name}: {sentence}")
     return found
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import re
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -377,21 +376,17 @@ def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
     Without places, and only then, every id gets a straight road, of which nothing is true but the
     id: a policy under test takes no more from its scenario than cameras and vehicle.
 
-    Raises (when called):
-        InputError: None of the places has the id.
+    Raises:
+        InputError: A scene cannot be read; when called, none has the id.
     """
     if not places:
         blank = load_scenario("smoke/straight")
         return lambda scene_id: replace(blank, scene_id=scene_id, actors=())
     paths = [path for place in places for path in _scene_files(place)]
-    found: dict[str, Scenario] = {}
-    reading = threading.Lock()  # sessions open at the same time
+    scenarios = [load_scenario(path) for path in paths]
+    found = {scenario.scene_id: scenario for scenario in scenarios}
 
     def find(scene_id: str) -> Scenario:
-        with reading:
-            while scene_id not in found and paths:
-                scenario = load_scenario(paths.pop(0))
-                found[scenario.scene_id] = scenario
         if scene_id not in found:
             shown = ", ".join(sorted(found)[:5])
             raise InputError(

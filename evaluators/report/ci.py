@@ -35,6 +35,7 @@ MARKS = {
     "pass": "pass",
     "regression": "FAIL",
     "undecided": "undecided",
+    "renderer": "error",
     "incomplete": "error",
     "policy": "error",
     "infrastructure": "error",

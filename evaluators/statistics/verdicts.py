@@ -19,7 +19,14 @@ from alpasim_plugin.core.types import F64, Direction
 from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
 
 Cause = Literal[
-    "pass", "regression", "incomplete", "policy", "undecided", "infrastructure", "evaluator"
+    "pass",
+    "regression",
+    "incomplete",
+    "policy",
+    "renderer",
+    "undecided",
+    "infrastructure",
+    "evaluator",
 ]
 
 EXIT_CODES: dict[Cause, int] = {
@@ -27,6 +34,7 @@ EXIT_CODES: dict[Cause, int] = {
     "regression": 1,
     "incomplete": 2,
     "policy": 2,
+    "renderer": 2,
     "undecided": 3,
     "infrastructure": 4,
     "evaluator": 5,
@@ -36,6 +44,7 @@ WORDS: dict[Cause, str] = {
     "regression": "FAIL",
     "incomplete": "INCOMPLETE",
     "policy": "POLICY FAILURE",
+    "renderer": "RENDERER FAILURE",
     "undecided": "UNDECIDED",
     "infrastructure": "INFRASTRUCTURE FAILURE",
     "evaluator": "EVALUATOR FAILURE",
@@ -46,6 +55,7 @@ SEVERITY: tuple[Cause, ...] = (
     "evaluator",
     "infrastructure",
     "policy",
+    "renderer",
     "incomplete",
     "regression",
     "undecided",
@@ -91,6 +101,14 @@ def worst(outcomes: list[Outcome]) -> Outcome:
     return Outcome("pass")
 
 
+# By failure class; that of any other class is the infrastructure.
+CAUSES: dict[str, Cause] = {
+    "evaluator": "evaluator",
+    "policy": "policy",
+    "renderer fault": "renderer",
+}
+
+
 def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> Outcome:
     """Judge rollouts that could not be run or scored.
 
@@ -106,10 +124,10 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
         return Outcome("pass")
     causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
     text = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
-    alone: Cause | None = next(
-        (cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None
-    )
-    return Outcome(alone or "infrastructure", (text,))
+    causes = {CAUSES.get(name, "infrastructure") for name in by_class}
+    if causes == {"policy", "renderer"}:
+        return Outcome("policy", (text,))
+    return Outcome(causes.pop() if len(causes) == 1 else "infrastructure", (text,))
 
 
 Verdict = Literal["non-inferior", "worse", "undecided"]

@@ -21,6 +21,7 @@ from alpasim_plugin.core.interfaces import Declaration
 from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.core.parts.source import (
     absolute_target,
+    classes_of,
     file_of,
     is_target,
     load,
@@ -78,12 +79,25 @@ def find(kind: KindName, name: str) -> Entry:
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
+    if name.endswith(".py"):
+        return _classless(kind, Path(name))
     near = difflib.get_close_matches(name, known, n=1)
     guess = f"did you mean {near[0]!r}? " if near else ""
     return InputError(
         f"name {name!r}: no {kind} has that name",
         f"{guess}known: {', '.join(known)}; or name one of your own as package.module:Class",
     )
+
+
+def _classless(kind: str, file: Path) -> InputError:
+    """Return the error for a file without a class: it names the classes of the file, unrun."""
+    if not file.is_file():
+        return InputError(f"{file}: no such file", f"Name FILE.py:Class of a {kind}.")
+    classes = classes_of(file)
+    if not classes:
+        return InputError(f"{file}: it has no class", f"Write the {kind} as a class in it.")
+    named = " or ".join(f"{file}:{name}" for name in classes)
+    return InputError(f"{file}: a file without a class of it", f"Name its {kind}: {named}.")
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said

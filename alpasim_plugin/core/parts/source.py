@@ -8,9 +8,11 @@ files that it imports beside it, can be imported.
 from __future__ import annotations
 
 import ast
+import difflib
 import hashlib
 import importlib
 import importlib.util
+import inspect
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -191,11 +193,44 @@ def load(target: str, kind: str) -> Any:
     try:
         if name.endswith(".py") and not os.path.isfile(name):
             raise FileNotFoundError(f"no such file: {name}")
-        return getattr(importlib.import_module(make_importable(target)), attribute)
+        module = importlib.import_module(make_importable(target))
+        found = getattr(module, attribute, None)  # a module of a file runs here
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
-        raise InputError(f"{kind} {target!r}: {raised(error)}", DO_THIS) from error
+        raise InputError(f"{kind} {target!r}: {raised(error)}", _advice(name, error)) from error
+    if found is None:
+        has = [key for key, value in vars(module).items() if inspect.isclass(value)]
+        near = difflib.get_close_matches(attribute, has, 3, 0.0)
+        raise InputError(
+            f"{kind} {target!r}: {name} has no {attribute!r}",
+            f"Name one of its classes: {', '.join(near) or 'it has none'}.",
+        )
+    return found
+
+
+def _advice(name: str, error: BaseException) -> str:
+    """Return what to do about a module that cannot be imported."""
+    if "relative import" in str(error):
+        return "Write 'import helper' for a file beside it, or put an __init__.py into the folder."
+    if isinstance(error, FileNotFoundError | ModuleNotFoundError) and not name.endswith(".py"):
+        return DO_THIS
+    if isinstance(error, ModuleNotFoundError):
+        return f"Install {error.name}, or put it beside the file."
+    return "Correct the file." if name.endswith(".py") else DO_THIS
+
+
+def classes_of(file: Path) -> list[str]:
+    """Return the names of the classes that a file defines, without running it.
+
+    Raises:
+        InputError: It is not Python.
+    """
+    try:
+        tree = ast.parse(file.read_bytes(), str(file))
+    except (SyntaxError, ValueError) as error:
+        raise InputError(f"{file}: {error}", "Correct the file.") from error
+    return [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
 
 
 def make_importable(target: str) -> str:

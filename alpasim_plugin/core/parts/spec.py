@@ -22,7 +22,7 @@ from alpasim_plugin.core.errors import (
     FixerError,
     InputError,
     PolicyError,
-    RendererError,
+    RendererFault,
     SimrunError,
 )
 from alpasim_plugin.core.interfaces import complete, contract_error
@@ -167,7 +167,7 @@ def _blank(content: Any, keys: list[str]) -> None:
 
 
 ERRORS: dict[str, type[SimrunError]] = {
-    "renderer": RendererError,
+    "renderer": RendererFault,
     "fixer": FixerError,
     "policy": PolicyError,
     "evaluator": EvaluatorError,

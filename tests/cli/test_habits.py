@@ -1,0 +1,119 @@
+"""What newcomers type: other spellings that are understood, and mistakes whose answer names the
+value that is wrong.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command, usual
+
+PARTS = """
+import numpy as np
+from policies.simple import PurePursuit
+from simrun import Frame
+
+class One(PurePursuit): pass
+class NeedsGain(PurePursuit):
+    def __init__(self, scenario, gain): ...
+
+class Channels:
+    def __init__(self, scenario): ...
+    def render(self, request):
+        return Frame(request.t_us, request.camera.name, np.zeros((3, 144, 256), np.uint8))
+class Floats(Channels):
+    def render(self, request):
+        return Frame(request.t_us, request.camera.name, np.zeros((144, 256, 3), np.float32))
+class Small(Channels):
+    def render(self, request):
+        return Frame(request.t_us, request.camera.name, np.zeros((9, 16, 3), np.uint8))
+class Nothing(Channels):
+    def render(self, request): ...
+class Raises(Channels):
+    def render(self, request):
+        return np.argmin([])
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in a folder with some files of a newcomer's."""
+    (tmp_path / "parts.py").write_text(PARTS)
+    (tmp_path / "relative.py").write_text("from .helper import x\nclass One: pass\n")
+    (tmp_path / "syntax.py").write_text("class One\n    pass\n")
+    (tmp_path / "tabs.yaml").write_text("version: 1\nroad:\n\tsegments: []\n")
+    (tmp_path / "notes.txt").write_text("hello")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("help list", "list --help"),
+        ("help", "--help"),
+        ("version", "--version"),
+        ("-v", "--version"),
+        ("-j list presets", "list -j presets"),
+        ("--renderer clean, 3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
+        ("--renderer clean ,3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
+    ],
+)
+def test_other_spellings_are_understood(typed: str, meant: str) -> None:
+    assert usual(typed.split()) == meant.split()
+
+
+@pytest.mark.parametrize(
+    "line", ["-v", "version -j", "help", "help why", "list", "-j list presets"]
+)
+def test_what_asks_for_help_ends_well(line: str) -> None:
+    assert run_command(line.split()) == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("lits", "list"),
+        ("drive", "run"),
+        ("clean smoke/curve", "--renderer clean"),
+        ("smoke/curve lane-camera", "--policy lane-camera"),
+        ("--policy parts.py smoke/curve", "parts.py:One"),
+        ("--policy parts.py:Onee smoke/curve", "One"),
+        ("--policy absent.py:One smoke/curve", "absent.py"),
+        ("--policy absent.py smoke/curve", "absent.py"),
+        ("--policy relative.py:One smoke/curve", "relative.py:1"),
+        ("--policy syntax.py:One smoke/curve", "syntax.py"),
+        ("--policy parts.py:NeedsGain --out run smoke/curve", "gain"),
+        ("--renderer parts.py smoke/curve", "parts.py:Channels"),
+        ("--set roda.x=1 smoke/curve", "--set roda.x=1"),
+        ("--seeds 0..3 smoke/curve", "0..3"),
+        ("--workers 0 smoke/curve", "--workers"),
+        ("tabs.yaml", "tabs.yaml:3"),
+        ("notes.txt", "notes.txt"),
+        ("report smoke/curve", "smoke/curve"),
+        ("why", "runs/"),
+        ("export --mcap a.mcap", "runs/"),
+        ("serve --policy lane-camera --scenes absent", "absent"),
+        ("serve --policy lane-camera --scenes tabs.yaml", "tabs.yaml:3"),
+        ("check renderer parts.py:Channels", "parts.py:12"),
+        ("check renderer parts.py:Floats", "parts.py:15"),
+        ("check renderer parts.py:Small", "parts.py:18"),
+        ("check renderer parts.py:Nothing", "parts.py:21"),
+        ("check renderer parts.py:Raises", "parts.py:24"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_is_wrong(
+    line: str, named: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(line.split()) == 2
+    said = capsys.readouterr().err
+    assert named in said
+    assert "simrun_file_" not in said
+
+
+def test_a_renderer_of_the_users_own_is_at_fault_in_a_run_as_a_policy_is(here: Path) -> None:
+    line = "--renderer parts.py:Channels --workers 1 --out run --set timing.duration_us=1000000"
+    assert run_command([*line.split(), "smoke/straight"]) == 2
+    assert run_command(["why", "run"]) == 0
