@@ -35,6 +35,7 @@ from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
+SHORT_KEY = 4  # letters in the name of a run folder
 IN_SUMMARY = ("pool", "repeat", "exit_code", "alpasim")  # members of run.json in the summary too
 
 
@@ -87,10 +88,17 @@ def on_done(progress: Progress) -> Callable[[dict[str, Any], bool], None]:
 
 
 def default_folder(plan: RunPlan) -> Path:
-    """Return the default run folder; it depends on the command alone."""
-    first = next(iter(plan.scenarios))
-    more = f"-and-{len(plan.scenarios) - 1}-more" if len(plan.scenarios) > 1 else ""
-    return Path("runs", f"{slug(first)}{more}-{plan.command_key}")
+    """Return the default run folder: what the command named first, and a short key of the command;
+    the whole key where another command has the short one.
+    """
+    asked = Path(plan.asked[0] if plan.asked else next(iter(plan.scenarios)))
+    name, key = slug(asked.stem or asked.resolve().stem), plan.command_key
+    short = Path("runs", f"{name}-{key[:SHORT_KEY]}")
+    try:
+        is_free = not (short / RUN_INFO).exists() or read_run_json(short).get("key") == key
+    except InputError:
+        is_free = True  # `claim` writes a damaged description again
+    return short if is_free else Path("runs", f"{name}-{key}")
 
 
 def execute_run(
