@@ -17,6 +17,7 @@ from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.printing import warn
+from alpasim_plugin.core.stage import announce
 
 DO_THIS = "free disk space, or name a writable folder in SIMRUN_CACHE"
 
@@ -67,6 +68,7 @@ def cached(
             except InputError:
                 pass  # damaged, and said above
         warn(f"{what} ...")
+        announce(what)
         began = time.perf_counter()
         with atomic_folder(folder, DO_THIS) as partial:
             make(partial)

@@ -18,6 +18,7 @@ import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit
@@ -92,7 +93,14 @@ def reconstruct(
     start = rough_start(believed, boxes, recipe, scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})
     with _one_torch_thread():
-        fitted = fit(believed, start, splat, scene_id=scene_id, threads=threads)
+        fitted = fit(
+            believed,
+            start,
+            splat,
+            scene_id=scene_id,
+            report=lambda step, _: announce(f"fitting {scene_id}", step, splat.steps),
+            threads=threads,
+        )
     actors = {
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
     }

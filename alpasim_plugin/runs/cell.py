@@ -19,6 +19,7 @@ from alpasim_plugin.core.errors import FaultOfPart, SimrunError
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
+from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.run_folder.manifests import (
@@ -142,9 +143,12 @@ def run_cell(
             (folder / name).unlink(missing_ok=True)
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
+            announce(f"loading {cell.renderer.name} and {cell.policy.name}")
             parts = builder(cell, options, scenario, threads)
+            announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
+        announce(f"scoring {cell.scene}")
         manifest |= _score(folder, cell, options, scenario)
         has_failed = bool(manifest["events"])
         recorder.save_pictures(

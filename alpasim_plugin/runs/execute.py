@@ -9,6 +9,7 @@ therefore run cells in any order.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
@@ -120,9 +123,12 @@ def execute(
         driven = _run_local(todo, plan, root, how)
     else:
         driven = _run_on_ray(todo, plan, root, how)
-    for cell, manifest in driven:
-        manifests[cell.folder] = manifest
-        on_done(manifest, False)
+    try:
+        for cell, manifest in driven:
+            manifests[cell.folder] = manifest
+            on_done(manifest, False)
+    finally:
+        shutil.rmtree(root / STAGES, ignore_errors=True)
     return [manifests[cell.folder] for cell in plan.cells]
 
 
@@ -148,7 +154,8 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -
 
 def _drive(options: RunOptions, root: Path, threads: int, cell: Cell) -> dict[str, Any]:
     """Run a cell in a worker of this machine."""
-    return run_cell(cell, options, root, threads)
+    with shown_in(root / STAGES):
+        return run_cell(cell, options, root, threads)
 
 
 def _run_on_ray(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:

@@ -20,6 +20,7 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.places import temporary_folder
+from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
     U8,
@@ -131,6 +132,7 @@ class Recorder:
         self._only_watched = False
         self._last_query_us = -1
         self._steps = 0
+        self._n_steps = 0
         self._first_call = 0
         self._passed = False
         self._writer: AslWriter | None = None
@@ -180,6 +182,7 @@ class Recorder:
             first = next(iter(cameras))
             period_us = self._scenario.period_us(SensorSpec(first))
             self._pictures = Pictures(clock, first, period_us, self._keep_frames)
+        self._n_steps = clock.n_steps
         header = header_from_scenario(
             self._scenario, self._session, self._seed, clock.n_steps, self._versions
         )
@@ -242,6 +245,7 @@ class Recorder:
             )
             self._log.controller_return(after)
             self._steps += 1
+            announce(f"driving {self._scenario.scene_id}", self._steps, self._n_steps)
 
     def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.writer import remove_left_overs
 from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.runs.run import execute_run
+from alpasim_plugin.runs.run import default_folder, execute_run
 from alpasim_plugin.runs.score_logs import check_vouched
 from scenarios.suite import expand
 from tests.runs.test_runs import Announced, comparable
@@ -202,3 +203,17 @@ def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -
     os.utime(younger, ns=(limit_ns + 1, limit_ns + 1))
     assert set(remove_left_overs(root, limit_ns)) == set(gone)
     assert all(path.exists() for path in [*kept, younger])
+
+
+def test_a_run_folder_is_named_by_what_was_driven_and_a_short_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plan = replace(plan_of(), asked=("suites/first",))
+    folder = default_folder(plan)
+    assert folder == Path(f"runs/first-{plan.command_key[:4]}")
+    run(folder, plan)
+    assert default_folder(plan) == folder
+    info = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(info | {"key": "another"}))
+    assert default_folder(plan) == Path(f"runs/first-{plan.command_key}")

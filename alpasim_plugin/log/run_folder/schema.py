@@ -38,6 +38,7 @@ ROLLOUTS = "rollouts.parquet"  # a row for each rollout
 STEPS = "steps.parquet"  # a row for each metric at each instant of a rollout
 SUMMARY = "summary.json"  # the last of the tables
 PAGES = ("report.html", "flips.html")
+STAGES = ".stages"  # what the workers of a run do, while they do it
 LOCK = ".simrun.lock"  # while somebody writes the folder
 AGGREGATE = "aggregate"  # AlpaSim's aggregation of scored logs
 # Files of the folder of a rollout.

@@ -1,0 +1,27 @@
+"""What a process does at the moment, for whoever waits for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from alpasim_plugin.core.stage import Stage, announce, shown_in, stages_in
+
+
+def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path: Path) -> None:
+    announce("nobody asked", 1, 2)
+    with shown_in(tmp_path / "stages"):
+        announce("fitting a", 3, 10)
+        announce("fitting a", 4, 10)  # too soon to be worth a write
+        (found,) = stages_in(tmp_path / "stages")
+        assert (found.name, found.done, found.total) == ("fitting a", 3, 10)
+        announce("driving a")
+        assert [one.name for one in stages_in(tmp_path / "stages")] == ["driving a"]
+        (tmp_path / "stages" / "1").write_text("{")  # written just now
+        assert len(stages_in(tmp_path / "stages")) == 1
+    (tmp_path / "stages" / "1").unlink()
+    assert stages_in(tmp_path / "stages") == []
+
+
+def test_an_estimate_needs_something_done() -> None:
+    assert "30 s left" in Stage("fitting", 100.0, 1, 4).text(110.0)
+    assert "left" not in Stage("loading", 100.0).text(110.0)
