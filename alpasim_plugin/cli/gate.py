@@ -87,18 +87,18 @@ def gate(
             f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
             "Score the run with that preset.",
         )
-    rows = None
+    stored = None
     repeatable = is_repeatable(stored_run)
     if baseline_file is not None:
         baseline = read_baseline(baseline_file)
         check_matches(baseline, stored_run, baseline_file)
-        rows = baseline.rows
+        stored = baseline.table
         if baseline.repeatable is False:
             repeatable = False
     verdict = judge(
         table_of_run(stored_run),
         spec,
-        rows,
+        stored,
         str(baseline_file or ""),
         stored_run.table,
         preset,

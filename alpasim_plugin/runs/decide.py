@@ -8,7 +8,7 @@ interruptions. The same command therefore reaches the same decision after any ki
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,8 +18,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
-from alpasim_plugin.log.run_folder.sides import Side
-from alpasim_plugin.log.run_folder.writer import rollout_rows, writing
+from alpasim_plugin.log.run_folder.sides import RolloutTable
+from alpasim_plugin.log.run_folder.writer import rollout_table, writing
 from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import Cell, RunPlan, part_of
@@ -50,8 +50,6 @@ from evaluators.statistics.decision import (
 )
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.variants import (
-    Variant,
-    as_policy,
     base_named,
     short_name,
     usual_base,
@@ -192,11 +190,6 @@ def execute_decision(
     return Decided(result, test.record(), test.state, test.outcome)
 
 
-def _side(rows: Sequence[Mapping[str, Any]], variant: Variant) -> Side:
-    names = (variant.renderer, variant.policy)
-    return Side.of([row for row in rows if (row["renderer"], row["policy"]) == names])
-
-
 @dataclass
 class _SequentialTest:
     """The scenes driven so far, what follows from them, and which come next."""
@@ -239,10 +232,11 @@ class _SequentialTest:
         """Take in a batch and analyse all scenes so far."""
         folders = [cell.folder.as_posix() for cell in cells]
         self.manifests |= dict(zip(folders, manifests, strict=True))
-        rows = rollout_rows(list(self.manifests.values()))
-        self.failed = outcome_of_failures(failures_of(rows))
-        candidate = _side(rows, self.candidate)
-        base = as_policy(_side(rows, self.baseline), self.candidate.policy)
+        table = RolloutTable.of_table(rollout_table(list(self.manifests.values())))
+        self.failed = outcome_of_failures(failures_of(table))
+        policy = self.candidate.policy
+        candidate = table.sides(policy)[self.candidate.renderer]
+        base = table.sides(self.baseline.policy, policy)[self.baseline.renderer]
         scenes = self.order[: self.driven]
         values = {}
         for one in self.question.metrics:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.parts import names
-from alpasim_plugin.log.run_folder.sides import Row
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import Progress, execute_run
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
-from evaluators.statistics.baselines import rows_of_run
+from evaluators.statistics.baselines import table_of_run
 from evaluators.statistics.gate import GateSpec, GateVerdict, judge
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
@@ -84,12 +84,9 @@ def run_self_test(
         execute_run(control, root / "control", None, command, progress),
     ]
     failed = worst([outcome_of_failures(result.summary["failures"]) for result in results])
-    rows = rows_of_run(read_run(root))
-    rows += [{**row, "renderer": CONTROL} for row in rows_of_run(read_run(root / "control"))]
-    trials = [
-        Trial(name, name != CONTROL, judge_pair(spec, rows, name, options.preset))
-        for name in (*broken, CONTROL)
-    ]
+    first, again = (table_of_run(read_run(folder)) for folder in (root, root / "control"))
+    trials = [Trial(name, True, judge_against(first, spec, first, name)) for name in broken]
+    trials.append(Trial(CONTROL, False, judge_against(again, spec, first, REFERENCE)))
     reasons = tuple(
         f"{trial.renderer} is {'not caught' if trial.is_broken else 'wrongly called worse'}"
         for trial in trials
@@ -100,10 +97,10 @@ def run_self_test(
     return trials, Outcome("regression" if reasons else "pass", reasons)
 
 
-def judge_pair(
-    spec: GateSpec, rows: Sequence[Row], name: str, preset: str = DEFAULT
+def judge_against(
+    table: RolloutTable, spec: GateSpec, first: RolloutTable, name: str
 ) -> GateVerdict:
-    """Judge one renderer against the reference."""
+    """Judge one renderer of a table against the reference of the first."""
     fields = {
         "renderers": (name,),
         "baseline": REFERENCE,
@@ -111,5 +108,5 @@ def judge_pair(
         "max_failed": 0.0,
         "population": "suite",
     }
-    pair = [row for row in rows if row["renderer"] in (REFERENCE, name)]
-    return judge(pair, spec.model_copy(update=fields), preset=preset)
+    preset = spec.preset or DEFAULT
+    return judge(table, spec.model_copy(update=fields), first, "the reference", preset=preset)

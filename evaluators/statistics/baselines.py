@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
@@ -65,20 +66,8 @@ def rows_of_run(run: Run) -> list[dict[str, Any]]:
         for name in run.metric_names:
             value = rollout.metrics.get(name)
             row[name], row[f"{name}_valid"] = value, value is not None
-            if value is None and rollout.ok:
-                row[f"{name}_reason"] = run.invalid_reasons.get((rollout.renderer, name), "")
         rows.append(row)
     return rows
-
-
-def of_policy(rows: Sequence[Row], policy: str) -> list[Row]:
-    """Return the rows of one policy."""
-    return [row for row in rows if row["policy"] == policy]
-
-
-def policies_of(rows: Sequence[Row]) -> list[str]:
-    """Return the policies in order of appearance."""
-    return list(dict.fromkeys(str(row["policy"]) for row in rows))
 
 
 class StoredBaseline(TypedDict):
@@ -118,6 +107,11 @@ class Baseline:
     metrics: Mapping[str, Any]  # what each is, as in run.json
     repeatable: bool | None  # what ``run --repeat`` found; None: not tried
     schema_version: int = SCHEMA_VERSION
+
+    @property
+    def table(self) -> RolloutTable:
+        """Give the rollouts in columns."""
+        return RolloutTable.of_table(pa.Table.from_pylist(list(self.rows)))
 
 
 def baseline_of(run: Run) -> Baseline:

@@ -7,7 +7,6 @@ were drawn from (`evaluators.statistics.paired`).
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,19 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.log.run_folder.sides import (
-    RolloutTable,
-    Row,
-    Side,
-    by_renderer,
-    failure_of,
-    is_ok,
-)
+from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.report.numbers import plural, short
-from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (
@@ -234,9 +225,9 @@ class GateVerdict:
 
 
 def judge(
-    rollouts: RolloutTable | Sequence[Row],
+    rollouts: RolloutTable,
     spec: GateSpec,
-    stored: Sequence[Row] | None = None,
+    stored: RolloutTable | None = None,
     stored_name: str = "",
     known: MetricTable = METRICS,
     preset: str = DEFAULT,
@@ -245,9 +236,9 @@ def judge(
     """Judge rollouts.
 
     Args:
-        rollouts: Every planned rollout of the run, in columns or as rows (`rows_of_run`).
+        rollouts: Every planned rollout of the run.
         spec: The gate.
-        stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
+        stored: A stored baseline; without it the baseline is a renderer of the run itself.
         stored_name: How to call the stored baseline.
         known: What the metrics are.
         preset: With which both sides were scored.
@@ -296,29 +287,20 @@ def judge(
     return GateVerdict(worst(outcomes), tuple(checks), failures, name, about)
 
 
-def _sides(rollouts: RolloutTable | Sequence[Row]) -> Sides:
+def _sides(table: RolloutTable) -> Sides:
     """Return the rollouts of each variant, policy by policy."""
-    if isinstance(rollouts, RolloutTable):
-        by_policy = {policy: rollouts.sides(policy) for policy in rollouts.policies}
-    else:
-        by_policy = {
-            policy: by_renderer(of_policy(rollouts, policy)) for policy in policies_of(rollouts)
-        }
     return {
         Variant(renderer, policy): side
-        for policy, sides in by_policy.items()
-        for renderer, side in sides.items()
+        for policy in table.policies
+        for renderer, side in table.sides(policy).items()
     }
 
 
-def failures_of(rollouts: RolloutTable | Sequence[Row]) -> dict[str, Any]:
+def failures_of(table: RolloutTable) -> dict[str, Any]:
     """Count rollouts that did not run to their end, as summary.json does."""
-    if isinstance(rollouts, RolloutTable):
-        n, by_class = rollouts.n_rollouts, rollouts.failures()
-    else:
-        n = len(rollouts)
-        by_class = dict(Counter(failure_of(row) for row in rollouts if not is_ok(row)))
-    return {"n_rollouts": n, "n_failed": sum(by_class.values()), "by_class": by_class}
+    by_class = table.failures()
+    n_failed = sum(by_class.values())
+    return {"n_rollouts": table.n_rollouts, "n_failed": n_failed, "by_class": by_class}
 
 
 def _base(

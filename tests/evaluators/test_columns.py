@@ -17,7 +17,6 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators import aggregate, paired
-from evaluators.statistics.gate import GateSpec, judge
 from evaluators.statistics.summary import numbers
 from tests.evaluators.eval_build import base_pairs
 
@@ -180,39 +179,6 @@ def test_a_run_without_rollouts_has_no_numbers() -> None:
         "paired_arms": {},
     }
     assert table.failures() == {}
-
-
-SPEC = GateSpec.model_validate(
-    {
-        "version": 1,
-        "metrics": {
-            "offroad": {"margin": 0.1},
-            "lateral_distance_m": {"margin": 0.2, "max": 3.0},
-            "progress": {"min": 0.9},
-        },
-    }
-)
-
-
-@pytest.mark.parametrize(
-    "stored", [None, rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 7, (1, 2, 5), 12)]
-)
-def test_a_gate_judges_columns_as_rows_beside_stored_rows_too(stored):
-    rows = rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 6, (0, 1, 2), 11)
-    assert judge(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(
-        rows, SPEC, stored, "before"
-    )
-
-
-def test_a_gate_of_rows_and_of_columns_refuses_a_baseline_that_is_not_there():
-    rows = rows_like_a_run(("clean", "3dgs"), ("a",), 3, (0,), 13)
-    spec = SPEC.model_copy(update={"baseline": "absent"})
-    for call in (
-        lambda: judge(rows, spec),
-        lambda: judge(RolloutTable.of_table(table_of(rows)), spec),
-    ):
-        with pytest.raises(InputError, match="absent"):
-            call()
 
 
 def test_cells_of_rows_are_those_of_columns():

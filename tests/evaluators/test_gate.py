@@ -8,10 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.statistics.gate import GateSpec, MetricRule, judge, load_gate, shipped_gates
+from alpasim_plugin.log.run_folder.sides import RolloutTable
+from evaluators.statistics.gate import (
+    GateSpec,
+    GateVerdict,
+    MetricRule,
+    judge,
+    load_gate,
+    shipped_gates,
+)
 from evaluators.statistics.verdicts import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
 
 SCENES = 14
@@ -42,8 +51,19 @@ def rows(renderer: str = "3dgs", scenes: int = SCENES, seeds: int = 1, policy: s
         }
         names = {"renderer": renderer, "policy": policy, "scene": f"s{scene:03d}", "seed": seed}
         valid = {f"{name}_valid": True for name in values}
-        made.append(names | {"status": "ok"} | values | valid)
+        made.append(names | {"status": "ok", "failure_class": None} | values | valid)
     return made
+
+
+def table_of(made: Rows) -> RolloutTable:
+    return RolloutTable.of_table(pa.Table.from_pylist(made))
+
+
+def judged(
+    run: Rows, spec: GateSpec, stored: Rows | None = None, name: str = "", **fields: Any
+) -> GateVerdict:
+    base = None if stored is None else table_of(stored)
+    return judge(table_of(run), spec, base, name, **fields)
 
 
 def add(change: float, metric: str = "lateral_distance_m", where: slice = slice(None)):
@@ -92,7 +112,7 @@ def code(
 ) -> int:
     """Return the exit code of a change of the run and one of its baseline."""
     stored = before(rows(renderer="clean", **size))
-    return judge([*stored, *now(rows(**size))], spec or gate(), repeatable=not is_noisy).exit_code
+    return judged([*stored, *now(rows(**size))], spec or gate(), repeatable=not is_noisy).exit_code
 
 
 @pytest.mark.parametrize(
@@ -180,20 +200,20 @@ def test_a_distance_that_an_event_cut_short_is_compared_with_none() -> None:
     short = both(add(1.0, "collision_any", ONE), add(-0.3, where=ONE))
     spec = gate(metrics={"lateral_distance_m": RULES["lateral_distance_m"]})
     assert code(short, spec=spec) == 1  # the event ends the scored part, though it has no rule
-    verdict = judge([*short(rows("clean")), *rows()], spec)
+    verdict = judged([*short(rows("clean")), *rows()], spec)
     assert verdict.exit_code == 0
     assert (verdict.checks[0].entry["diff"], verdict.checks[0].entry["cut"]) == (
         0.0,
         ["s004 seed 0"],
     )
     assert code(short, spec=gate(max_new=1)) == 0
-    driven_on = judge([*rows("clean"), *short(rows())], spec, preset="nuplan")
+    driven_on = judged([*rows("clean"), *short(rows())], spec, preset="nuplan")
     assert driven_on.exit_code == 0  # its rollouts go on after an event
 
 
 def test_a_verdict_counts_and_names_what_changed() -> None:
     stored = add(1.0, "collision_at_fault", THREE)(rows("clean"))
-    verdict = judge([*stored, *both(NEW, add(0.4, where=ONE))(rows())], gate())
+    verdict = judged([*stored, *both(NEW, add(0.4, where=ONE))(rows())], gate())
     checks = {check.metric: check for check in verdict.checks}
     event, distance = checks["collision_at_fault"], checks["lateral_distance_m"]
     assert event.entry["counts"] == {"equal": 10, "new": 1, "gone": 3}
@@ -242,7 +262,7 @@ def test_a_policy_that_is_not_repeatable_is_tested_over_its_seeds(now, before, s
 
 
 def test_an_undecided_gate_says_how_many_seeds_would_decide() -> None:
-    verdict = judge([*rows("clean"), *often(0.0, 1)(rows())], gate(), repeatable=False)
+    verdict = judged([*rows("clean"), *often(0.0, 1)(rows())], gate(), repeatable=False)
     undecided = {check.metric: check for check in verdict.checks if check.cause == "undecided"}
     assert undecided["offroad"].entry["seeds"] == 3
     assert "3 seeds" in undecided["offroad"].text.replace("\u00a0", " ")
@@ -279,15 +299,15 @@ def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators() -
 
 def test_renderers_and_policies_are_judged_one_by_one() -> None:
     both_renderers = [*rows("clean"), *rows("good"), *add(0.5)(rows("worse one"))]
-    verdict = judge(both_renderers, gate())
+    verdict = judged(both_renderers, gate())
     distances = [c for c in verdict.checks if c.metric == "lateral_distance_m"]
     assert {(c.renderer, c.cause) for c in distances} == {
         ("good", "pass"),
         ("worse one", "regression"),
     }
-    assert judge(both_renderers, gate(renderers=("good",))).exit_code == 0
+    assert judged(both_renderers, gate(renderers=("good",))).exit_code == 0
     other = [*rows("clean", policy="q"), *add(0.5)(rows("good", policy="q"))]
-    arms = judge([*both_renderers, *other], gate(renderers=("good",))).checks
+    arms = judged([*both_renderers, *other], gate(renderers=("good",))).checks
     assert {(c.policy, c.cause) for c in arms if c.metric == "lateral_distance_m"} == {
         ("p", "pass"),
         ("q", "regression"),
@@ -296,7 +316,7 @@ def test_renderers_and_policies_are_judged_one_by_one() -> None:
 
 def test_a_stored_baseline_meets_the_renderer_of_the_same_name() -> None:
     stored = [*rows("clean"), *rows()]
-    verdict = judge([*rows("clean"), *add(0.5)(rows())], gate(), stored, "main.json")
+    verdict = judged([*rows("clean"), *add(0.5)(rows())], gate(), stored, "main.json")
     assert {(c.renderer, c.cause) for c in verdict.checks if c.metric == "lateral_distance_m"} == {
         ("clean", "pass"),
         ("3dgs", "regression"),
@@ -312,9 +332,9 @@ def test_names_that_are_not_there_are_refused() -> None:
         ([*one, *rows()], gate(baseline="onefixer")),
     ):
         with pytest.raises(InputError):
-            judge(run, spec)
+            judged(run, spec)
     limits = gate(metrics={"img_is_black": MetricRule(max=0.0)})
-    assert judge(one, limits).exit_code == 0  # limits need no second renderer
+    assert judged(one, limits).exit_code == 0  # limits need no second renderer
 
 
 def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides() -> None:

@@ -15,19 +15,19 @@ from alpasim_plugin.runs.self_test import (
     SUITE,
     Trial,
     broken_renderers,
-    judge_pair,
+    judge_against,
 )
 from evaluators.statistics.gate import GateSpec, MetricRule
 from scenarios.suite import load_suite
-from tests.evaluators.test_gate import add, rows
+from tests.evaluators.test_gate import add, rows, table_of
 
 
 def trial(margin: float, is_broken: bool, change: float, limit: float | None = None) -> Trial:
     rules = {"lateral_distance_m": MetricRule(margin=margin, max=limit)}
     name = "broken-black" if is_broken else CONTROL
-    both = [*rows(REFERENCE), *add(change)(rows(name))]
+    first, again = table_of(rows(REFERENCE)), table_of(add(change)(rows(name)))
     spec = GateSpec(version=1, metrics=rules, min_scenes=100)  # the self-test asks for no more
-    return Trial(name, is_broken, judge_pair(spec, both, name))
+    return Trial(name, is_broken, judge_against(again, spec, first, name))
 
 
 def test_a_sensitive_gate_is_right_about_both() -> None:
