@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
@@ -38,13 +40,12 @@ from evaluators.statistics.decision import (
     WORDS,
     Decision,
     Question,
-    SceneDifferences,
     State,
     least_scenes,
     look_as_dict,
     outcome_of,
     question_as_dict,
-    scene_differences,
+    scene_harm,
     state_after,
     write_decision,
 )
@@ -199,7 +200,7 @@ class _SequentialTest:
     driven: int = 0  # scenes, the first of the order
     manifests: dict[str, dict[str, Any]] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
-    differences: dict[str, SceneDifferences] = field(default_factory=dict)
+    lacking: list[str] = field(default_factory=list)  # binding metrics of which a pair has no value
     state: State = State(0, "open", ())
     failed: Outcome = Outcome("pass")
     stopped: str = ""
@@ -238,11 +239,11 @@ class _SequentialTest:
         candidate = table.sides(policy)[self.candidate.renderer]
         base = table.sides(self.baseline.policy, policy)[self.baseline.renderer]
         scenes = self.order[: self.driven]
-        values = {}
-        for one in self.question.metrics:
-            difference = scene_differences(candidate, base, one.metric, scenes)
-            self.differences[one.metric] = difference
-            values[one.metric] = difference.harm(one.facts.direction)
+        asked = self.question.metrics
+        values = {one.metric: scene_harm(candidate, base, one.facts, scenes) for one in asked}
+        self.lacking = [
+            one.metric for one in asked if one.binding and np.isnan(values[one.metric]).any()
+        ]
         self.state = state_after(self.question, values, len(self.order))
         self.looks.append(look_as_dict(self.state, len(self.manifests)))
         if self.failed.cause != "pass":
@@ -251,15 +252,6 @@ class _SequentialTest:
             self.stopped = "decided"
         elif self.lacking:
             self.stopped = f"pairs lack a value: {', '.join(self.lacking)}"
-
-    @property
-    def lacking(self) -> list[str]:
-        """Give the binding metrics of which a pair lacks a value."""
-        return [
-            one.metric
-            for one in self.question.metrics
-            if one.binding and self.differences[one.metric].n_missing > 0
-        ]
 
     @property
     def outcome(self) -> Outcome:

@@ -27,7 +27,7 @@ from typing_extensions import TypedDict
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
-from alpasim_plugin.core.types import F64, I64, Bool, Direction, MetricInfo
+from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.metrics import METRICS
 from evaluators.statistics.betting import (
@@ -37,7 +37,7 @@ from evaluators.statistics.betting import (
     log_capital,
     lower_bound,
 )
-from evaluators.statistics.paired import reach_of
+from evaluators.statistics.paired import Pairs, reach_of
 from evaluators.statistics.verdicts import Cause, Outcome
 
 Answer = Literal["good", "bad", "open"]
@@ -135,50 +135,27 @@ def metric_question(
     return question
 
 
-@dataclass(frozen=True)
-class SceneDifferences:
-    """Paired differences of one metric, scene by scene in the order of the drawing.
+def scene_harm(candidate: Side, baseline: Side, metric: MetricInfo, scenes: Sequence[str]) -> F64:
+    """Return the mean difference ``(n,)`` of each scene named, positive is worse; without a better
+    side as it is.
 
-    Attributes:
-        diff: ``(n,)`` candidate minus baseline, mean over the scene's pairs, in the metric's own
-            sign; NaN where a pair is missing.
-        n_pairs: Pairs planned.
-        n_missing: Of these, pairs without a difference.
-    """
-
-    diff: F64
-    n_pairs: int
-    n_missing: int
-
-    def harm(self, direction: Direction) -> F64:
-        """Return the differences with the sign that makes positive worse; without a better side as
-        they are.
-        """
-        return -self.diff if direction == "higher" else self.diff
-
-
-def scene_differences(
-    candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]
-) -> SceneDifferences:
-    """Return the differences of the scenes named, in their order.
-
-    A scene with a rollout that lacks its pair has no difference: which pairs are lost may depend
-    on how the rollout went.
+    A scene with a rollout that lacks its pair has no difference, NaN: which pairs are lost may
+    depend on how the rollout went.
 
     Args:
         candidate: Rollouts of the variant in question, of one policy.
         baseline: Those of the variant that it is compared with.
-        metric: Its name.
+        metric: What is compared.
         scenes: In the order in which they were drawn.
     """
-    own = dict(zip(candidate.cells, candidate.values(metric).tolist(), strict=True))
-    base = dict(zip(baseline.cells, baseline.values(metric).tolist(), strict=True))
+    pairs = Pairs(candidate, baseline, metric.name)
+    diff = pairs.there - pairs.here if metric.direction == "higher" else pairs.here - pairs.there
     of_scene: dict[str, list[float]] = {scene: [] for scene in scenes}
-    for cell in dict.fromkeys([*own, *base]):
-        of_scene.setdefault(cell[1], []).append(own.get(cell, np.nan) - base.get(cell, np.nan))
-    diff = [np.mean(of_scene[scene]) if of_scene[scene] else np.nan for scene in scenes]
-    every = np.concatenate([of_scene[scene] or [np.nan] for scene in scenes])
-    return SceneDifferences(np.array(diff), len(every), int(np.isnan(every).sum()))
+    for (_, scene, _), value in zip(candidate.cells, diff.tolist(), strict=True):
+        of_scene[scene].append(value)
+    for i in pairs.only_base.tolist():
+        of_scene[baseline.cells[i][1]].append(math.nan)
+    return np.array([np.mean(of_scene[scene] or [math.nan]) for scene in scenes])
 
 
 def closed(log_e: F64) -> F64:
