@@ -449,7 +449,7 @@ def _suite_check(
     n_equal = n_cells - int(np.sum(change.harms[0] != 0.0))
     entry = {
         "baseline": pair.label,
-        "diff": -change.mean if metric.direction == "higher" else change.mean,
+        "diff": (0.0 - change.mean) if metric.direction == "higher" else change.mean,
         "margin": change.margin,
         "max_new": max_new,
         "p_value": p,

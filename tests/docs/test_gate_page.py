@@ -15,7 +15,7 @@ from evaluators.opening import read_run
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "ci.md"
 MINE = "my_policy:Mine"
-NOISY = "tests.runs.broken_policies:RemembersEarlierRollouts"
+NOISY = "tests.runs.broken_policies:ShiversByTheClock"
 POLICIES = ("log-replay", "constant-velocity", "pure-pursuit", NOISY)
 BASELINES = ("log-replay", "constant-velocity")
 

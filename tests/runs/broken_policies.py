@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 
 import numpy as np
 
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from policies.simple import LogReplay
 
 
 class Raises:
@@ -63,3 +65,12 @@ class RemembersEarlierRollouts(Raises):
             np.stack([observation.ego.speed_mps * seconds, left], axis=1),
             np.zeros(len(times)),
         )
+
+
+class ShiversByTheClock(LogReplay):
+    """Drives the recording but for some millimetres to the side, by the clock: not repeatable."""
+
+    def act(self, observation: Observation) -> Plan:
+        plan = super().act(observation)
+        aside = np.array([0.0, 1e-3 * (time.monotonic_ns() % 11)])
+        return Plan(plan.t_us, plan.times_us, plan.xy + aside, plan.yaw)
