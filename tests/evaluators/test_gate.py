@@ -343,6 +343,7 @@ def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides() -
         "regression": 1,
         "incomplete": 2,
         "policy": 2,
+        "renderer": 2,
         "undecided": 3,
         "infrastructure": 4,
         "evaluator": 5,
