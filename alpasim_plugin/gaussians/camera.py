@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +14,23 @@ from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.gaussians.constants import SLOPE_MARGIN
+
+
+@dataclass(frozen=True, eq=False)
+class Rolling:
+    """A rolling shutter of a camera whose pose is that of the middle of the shutter.
+
+    Attributes:
+        T_camera_world_start: ``(4, 4)`` at shutter start.
+        actors_start: Actor id to ``T_world_box`` at shutter start.
+        time: ``(a, b, c)``: the pixel (u, v) is exposed ``a u + b v + c`` shutters after its middle.
+        reach_px: By how many pixels things move at most.
+    """
+
+    T_camera_world_start: F64
+    actors_start: Mapping[str, F64]
+    time: tuple[float, float, float]
+    reach_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +44,7 @@ class PinholeCamera:
         K: ``(3, 3)`` intrinsics in pixels, no skew.
         T_camera_world: ``(4, 4)`` rigid transform that maps world points, metres, to camera points.
         whole: `slope_limits` of the picture that this is a window of; None: it is a whole picture.
+        rolling: Its shutter; None: all pixels are exposed at once.
 
     Raises:
         InputError: A size below 1, intrinsics with skew or without positive focal lengths, or a
@@ -36,6 +56,7 @@ class PinholeCamera:
     K: F64
     T_camera_world: F64
     whole: tuple[float, float, float, float] | None = None
+    rolling: Rolling | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
@@ -96,6 +117,26 @@ class PinholeCamera:
         K[:2, 2] -= columns.start, rows.start
         size = columns.stop - columns.start, rows.stop - rows.start
         return PinholeCamera(*size, K, self.T_camera_world, self.slope_limits())
+
+    def widened(self, by_px: float) -> PinholeCamera:
+        """Return the camera of an image with so many more pixels on each side."""
+        more = int(np.ceil(by_px))
+        return self.window(slice(-more, self.height + more), slice(-more, self.width + more))
+
+    def motion(self, T_world_node: F64, T_world_start: F64) -> F64:
+        """Return how a node moves as the camera sees it while the shutter is open: a rotation
+        vector and a shift, ``(6,)``; for each point p, ``turn x p + shift`` in a shutter.
+
+        Args:
+            T_world_node: ``(4, 4)`` at the middle of the shutter.
+            T_world_start: ``(4, 4)`` at its start.
+        """
+        assert self.rolling is not None, "nothing moves in a global shutter"
+        before = self.rolling.T_camera_world_start @ T_world_start
+        M = before @ inverse(self.T_camera_world @ T_world_node)
+        turn = cv2.Rodrigues(M[:3, :3])[0].ravel()
+        shift = M[:3, 3] - 0.5 * np.cross(turn, M[:3, 3])
+        return np.asarray(-2.0 * np.concatenate([turn, shift]))  # half a shutter lies between
 
     @property
     def fx(self) -> float:

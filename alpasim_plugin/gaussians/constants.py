@@ -35,6 +35,10 @@ CAM_SLOPE_HIGH_X = 5
 CAM_SLOPE_LOW_Y = 6
 CAM_SLOPE_HIGH_Y = 7
 CAM_WIDTH, CAM_HEIGHT = 8, 9
+# of a rolling shutter: the time of a pixel, in shutters from its middle, as a U + b V + c; and by how
+# many pixels things move while it is open, 0: it does not roll
+CAM_TIME_U, CAM_TIME_V, CAM_TIME_0 = 10, 11, 12
+CAM_REACH = 13
 
 # A node's pose, one float64 array: rotation node to camera, camera centre in the node, and the depth
 # range.
@@ -42,7 +46,9 @@ POSE_ROTATION = 0
 POSE_CENTRE = 9
 POSE_NEAR = 12
 POSE_FAR = 13
-POSE_SIZE = 14
+POSE_TURN = 14  # rotation vector and shift of the node as the camera sees it, over the shutter
+POSE_SHIFT = 17
+POSE_SIZE = 20
 
 # One group of sixteen prepared Gaussians: columns of sixteen lanes each.
 GEO_FACTOR = 0  # nine columns: R_q diag(s), row by row

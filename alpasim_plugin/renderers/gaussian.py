@@ -60,7 +60,7 @@ class CleanRenderer(Renderer):
                 camera, actors, self.threads, self.device, sky_in_alpha=complete
             )
 
-        out = draw_request(request, draw)
+        out = draw_request(request, draw, self.device)
         self.stats = out.stats
         return Frame(
             request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth()

@@ -100,7 +100,7 @@ class ReconstructionRenderer(Renderer):
                 depth=out.surface_depth(),
             )
 
-        out = draw_request(request, draw)
+        out = draw_request(request, draw, self.device)
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
@@ -209,7 +209,7 @@ class ImportedRenderer(Renderer):
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
-        out = draw_request(request, self._drawn)
+        out = draw_request(request, self._drawn, self.device)
         place = camera_at(request, request.T_world_camera[1]).centre_world
         rgb = np.clip(out.rgb * exposure_near(self.fitted, request.camera.name, place), 0.0, 1.0)
         shown = replace(out, rgb=np.asarray(rgb, np.float32))

@@ -5,23 +5,30 @@ the band's instant.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.shutter import at_share, bands, motion_px
 from alpasim_plugin.core.types import F64, RenderRequest
-from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 
+NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still looked for in full
 Draw = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
 
 
-def draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
-    """Draw a request's frame; with an exposure in `bands`, otherwise at the shutter's end.
+def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutput:
+    """Draw a request's frame; without an exposure at the shutter's end.
+
+    Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
+    time of its pixel. Otherwise the frame is drawn in `bands`.
 
     Args:
         request: What to draw.
         draw: Draws a camera's image with the road users at their boxes.
+        device: That of ``draw``.
 
     Returns:
         The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of
@@ -30,6 +37,8 @@ def draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
     spec = request.camera
     if request.exposure is None:
         return draw(camera_at(request, request.T_world_camera[1]), request.actors)
+    if device == "cpu" and 1 in request.exposure.share.shape:
+        return draw(*_rolling(request))
     shape = (spec.height, spec.width)
     out = RasterOutput(
         np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
@@ -42,6 +51,29 @@ def draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
             band.put(whole, drawn)
         stats = {name: max(count, stats.get(name, 0)) for name, count in part.stats.items()}
     return RasterOutput(out.rgb, out.alpha, out.depth, stats)
+
+
+def _rolling(request: RenderRequest) -> tuple[PinholeCamera, Mapping[str, F64]]:
+    """Return the camera of a shutter that rolls along rows or columns, and the road users, both at
+    its middle.
+    """
+    assert request.exposure is not None, "a frame without exposure is exposed at one instant"
+    share = request.exposure.share
+    T_world_camera, actors = at_share(request, 0.5)
+    camera = camera_at(request, T_world_camera)
+    first, last = float(share.flat[0]), float(share.flat[-1])
+    step = (last - first) / max(share.size - 1, 1)
+    along = (0.0, step) if share.shape[1] == 1 else (step, 0.0)
+    reach_px = motion_px(request)
+    if reach_px == 0.0:
+        return camera, actors
+    rolling = Rolling(
+        inverse(request.T_world_camera[0]),
+        request.exposure.actors_start,
+        (*along, first - 0.5 - 0.5 * step),
+        NEARER * reach_px + 1.0,
+    )
+    return replace(camera, rolling=rolling), actors
 
 
 def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:

@@ -19,10 +19,14 @@ from alpasim_plugin.gaussians.constants import (
     CAM_FX,
     CAM_FY,
     CAM_HEIGHT,
+    CAM_REACH,
     CAM_SLOPE_HIGH_X,
     CAM_SLOPE_HIGH_Y,
     CAM_SLOPE_LOW_X,
     CAM_SLOPE_LOW_Y,
+    CAM_TIME_0,
+    CAM_TIME_U,
+    CAM_TIME_V,
     CAM_WIDTH,
     EPS2D_PX2,
     EXPONENT_SCALE,
@@ -40,6 +44,8 @@ from alpasim_plugin.gaussians.constants import (
     POSE_FAR,
     POSE_NEAR,
     POSE_ROTATION,
+    POSE_SHIFT,
+    POSE_TURN,
     RADIUS_X,
     RADIUS_Y,
     RECORD,
@@ -84,10 +90,11 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
     z = pose[r + 6] * dx + pose[r + 7] * dy + pose[r + 8] * dz
     if z + radius < pose[POSE_NEAR]:
         return True
-    right = (camera[CAM_WIDTH] - camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
-    left = (camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
-    below = (camera[CAM_HEIGHT] - camera[CAM_CY] + _LOWPASS_REACH_PX) / camera[CAM_FY]
-    above = (camera[CAM_CY] + _LOWPASS_REACH_PX) / camera[CAM_FY]
+    beyond = _LOWPASS_REACH_PX + camera[CAM_REACH]
+    right = (camera[CAM_WIDTH] - camera[CAM_CX] + beyond) / camera[CAM_FX]
+    left = (camera[CAM_CX] + beyond) / camera[CAM_FX]
+    below = (camera[CAM_HEIGHT] - camera[CAM_CY] + beyond) / camera[CAM_FY]
+    above = (camera[CAM_CY] + beyond) / camera[CAM_FY]
     slope_x = max(abs(camera[CAM_SLOPE_LOW_X]), abs(camera[CAM_SLOPE_HIGH_X]))
     slope_y = max(abs(camera[CAM_SLOPE_LOW_Y]), abs(camera[CAM_SLOPE_HIGH_Y]))
     reach_x, reach_y = (
@@ -230,6 +237,41 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
 
 
 @njit(cache=True, nogil=True)
+def _cross(a, b):
+    return (
+        v.fnma(a[2], b[1], a[1] * b[2]),
+        v.fnma(a[0], b[2], a[2] * b[0]),
+        v.fnma(a[1], b[0], a[0] * b[1]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _at_its_time(p, turn, shift, camera):
+    """Return where points are, in camera axes, when the pixel that shows them is exposed.
+
+    A point moves by ``turn x p + shift`` in a shutter, to second order; its time follows from its
+    pixel, and its pixel from its time.
+    """
+    half = v.splat(_f(0.5))
+    tx, ty, tz = _cross(turn, p)
+    first = tx + shift[0], ty + shift[1], tz + shift[2]
+    cx, cy, cz = _cross(turn, first)
+    second = half * cx, half * cy, half * cz
+    x, y, z = p
+    for _ in range(3):
+        inverse_z = v.splat(_f(1.0)) / v.maximum(z, v.splat(_f(1e-3)))
+        u = v.fma(v.splat(camera[CAM_FX]), x * inverse_z, v.splat(camera[CAM_CX]))
+        w = v.fma(v.splat(camera[CAM_FY]), y * inverse_z, v.splat(camera[CAM_CY]))
+        time = v.fma(v.splat(camera[CAM_TIME_U]), u, v.splat(camera[CAM_TIME_0]))
+        time = v.fma(v.splat(camera[CAM_TIME_V]), w, time)
+        time = v.minimum(v.maximum(time, v.negative(half)), half)
+        x = v.fma(time, v.fma(time, second[0], first[0]), p[0])
+        y = v.fma(time, v.fma(time, second[1], first[1]), p[1])
+        z = v.fma(time, v.fma(time, second[2], first[2]), p[2])
+    return x, y, v.maximum(z, v.splat(_f(1e-3)))
+
+
+@njit(cache=True, nogil=True)
 def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of
     those that reach the image.
@@ -238,8 +280,11 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     down = _row(pose, POSE_ROTATION + 3)
     ahead = _row(pose, POSE_ROTATION + 6)
     fx, fy = v.splat(camera[CAM_FX]), v.splat(camera[CAM_FY])
+    x, y = _dot(right, d), _dot(down, d)
+    if camera[CAM_REACH] > 0:
+        x, y, z = _at_its_time((x, y, z), _row(pose, POSE_TURN), _row(pose, POSE_SHIFT), camera)
     inverse_z = v.splat(_f(1.0)) / z
-    slope_x, slope_y = _dot(right, d) * inverse_z, _dot(down, d) * inverse_z
+    slope_x, slope_y = x * inverse_z, y * inverse_z
     u, w = v.fma(fx, slope_x, v.splat(camera[CAM_CX])), v.fma(fy, slope_y, v.splat(camera[CAM_CY]))
     a = v.minimum(
         v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X])

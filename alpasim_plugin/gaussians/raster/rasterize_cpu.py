@@ -32,6 +32,7 @@ from alpasim_plugin.gaussians.constants import (
     POSE_NEAR,
     POSE_ROTATION,
     POSE_SIZE,
+    POSE_TURN,
     RECORD,
     SPHERE_SIZE,
     TILE,
@@ -78,6 +79,7 @@ def rasterize_prepared(
     *,
     near_m: float = NEAR_M,
     threads: int | None = None,
+    starts: Sequence[F64 | None] = (),
 ) -> RasterOutput:
     """Render several prepared clouds, each at its rigid pose, in one image.
 
@@ -89,6 +91,8 @@ def rasterize_prepared(
         near_m: Gaussians whose centre is nearer are left out.
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
             depend on it.
+        starts: Poses of the nodes at the start of the camera's rolling shutter; those above are
+            then of its middle.
 
     Raises:
         InputError: A transform is not rigid or the background does not fit.
@@ -99,6 +103,11 @@ def rasterize_prepared(
     behind = background_image(background, camera)
     view = camera_numbers(camera)
     poses = node_poses([T for _, T in nodes], camera, near_m)
+    if camera.rolling is not None:
+        still = camera.motion(_IDENTITY, _IDENTITY)
+        for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
+            moves = T is not None and T_start is not None
+            pose[POSE_TURN:] = camera.motion(T, T_start) if moves else still
     spheres = np.array([prepared.sphere for prepared, _ in nodes], np.float64).reshape(-1)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = []
@@ -172,11 +181,13 @@ def project_parts(
 def camera_numbers(camera: PinholeCamera) -> F32:
     """Return a camera as the kernels read it, columns ``CAM_*``."""
     low_x, high_x, low_y, high_y = camera.slope_limits()
+    rolling = camera.rolling
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy),
             *(low_x, high_x, low_y, high_y),
             *(camera.width, camera.height),
+            *((0.0, 0.0, 0.0, 0.0) if rolling is None else (*rolling.time, rolling.reach_px)),
         ],
         np.float32,
     )
@@ -280,7 +291,7 @@ def node_poses(
             require_rigid(T)
     T_world_node = np.array(given)
     rotation = T_world_node[:, :3, :3]
-    placed = np.empty((len(given), POSE_SIZE))
+    placed = np.zeros((len(given), POSE_SIZE))
     placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
     placed[:, POSE_CENTRE:POSE_NEAR] = np.einsum(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]

@@ -170,11 +170,19 @@ class SceneGraph:
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
         """
-        chosen = self._choose(camera, actor_poses)
+        rolling = camera.rolling
+        chosen = self._choose(
+            camera if rolling is None else camera.widened(rolling.reach_px), actor_poses
+        )
         behind = self.sky.image(camera)
         if device == "cpu":
             nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
-            out = rasterize_prepared(nodes, camera, behind, threads=threads)
+            starts = (
+                []
+                if rolling is None
+                else [rolling.actors_start.get(node.name) for node, _, _ in chosen]
+            )
+            out = rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
         else:
             clouds, place = self._upload(device)
             out = clouds.draw([(place[n.name, i], T) for n, i, T in chosen], camera, behind)

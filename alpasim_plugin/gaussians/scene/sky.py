@@ -70,12 +70,15 @@ class Sky:
         u = np.arange(-(-w // STEP_PX) + 1) * STEP_PX
         v = np.arange(-(-h // STEP_PX) + 1) * STEP_PX
         x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-        ray = (
-            np.stack(
-                [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
-            )
-            @ camera.T_camera_world[:3, :3]
+        ray = np.stack(
+            [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
         )
+        if camera.rolling is not None:
+            a, b, c = camera.rolling.time
+            time = np.clip(a * u[None, :] + b * v[:, None] + c, -0.5, 0.5)[..., None]
+            turn = camera.motion(np.eye(4), np.eye(4))[:3]
+            ray = ray - time * np.cross(turn, ray)
+        ray = ray @ camera.T_camera_world[:3, :3]
         elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
         forward = camera.T_camera_world[2, :3]
