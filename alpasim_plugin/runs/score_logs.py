@@ -14,6 +14,7 @@ from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
@@ -341,7 +342,7 @@ class KnownScenes:
         if scene_id not in self._read:
             known = sorted({*self._archives, *self._read})
             raise InputError(
-                f"scene {scene_id!r}: not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
+                f"scene {scene_id!r}: not among the {len(known)} scenes of {', '.join(self.places)}: {some_of(known)}",
                 "name the log's scene with --scene, or a folder that holds it",
             )
         return self._read[scene_id]
@@ -388,7 +389,7 @@ def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
 
     def find(scene_id: str) -> Scenario:
         if scene_id not in found:
-            shown = ", ".join(sorted(found)[:5])
+            shown = some_of(sorted(found))
             raise InputError(
                 f"scene {scene_id!r}: not among the {len(found)} scenes given: {shown}",
                 "name it with --scenes",

@@ -1,4 +1,4 @@
-"""Recorded logs without what a reader could do without."""
+"""Recorded logs without what a reader can do without, and what is named by mistake."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve_renderer
+from alpasim_plugin.core.plan_check import sensors_problem
+from alpasim_plugin.core.types import CameraSpec, SensorSpec
 from scenarios.argoverse import read_argoverse
 from scenarios.load import load_scenario
+from scenarios.suite import load_suite
 from tests.scenarios.make_argoverse import TRACKS, cuboids, write_argoverse
 
 
@@ -22,3 +27,38 @@ def test_an_argoverse_log_of_the_test_split_drives_alone(tmp_path: Path, empty: 
     assert log.actors == ()
     assert any("test split" in note for note in log.notes)
     assert load_scenario(folder).actors == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("street.ply", "import splat"),
+        ("street.spz", "import splat"),
+        ("film.mp4", "COLMAP"),
+        ("a/transforms.json", "import drive"),
+        ("a/calib.txt", "import drive"),
+        ("a/sparse/0/cameras.bin", "import drive"),
+        ("a/cameras.txt", "import drive"),
+    ],
+)
+def test_what_becomes_a_scenario_by_an_import_names_the_command(
+    tmp_path: Path, name: str, advice: str
+) -> None:
+    file = tmp_path / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(b"x")
+    given = file if "/" not in name else tmp_path / "a"
+    with pytest.raises(InputError) as caught:
+        load_suite(given)[0] and load_scenario(given)
+    assert advice in caught.value.hint
+
+
+def test_a_policy_that_asks_for_a_camera_instead_of_its_name_is_told_so() -> None:
+    camera = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
+    assert "CameraSpec" in sensors_problem((SensorSpec(camera),))  # type: ignore[arg-type]
+    assert not sensors_problem((SensorSpec("front"),))
+
+
+def test_a_prompt_that_the_weights_did_not_learn_is_refused_before_anything_runs() -> None:
+    with pytest.raises(InputError, match="night"):
+        resolve_renderer("onefixer-dit-tiny", ("prompt=night",))

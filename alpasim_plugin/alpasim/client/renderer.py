@@ -13,6 +13,7 @@ from alpasim_plugin.alpasim.client.channel import READY_S, Address, Service, enc
 from alpasim_plugin.alpasim.client.driver import cameras_of
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request
@@ -42,7 +43,7 @@ class NreRenderer(Renderer):
         scenes = self._service.call("get_available_scenes", common_pb2.Empty(), READY_S).scene_ids
         if "*" not in scenes and self._scene not in scenes:
             raise InputError(
-                f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}",
+                f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {some_of(sorted(scenes))}",
                 "give the service that scene, or name one of its own with ?scene=ID",
             )
         self._names = self._camera_names(scenario, place.options.get("cameras"))

@@ -16,6 +16,7 @@ from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.references import ReferenceSession
@@ -221,7 +222,7 @@ class SceneCache:
                 self._loaded.move_to_end(scene_id)
                 return self._loaded[scene_id]
         if scene_id not in self._sources:
-            some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
+            some = some_of(self.ids)
             raise UnknownScene(
                 f"scene {scene_id!r}: it is none of the {len(self._sources)} known: {some}",
                 "add its file to --scenes",
