@@ -100,6 +100,11 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
+    unknown = sorted({one.camera for one in images} - set(cameras))
+    if unknown:
+        raise InputError(f"{model}: images of camera {unknown[0]}, which it does not have", DO_THIS)
+    if any((model / f"rigs{end}").is_file() for end in (".bin", ".txt")):
+        notes.append("rigs and frames are not read: each image has its own pose")
     root = _pictures_root(folder, model, images[0].name, photographs)
     shots = [
         Picture(
@@ -200,6 +205,8 @@ def _images_txt(data: bytes) -> Iterator[_Image]:
         words = line.split()
         if line.startswith("#") or (len(words) % 3 == 0 and all(map(_is_number, words))):
             continue
+        if len(words) < 10:
+            raise ValueError(f"a line that is neither an image nor its points: {line[:60]!r}")
         name = line.split(maxsplit=9)[9].strip()
         yield _image(int(words[8]), name, np.array([float(w) for w in words[1:8]]))
 

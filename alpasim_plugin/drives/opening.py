@@ -30,7 +30,7 @@ PAIRS, FEWEST, CLEARLY = (
     40,
     1.5,
 )  # pairs that the axes are tried on; matches that tell; by how much one must be better
-FORMS = "a folder with transforms.json, a KITTI odometry folder, or a COLMAP model"
+FORMS = "a folder with transforms.json, a KITTI odometry folder (not raw, which has no poses), or a COLMAP model"
 
 
 def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
@@ -61,6 +61,8 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
 def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
     document, listed = read_pictures(folder, "opencv")
+    if not listed:
+        raise InputError(f"{folder / FILE}: no frames", "list the photographs with their poses")
     notes = []
     some = photographs or any(one.file.is_file() for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())

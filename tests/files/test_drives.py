@@ -254,3 +254,29 @@ def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(
     assert any("dataparser_transforms.json" in note for note in notes)
     unmoved, _ = _in_frame(tmp_path / "splat.ply", street_cloud(), folder, drive)
     assert np.abs(unmoved.means - street_cloud().means).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "found"),
+    [
+        ("cameras.txt", "8 PINHOLE 320 128 180 180 160 54\n", "camera 7"),
+        ("images.txt", "IMAGE_ID QW QX QY QZ\n", "IMAGE_ID"),
+        ("rigs.txt", "1 1 CAMERA 7\n", None),
+    ],
+)
+def test_what_a_colmap_model_lacks_or_has_besides_is_said(
+    tmp_path: Path, file: str, text: str, found: str | None
+) -> None:
+    model = tmp_path / "sparse/0"
+    colmap(model, [f"{i}.png" for i in range(13)])
+    (model / file).write_text(text)
+    if found is None:
+        assert any("rigs" in note for note in read_source(tmp_path, photographs=False).notes)
+    else:
+        with pytest.raises(InputError, match=found):
+            read_source(tmp_path, photographs=False)
+
+
+def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no frames"):
+        read_source(transforms(tmp_path / "a", []), photographs=False)
