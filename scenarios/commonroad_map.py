@@ -41,6 +41,9 @@ COLOURS = {
 Cycle = tuple[tuple[tuple[str, int], ...], int]  # phases in microseconds, and when the first begins
 KINDS = {"shoulder": "shoulder", "busLane": "bus", "bicycleLane": "bike", "parking": "parking"}
 NOT_FOR_CARS = ("sidewalk", "crosswalk")
+_FOR_CARS = """urban interstate country highway exitRamp accessRamp mainCarriageWay driveWay
+    intersection busStop"""
+KNOWN = {*KINDS, *NOT_FOR_CARS, *_FOR_CARS.split()}
 MAX_SPEED_SIGNS = ("274", "R2-1")  # German and US maximum speed; the additional value is in m/s
 CROSSING_SHARE = (
     0.1  # a lanelet covered to this share by lanelets it is not linked to lies in an intersection
@@ -65,6 +68,7 @@ def read_lanelets(
     crosswalks: list[F64] = []
     stop_lines: list[F64] = []
     left_out: Counter[str] = Counter()
+    strange: Counter[str] = Counter()
     swapped = 0
     for element in elements:
         lane_id = str(element.get("id"))
@@ -78,6 +82,7 @@ def read_lanelets(
             if "crosswalk" in types:
                 crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
             continue
+        strange.update(t for t in types if t not in KNOWN)
         if is_left_of(right, left):  # bounds exchanged
             left, right, swapped = right, left, swapped + 1
         stop_line = _stop_line(files, where, element, left, right, origin)
@@ -124,6 +129,10 @@ def read_lanelets(
     notes = [
         f"{n} lanelets of type {t} carry no vehicles and are no lanes"
         for t, n in sorted(left_out.items())
+    ]
+    notes += [
+        f"{n} lanelets of type {t} are taken as lanes for vehicles"
+        for t, n in sorted(strange.items())
     ]
     if swapped:
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")

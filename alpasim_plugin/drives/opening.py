@@ -74,11 +74,12 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
             )
         axes, note = recognised_axes(folder, there)
         notes.append(note)
-        there = [replace(one, T_world_camera=one.T_world_camera @ AXES[axes]) for one in there]
+        listed = [replace(one, T_world_camera=one.T_world_camera @ AXES[axes]) for one in listed]
     if missing:
         notes.append(
             f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {some_of(missing)}"
         )
+    files = {one.file for one in there}
     unknown = sorted({key for one in listed for key in one.more} - KNOWN_KEYS)
     if unknown:
         notes.append(f"keys of {FILE} that are not read: {some_of(unknown)}")
@@ -86,19 +87,19 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     front = next((name for name in names if "front" in name), names[0])
     pictures: list[Picture] = []
     for name in names:
-        mine = [replace(one, camera=name) for one in there if (one.camera or "front") == name]
+        mine = [replace(one, camera=name) for one in listed if (one.camera or "front") == name]
         if all(one.t_us is None for one in mine):
-            ordered, note = in_order(mine)
-            pictures += ordered
+            mine, note = in_order(mine)
             notes.append(note)
-            continue
         if any(one.t_us is None for one in mine):
             bad = next(one for one in mine if one.t_us is None)
             raise InputError(
                 f"{bad.where}: no t_us, which other photographs have",
                 "give every photograph its time, or none",
             )
-        pictures += sorted(mine, key=lambda one: int(one.t_us or 0))
+        pictures += sorted(
+            (one for one in mine if one.file in files), key=lambda one: int(one.t_us or 0)
+        )
     kept = tuple(
         sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"})
     )

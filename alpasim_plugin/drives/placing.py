@@ -119,9 +119,13 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
 def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     """Refuse a drive whose speed, or change of speed from one photograph to the next, no car has.
 
+    Photographs without metres that were not taken along a road say nothing of speed.
+
     Raises:
         InputError: Names the photograph.
     """
+    if drive.metric is None and placed.strip is None:
+        return
     centres = placed.poses[drive.front][:, :3, 3]
     pictures = drive.of(drive.front)
     dt_s = np.diff([int(one.t_us or 0) for one in pictures]) * 1e-6

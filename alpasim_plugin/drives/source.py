@@ -181,12 +181,12 @@ def _unit_change(steps: F64) -> tuple[int, float] | None:
     return None
 
 
-def timed(pictures: Sequence[Picture]) -> tuple[Picture, ...]:
+def timed(pictures: Sequence[Picture]) -> list[Picture]:
     """Return pictures without times as taken one after another, `PERIOD_US` apart."""
-    return tuple(replace(one, t_us=i * PERIOD_US) for i, one in enumerate(pictures))
+    return [replace(one, t_us=i * PERIOD_US) for i, one in enumerate(pictures)]
 
 
-def in_order(pictures: Sequence[Picture]) -> tuple[tuple[Picture, ...], str]:
+def in_order(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
     """Return a camera's pictures without times as they were taken, with a note.
 
     The order is that of the file. Some tools list photographs in an order of their own: where the

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import check_motion, place
-from alpasim_plugin.drives.source import SourceDrive, checked
+from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.drives.splat import _in_frame
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street
@@ -280,3 +280,24 @@ def test_what_a_colmap_model_lacks_or_has_besides_is_said(
 def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frames"):
         read_source(transforms(tmp_path / "a", []), photographs=False)
+
+
+def test_photographs_that_are_missing_leave_their_time(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)], unit="m")
+    (folder / "images").mkdir()
+    for i in (0, 1, 5, 6, 7, 8, 9, 10, 11, 12):
+        (folder / f"images/{i}.png").write_bytes(b"x")
+    drive = read_source(folder, photographs=False)
+    assert [one.t_us for one in drive.pictures][:3] == [0, 100_000, 500_000]
+    assert any("3 of 13" in note for note in drive.notes)
+
+
+def test_a_walk_around_an_object_without_metres_has_no_speed(tmp_path: Path) -> None:
+    folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)])
+    document = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(document["frames"]):
+        frame["transform_matrix"][1][3] = 3.0 * (-1) ** i
+    (folder / "transforms.json").write_text(json.dumps(document))
+    drive = read_source(folder, photographs=False)
+    nothing = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    check_motion(drive, place(drive, nothing))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.plan_check import sensors_problem
 from alpasim_plugin.core.types import CameraSpec, SensorSpec
 from scenarios.argoverse import read_argoverse
+from scenarios.commonroad_map import read_lanelets
 from scenarios.load import load_scenario
+from scenarios.recorded import SourceFiles
 from scenarios.suite import load_suite
 from tests.scenarios.make_argoverse import TRACKS, cuboids, write_argoverse
+from tests.scenarios.make_commonroad import lanelet
 
 
 @pytest.mark.parametrize("empty", [False, True])
@@ -62,3 +66,13 @@ def test_a_policy_that_asks_for_a_camera_instead_of_its_name_is_told_so() -> Non
 def test_a_prompt_that_the_weights_did_not_learn_is_refused_before_anything_runs() -> None:
     with pytest.raises(InputError, match="night"):
         resolve_renderer("onefixer-dit-tiny", ("prompt=night",))
+
+
+def test_lanelets_of_an_unknown_type_are_said(tmp_path: Path) -> None:
+    types = "".join(f"<laneletType>{name}</laneletType>" for name in ("urban", "restricted"))
+    root = ElementTree.fromstring(
+        f'<commonRoad timeStepSize="0.1">{lanelet(1, 0, 50, 0, types)}</commonRoad>'
+    )
+    _, notes = read_lanelets(SourceFiles(), Path("a.xml"), root, np.zeros(3))
+    assert any("restricted" in note for note in notes)
+    assert not any("urban" in note for note in notes)
