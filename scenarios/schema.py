@@ -75,6 +75,12 @@ class EnvironmentSpec(Part):
     texture: float = Field(
         default=1.0, ge=0, le=1, description="Contrast of ground and facade texture."
     )
+    fog_visibility_m: float | None = Field(
+        default=None,
+        ge=10,
+        le=100_000,
+        description="Distance at which fog leaves 2 % of a contrast.",
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -458,11 +464,13 @@ class ScenarioSpec(Part):
                 "give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}"
             )
         if self.log is not None and self.log.drive is not None:
-            given = [
-                key
-                for key in ("degradation", "background", "environment")
-                if getattr(self, key) != type(self).model_fields[key].default
-            ]
+            built = {
+                "degradation": self.degradation,
+                "background": self.background,
+                "environment": self.environment.model_copy(update={"fog_visibility_m": None}),
+            }
+            fields = type(self).model_fields
+            given = [key for key, value in built.items() if value != fields[key].default]
             if given:
                 raise ValueError(
                     f"{given[0]} with log.drive, whose look is its reconstruction's | remove {given[0]}"

@@ -295,6 +295,9 @@ class Environment:
     poles_spacing_m: float = 30.0  # 0: none
     sky: Literal["clear", "overcast", "dusk"] = "clear"
     texture: float = 1.0  # contrast of ground and facade texture, 0..1
+    fog_visibility_m: float | None = (
+        None  # distance at which 2 % of a contrast is left; None: clear
+    )
 
 
 @dataclass(frozen=True)

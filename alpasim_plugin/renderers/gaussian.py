@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -81,7 +82,7 @@ def scene_key(scenario: Scenario) -> str:
         scenario.scene_id,
         scenario.seed,
         scenario.content_hash,
-        scenario.environment,
+        replace(scenario.environment, fog_visibility_m=None),
         scenario.background,
         scenario.vehicle.box,
     ):

@@ -123,6 +123,7 @@ _NO_MATTER = frozenset(
         "warmup_us",
         "latency",
         "degradation",
+        "fog_visibility_m",
         "world_origin",
         "content_hash",
         "notes",

@@ -40,6 +40,7 @@ from alpasim_plugin.log.run_folder.schema import (
     WHY_NAME,
 )
 from alpasim_plugin.log.run_folder.writer import write_steps
+from alpasim_plugin.renderers.weather import in_weather
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.lenses import through_lenses
 from alpasim_plugin.runs.plan import Cell, RunOptions
@@ -354,7 +355,8 @@ def _renderer_of_pinholes(
     spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None
 ) -> Renderer:
     session = {"seed": seed, "device": device, "threads": threads}
-    base: Renderer = build(spec.base, scenario=scenario, **session)
+    built: Renderer = build(spec.base, scenario=scenario, **session)
+    base = in_weather(built, scenario.environment)
     if spec.fixer is None:
         return base
     from alpasim_plugin.fixers.loop import fixed_renderer

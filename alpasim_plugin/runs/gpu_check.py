@@ -91,7 +91,7 @@ def rasteriser(device: str) -> Facts:
     ours, theirs = (make_renderer("clean", scenario, 0, name) for name in (device, "cpu"))
     facts: Facts = {"ok": True}
     for width, height in SIZES:
-        request = _request(scenario, width, height)
+        request = frame_request(scenario, width, height)
         facts[f"{width}x{height}"] = compared(
             partial(_rendered, ours, request), partial(_rendered, theirs, request)
         )
@@ -155,7 +155,7 @@ def _median_ms(make: Callable[[], Any]) -> float:
     return round(1e3 * statistics.median(times_s), 2)
 
 
-def _request(scenario: Scenario, width: int, height: int) -> RenderRequest:
+def frame_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
     """Return a frame of the recorded drive at another size."""
     camera = scenario.cameras[0]
     K = camera.K.copy()

@@ -25,6 +25,7 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.log.schema import wire_camera
 from alpasim_plugin.log.wire import FRONT_WIDE, sensorsim_pb2
+from alpasim_plugin.renderers.weather import in_weather
 from alpasim_plugin.runs.guards import checked_frames
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
@@ -233,9 +234,8 @@ class SceneCache:
         scenario = load_scenario(source)
         renderer, references = None, None
         if self._spec is not None:
-            renderer = complete(
-                build(self._spec.base, scenario=scenario, **self._session), Renderer
-            )
+            built = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
+            renderer = in_weather(built, scenario.environment)
             settings = self._spec.fixer and self._spec.fixer.settings
             recorded = (
                 renderer.recorded()
