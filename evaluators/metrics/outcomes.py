@@ -139,7 +139,7 @@ def reached_end(rollout: Rollout) -> bool:
     )
 
 
-REACHED_END, SHORT_OF_END, NOT_RUN = "reached the end", "short of the end", "not run"
+REACHED_END, SHORT_OF_END, NOT_RUN = "reached the end", "end not reached", "not run"
 ENDINGS = tuple(  # the best first, and last what says nothing of the policy
     dict.fromkeys(
         (
