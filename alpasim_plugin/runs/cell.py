@@ -152,9 +152,8 @@ def run_cell(
         announce(f"scoring {cell.scene}")
         manifest |= _score(folder, cell, options, scenario)
         has_failed = bool(manifest["events"])
-        recorder.save_pictures(
-            options.video == "all" or (options.video == "failures" and has_failed)
-        )
+        if options.video == "all" or (options.video == "failures" and has_failed):
+            recorder.save_video()
         manifest["status"] = "ok"
     except Exception as error:
         manifest |= _failure(error, folder)

@@ -1,4 +1,4 @@
-"""Writes the files of one rollout: the log, per-frame facts, a strip of frames and on request a
+"""Writes the files of one rollout: the log, per-frame facts, and on request a
 video; collects stage times.
 """
 
@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
@@ -36,7 +35,6 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import (
     AslWriter,
-    encode_image,
     header_from_scenario,
     read_asl,
     write_facts,
@@ -47,14 +45,12 @@ from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
     FRAMES_NAME,
     LOG_NAME,
-    STRIP_NAME,
     VIDEO_NAME,
 )
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
-STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, of the rollout
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
@@ -102,7 +98,7 @@ class Recorder:
         folder: Folder to write; by default a temporary one that is deleted with the recorder.
         session: Identifies the rollout in the log; equal rollouts have equal ids.
         images: Encoding of camera frames in the log.
-        keep_frames: Keep every frame for a video, not only those of the strip.
+        keep_frames: Keep the first camera's frames for a video.
         versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs",
             "egodriver": "lane-camera"}``.
     """
@@ -128,7 +124,9 @@ class Recorder:
         self._times = StageTimes()
         self._frames: list[dict[str, Any]] = []
         self._debug: list[dict[str, Any]] = []
-        self._pictures: Pictures | None = None
+        self._film: list[U8] = []
+        self._film_camera = ""
+        self._film_period_us = 0
         self._only_watched = False
         self._last_query_us = -1
         self._steps = 0
@@ -180,8 +178,8 @@ class Recorder:
         """Open the log and write its header."""
         if cameras:
             first = next(iter(cameras))
-            period_us = self._scenario.period_us(SensorSpec(first))
-            self._pictures = Pictures(clock, first, period_us, self._keep_frames)
+            self._film_camera = first if self._keep_frames else ""
+            self._film_period_us = self._scenario.period_us(SensorSpec(first))
         self._n_steps = clock.n_steps
         header = header_from_scenario(
             self._scenario, self._session, self._seed, clock.n_steps, self._versions
@@ -210,8 +208,8 @@ class Recorder:
                     "events": " ".join(frame.events),
                 }
                 self._frames.append(facts | dict(frame.facts))
-        if self._pictures is not None:
-            self._pictures.add(frame)
+        if frame.camera == self._film_camera:
+            self._film.append(frame.rgb)
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""
@@ -269,7 +267,6 @@ class Recorder:
     def facts(self) -> dict[str, Any]:
         """Return counts and stage times for the manifest."""
         events = Counter(event for frame in self._frames for event in frame["events"].split())
-        strip = [] if self._pictures is None else self._pictures.strip()
         return {
             "frames": len(self._frames),
             "first_call_frames": self._first_call,
@@ -278,59 +275,15 @@ class Recorder:
             "passed_path_end": self._passed,
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": [t_us for t_us, _ in strip],
         }
 
-    def save_pictures(self, video: bool) -> None:
-        """Write the strip of frames, and the video if requested."""
-        if self._pictures is not None:
-            self._pictures.save(self.folder, video)
+    def save_video(self) -> None:
+        """Write the video; nothing for a rollout without frames."""
+        if self._film:
+            write_mp4(self.folder / VIDEO_NAME, self._film, 1e6 / self._film_period_us)
 
     @property
     def _log(self) -> AslWriter:
         if self._writer is None:
             raise RuntimeError("Recorder.start was not called")
         return self._writer
-
-
-class Pictures:
-    """Collects the frames of the strip and of the video.
-
-    Args:
-        clock: The rollout's clock.
-        camera: Name of the camera.
-        period_us: Between its frames.
-        all_frames: Keep every frame for a video, not only those of the strip.
-    """
-
-    def __init__(self, clock: Clock, camera: str, period_us: int, all_frames: bool) -> None:
-        self._camera = camera
-        self._all = all_frames
-        self._period_us = period_us
-        self._strip_us = [
-            clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us
-            for fraction in STRIP_FRACTIONS
-        ]
-        self._kept: list[tuple[int, U8]] = []
-
-    def add(self, frame: Frame) -> None:
-        """Keep a frame that the strip or the video needs."""
-        if frame.camera == self._camera and (self._all or self._in_strip(frame.t_us)):
-            self._kept.append((frame.t_us, frame.rgb))
-
-    def save(self, folder: Path, video: bool) -> None:
-        """Write the strip, and the video if requested; nothing for a rollout without frames."""
-        strip = [rgb for _, rgb in self.strip()]
-        if strip:
-            write_bytes(
-                folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90)
-            )
-        if video and self._kept:
-            write_mp4(folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._period_us)
-
-    def _in_strip(self, t_us: int) -> bool:
-        return any(abs(t_us - at_us) * 2 < self._period_us for at_us in self._strip_us)
-
-    def strip(self) -> list[tuple[int, U8]]:
-        """Return times and pixels of the strip's frames."""
-        return [(t_us, rgb) for t_us, rgb in self._kept if self._in_strip(t_us)]

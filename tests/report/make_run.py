@@ -61,7 +61,6 @@ class Plan:
     invalid: Sequence[str] = (
         "min_distance_to_obstacle_m",
     )  # metrics that are invalid in the first scene
-    pictures: bool = True
     clips: bool = True
     flip_frames: bool = False
     picture_px: tuple[int, int] = (256, 144)
@@ -329,17 +328,8 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
 def _files(folder: Path, row: dict[str, Any], content: dict[str, Any], plan: Plan) -> None:
     place = folder / row["path"]
     place.mkdir(parents=True, exist_ok=True)
-    times = [int(k * plan.steps * DT_US / 4) for k in range(4)]
-    _json(
-        place / "manifest.json",
-        {"status": row["status"], "path": row["path"], "strip_t_us": times, "events": []},
-    )
-    if plan.pictures and row["status"] == "ok":
-        width, height = plan.picture_px
-        frames = [_picture(row["renderer"], k, width, height) for k in range(4)]
-        cv2.imwrite(
-            str(place / "strip.jpg"), np.concatenate(frames, 1), [cv2.IMWRITE_JPEG_QUALITY, 85]
-        )
+    manifest = {"status": row["status"], "path": row["path"], "events": []}
+    _json(place / "manifest.json", manifest)
     if plan.clips and row["status"] == "ok" and row["seed"] == plan.seeds[0]:
         (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
 

@@ -97,7 +97,7 @@ def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
     tmp_path: Path, width: int
 ) -> None:
     names = [f"drivers.py:PurePursuitWithALongName{letter * 12}" for letter in "abcd"]
-    plan = Plan(("clean",), ("log-replay", *names), seeds=(0,), steps=30, pictures=False)
+    plan = Plan(("clean",), ("log-replay", *names), seeds=(0,), steps=30)
     shown = overview_of(read_run(make_run(tmp_path, plan)))
     lines = [line.plain for line in overview_lines(shown, width)]
     assert all(len(line) <= width for line in lines)
@@ -115,7 +115,7 @@ def test_every_line_is_printed_on_its_own(three: Path, capsys: pytest.CaptureFix
 def test_any_number_of_variants_has_a_first_screen(
     tmp_path: Path, renderers: tuple[str, ...]
 ) -> None:
-    run = read_run(make_run(tmp_path, Plan(renderers, seeds=(0,), steps=20, pictures=False)))
+    run = read_run(make_run(tmp_path, Plan(renderers, seeds=(0,), steps=20)))
     shown = overview_of(run)
     assert len(shown.rows) == len(renderers)
     assert bool(shown.axis) == (len(renderers) > 1)

@@ -40,7 +40,6 @@ SMALL = Plan(
     scenes=("urban-left_turn",),
     seeds=(0, 1),
     steps=8,
-    pictures=False,
     fail=[("3dgs", "urban-left_turn", 1)],
 )
 

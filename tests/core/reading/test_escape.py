@@ -63,7 +63,6 @@ def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path: Path) -> N
             scenes=(HOSTILE, "plain"),
             seeds=(0, 1),
             steps=20,
-            pictures=False,
             clips=False,
             fail=[("clean", "plain", 0)],
             failure=HOSTILE,
