@@ -8,7 +8,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.metrics.footprint import Geometries, pairs_of, spans
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.surface import MARGIN_M, Surface, closed_union, segment_distance
+from evaluators.metrics.surface import Region, Surface, segment_distance
 
 LEVEL_RADIUS_M = 30.0  # AlpaSim's later rule looks no further for road edges
 _RUN = 8  # points in a row that are looked up together
@@ -149,7 +148,6 @@ class Road:
         self._areas: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._centres: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._unions: dict[bytes, Any] = {}
-        self._chains: dict[int, list[Any]] = {}
         self._rings = lane_map.drivable_areas
 
     def areas(self, lane: I64) -> Geometries:
@@ -209,22 +207,15 @@ class Road:
             self._unions[key] = shape
         return self._unions[key]
 
-    def chains(self, lane: int) -> list[Any]:
-        """Return the prepared areas of a lane with one that leads into it and one that it leads to,
-        for all of these; a seam between connected lanes is no border.
+    def connected(self, lane: int) -> Region:
+        """Return a lane with those that lead into it and that it leads to; a seam between them is
+        no border.
         """
-        if lane not in self._chains:
-            own, number = self._lanes[lane], {name: k for k, name in enumerate(self.lane_ids)}
-            before = [k for k, other in enumerate(self._lanes) if own.lane_id in other.successors]
-            after = [number[name] for name in own.successors if name in number]
-            ends = product(before or [lane], after or [lane])
-            shapes = [
-                closed_union(self.areas(np.unique([first, lane, last])), self._preset.seam_m)
-                for first, last in ends
-            ]
-            self._chains[lane] = [shapely.buffer(shape, MARGIN_M) for shape in shapes]
-            shapely.prepare(self._chains[lane])
-        return self._chains[lane]
+        own, chosen = self._lanes[lane], np.zeros(self.surface.n_areas, dtype=np.bool_)
+        for k, other in enumerate(self._lanes):
+            chosen[k] = own.lane_id in other.successors or other.lane_id in own.successors
+        chosen[lane] = True
+        return self.surface.region(chosen)
 
     def touches_edge(self, footprints: Geometries, xyz: F64) -> Bool:
         """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the

@@ -54,6 +54,11 @@ class Surface:
         self._regions: dict[bytes, Region] = {}
 
     @property
+    def n_areas(self) -> int:
+        """Give how many areas it is made of."""
+        return len(self._areas)
+
+    @property
     def is_empty(self) -> bool:
         """Return whether nothing here has an area."""
         return bool(np.all(shapely.is_empty(self._areas)))

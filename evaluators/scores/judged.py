@@ -14,6 +14,7 @@ from evaluators.metrics.contact import NOT_LOOKED_FOR
 from evaluators.metrics.footprint import Footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.road import Road, road_of
+from evaluators.metrics.surface import MARGIN_M
 from evaluators.scores import nuplan
 from evaluators.scores.states import states_of
 
@@ -65,8 +66,8 @@ class Judged:
 
     @cached_property
     def astray(self) -> Bool | None:
-        """Where ``(T,)`` no lane holds the ego, nor one with a lane that leads into it and one that
-        it leads to: it is in several lanes that are not connected, or off the road; None without a
+        """Where ``(T,)`` no lane holds the ego, not even with those that lead into it and that it
+        leads to: it is in several lanes that are not connected, or off the road; None without a
         map.
         """
         if not self.has_map:
@@ -80,9 +81,9 @@ class Judged:
         touches = shapely.intersects(self.road.areas(lane), boxes[across[row]])
         row, lane = row[touches], lane[touches]
         for k in np.unique(lane).tolist():
-            for chain in self.road.chains(k):
-                steps = across[row[lane == k]]
-                out[steps[shapely.covers(chain, boxes[steps])]] = False
+            steps = across[row[lane == k]]
+            inner = shapely.buffer(boxes[steps], -MARGIN_M, join_style="mitre")
+            out[steps] &= ~shapely.covers(self.road.connected(k).shape, inner)
         return out
 
     @cached_property

@@ -169,8 +169,7 @@ def rate_interval(means: F64) -> Interval:
     if n < 2:
         return Interval(p, reason=f"needs at least two scenes, found {n}")
     if n < FEW_SCENES or are_alike(means):
-        note = f"{p * n:.4g} of {n} scenes: exact bounds, with scenes as trials"
-        return Interval(p, *exact_rate(p * n, n), note=note, method="exact, scenes as trials")
+        return Interval(p, *exact_rate(p * n, n), method="exact, scenes as trials")
     error = float(np.std(means, ddof=1)) / n**0.5 / (p * (1 - p))
     half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error
     low, high = scipy.special.expit(scipy.special.logit(p) + np.array([-half, half]))

@@ -285,9 +285,12 @@ def compare(
     reach = reach_of(metric, margin)
     rare = beyond_share(metric, margin)
     notes = [interval.note] if interval.note else []
-    both = _both(bounds, guarded)
+    both = bounds
+    if guarded is not None:
+        both = [min(bounds[0], guarded[0]), max(bounds[1], guarded[1])]
     if rare:
-        entry["beyond"] = _beyond(pairs, metric, reach) | {"margin": rare}
+        entry["beyond"] = _beyond(pairs, Pairs(side, base, metric.event), metric, reach)
+        entry["beyond"]["margin"] = rare
     if n < LEAST_SCENES:
         notes.append(f"{n} scenes: a verdict needs at least {LEAST_SCENES}")
     elif guarded is None:
@@ -315,7 +318,7 @@ def compare(
     return entry
 
 
-def _beyond(pairs: Pairs, metric: MetricInfo, reach: float) -> dict[str, Any]:
+def _beyond(pairs: Pairs, left: Pairs, metric: MetricInfo, reach: float) -> dict[str, Any]:
     """Return the companion of a distance: how much more often something happens that it does not
     count, by the metric's event where a preset has it, else by differences beyond ``reach``.
 
@@ -323,8 +326,7 @@ def _beyond(pairs: Pairs, metric: MetricInfo, reach: float) -> dict[str, Any]:
         ``event`` in words, ``diff`` (share of scenes, positive is worse), ``at_most`` (its upper
         guarded bound).
     """
-    change, scenes = pairs.of_event(metric.event)
-    what = metric.event
+    what, scenes, change = metric.event, left.scenes, left.mine - left.base
     if not len(change):
         what, scenes = f"more than {reach:g} {metric.unit}".rstrip(), pairs.scenes
         far = pairs.mine - pairs.base
@@ -365,13 +367,6 @@ def difference_bounds(
     )
     method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
-
-
-def _both(bounds: list[float] | None, guarded: list[float] | None) -> list[float] | None:
-    """Return the bounds that hold both."""
-    if bounds is None or guarded is None:
-        return bounds or guarded
-    return [min(bounds[0], guarded[0]), max(bounds[1], guarded[1])]
 
 
 def flag_interval(delta: F64, scenes: I64) -> Interval:
@@ -444,13 +439,6 @@ class Pairs:
         self._sides = {"here": (side, here), "baseline": (base, there)}
         self.only_base = np.flatnonzero(base.place_in(side) < 0)
         self.n_missing = int(np.sum(~self.both)) + len(self.only_base)
-
-    def of_event(self, event: str) -> tuple[F64, I64]:
-        """Return the change of a flag on the cells where both sides have it, and their scenes."""
-        (side, _), (base, _) = self._sides.values()
-        change = side.values(event) - np.append(base.values(event), np.nan)[self.index]
-        known = np.isfinite(change)
-        return change[known], side.scene[known]
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
         """Name the first cells without a pair, with side and cause."""

@@ -60,7 +60,7 @@ def test_scenes_that_all_have_the_same_share_are_as_many_trials_as_scenes():
     one = rate_interval(np.full(10, 0.2))
     want = stats.binomtest(2, 10).proportion_ci(0.95, "exact")
     assert (one.low, one.high) == pytest.approx((want.low, want.high))
-    assert one.note == "2 of 10 scenes: exact bounds, with scenes as trials"
+    assert one.method == "exact, scenes as trials"
 
 
 def test_below_ten_scenes_a_rate_has_the_bounds_of_clopper_and_pearson_and_a_pair_those_of_tango():

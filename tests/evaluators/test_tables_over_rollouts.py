@@ -107,7 +107,7 @@ def test_a_rate_of_zero_gets_exact_bounds_over_scenes():
     found = entry([[0.0, 0.0]] * 10, "collision_at_fault")
     assert (found["mean"], found["ci95"], found["n_events"]) == (0.0, 0.0, 0)
     assert found["ci95_clustered"] == pytest.approx([0.0, 1 - 0.025 ** (1 / 10)])
-    assert found["note"] == "0 of 10 scenes: exact bounds, with scenes as trials"
+    assert found["ci95_clustered_method"] == "exact, scenes as trials"
     assert entry([[1.0]] * 4, "offroad")["ci95_clustered"] == pytest.approx([0.025 ** (1 / 4), 1.0])
 
 
