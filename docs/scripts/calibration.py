@@ -250,13 +250,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=2000)
     repeats = parser.parse_args().repeats
-    text = PAGE.read_text(encoding="utf-8")
     for part in (differs, verdicts, intervals, betting):
         table = "\n".join(part(repeats))
         begin, end = f"<!-- begin {part.__name__} -->", f"<!-- end {part.__name__} -->"
-        text = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
-        print(table, flush=True)
-    PAGE.write_text(text, encoding="utf-8")
+        page = PAGE.read_text(encoding="utf-8")
+        page = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", page, flags=re.DOTALL)
+        PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
