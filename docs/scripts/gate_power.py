@@ -19,7 +19,7 @@ from evaluators.metrics import METRICS
 from evaluators.statistics.suite import Change, chances, verdict_of
 
 SCENES = (3, 6, 14, 42)
-SEEDS = (1, 2, 3, 6, 10, 20)
+SEEDS = (1, 3, 6, 20)
 RULES = {"collision_at_fault": 0.1, "offroad": 0.1, "lateral_distance_m": 0.1, "progress": 0.05}
 Draw = Callable[[np.random.Generator, int, int], dict[str, F64]]  # scenes, seeds -> differences
 
@@ -67,7 +67,6 @@ CASES: dict[str, Draw] = {
     "alike, events in 2 %": alike(0.02),
     "alike, events in 30 %": alike(0.3),
     "one scene always collides": in_one_scene,
-    "10 points more collisions": everywhere(0.02, 0.1, 0.0),
     "30 points more collisions": everywhere(0.02, 0.3, 0.0),
     "0.2 m farther from the path": everywhere(0.02, 0.0, 0.2),
 }
@@ -82,7 +81,9 @@ def shares(draw: Draw, scenes: int, seeds: int, runs: int) -> tuple[float, float
     red = green = 0
     for _ in range(runs):
         changes = [
-            Change(METRICS[name], RULES[name], side, none, diff.reshape(-1), every, ~every, 0, [])
+            Change(
+                METRICS[name], RULES[name], side, none, diff.reshape(-1), every, ~every, 0, 0, []
+            )
             for name, diff in draw(random, scenes, seeds).items()
         ]
         verdicts = [
@@ -94,18 +95,18 @@ def shares(draw: Draw, scenes: int, seeds: int, runs: int) -> tuple[float, float
 
 
 def main(runs: int) -> None:
-    """Print the table: red / green in percent; of variants that are alike from five times as many
+    """Print the table: red / green in percent; of variants that are alike from four times as many
     runs.
     """
     print("| | scenes |", " | ".join(f"{seeds} seeds" for seeds in SEEDS), "|", flush=True)
     print("|---|---:|" + "---:|" * len(SEEDS), flush=True)
     for name, draw in CASES.items():
         for scenes in SCENES:
-            n = 5 * runs if name.startswith("alike") else runs
+            n = 4 * runs if name.startswith("alike") else runs
             found = [shares(draw, scenes, seeds, n) for seeds in SEEDS]
             texts = [f"{100 * red:.1f} / {100 * green:.0f}" for red, green in found]
             print(f"| {name} | {scenes} |", " | ".join(texts), "|", flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50)

@@ -458,6 +458,7 @@ def _suite_check(
         "n_scenes": len(change.by_scene(change.now)),
         "n_missing": n_missing,
         "n_neither": change.n_neither,
+        "n_short": change.n_short,
         "n_far": 0 if metric.is_flag and p is None else change.n_far,
         "counts": counts | {"equal": n_equal},
         "worst": change.worst(),

@@ -80,6 +80,8 @@ def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
         parts.append(f"{plural(entry['n_far'], 'scene')} beyond three margins")
     if entry["cut"]:
         parts.append(f"not compared, as an event ended one side: {_some(entry['cut'])}")
+    if entry["n_short"]:
+        parts.append(f"an event cut both sides short in {plural(entry['n_short'], 'pair')}")
     if entry["n_neither"]:
         parts.append(f"no value on either side in {plural(entry['n_neither'], 'pair')}")
     if entry["missing"]:

@@ -45,6 +45,7 @@ class Change:
         is_cut: ``(C,)`` cells that an event has ended on one side only, where a value over part of
             a rollout would meet one over the whole.
         n_neither: Cells in which the metric has no value on either side.
+        n_short: Compared cells that an event has ended on both sides.
         missing: Cells without a pair, and why.
     """
 
@@ -56,6 +57,7 @@ class Change:
     is_pair: Bool
     is_cut: Bool
     n_neither: int
+    n_short: int
     missing: Sequence[Mapping[str, Any]]
 
     @property
@@ -130,16 +132,26 @@ def change_of(
     pairs = Pairs(side, base, metric.name)
     is_shared = pairs.index >= 0
     was_stopped = np.append(_any_of(base, stops), False)[pairs.index]
-    is_cut = is_shared & (_any_of(side, stops) != was_stopped) & (not metric.is_flag)
+    is_stopped = _any_of(side, stops)
+    is_cut = is_shared & (is_stopped != was_stopped) & (not metric.is_flag)
     is_pair = pairs.both & ~is_cut
     ran = _ran(side) & np.append(_ran(base), False)[pairs.index]
     is_neither = ran & np.isnan(pairs.here) & np.isnan(pairs.there) & ~is_cut
     lone = [side.cells[i] for i in np.flatnonzero(~(is_pair | is_cut | is_neither)).tolist()]
     lone += [base.cells[i] for i in pairs.only_base.tolist()]
     missing = [pairs.cause(cell, metric.name) for cell in lone]
-    n_neither = int(np.sum(is_neither))
+    n_short = int(np.sum(is_pair & is_stopped & was_stopped)) if not metric.is_flag else 0
     return Change(
-        metric, margin, side, pairs.there, pairs.here, is_pair, is_cut, n_neither, missing
+        metric,
+        margin,
+        side,
+        pairs.there,
+        pairs.here,
+        is_pair,
+        is_cut,
+        int(np.sum(is_neither)),
+        n_short,
+        missing,
     )
 
 

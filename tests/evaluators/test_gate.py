@@ -207,6 +207,8 @@ def test_a_distance_that_an_event_cut_short_is_compared_with_none() -> None:
         ["s004 seed 0"],
     )
     assert code(short, spec=gate(max_new=1)) == 0
+    ended = judged([*short(rows("clean")), *short(rows())], spec).checks[0]
+    assert (ended.cause, ended.entry["n_short"], ended.entry["n_cells"]) == ("pass", 1, SCENES)
     driven_on = judged([*rows("clean"), *short(rows())], spec, preset="nuplan")
     assert driven_on.exit_code == 0  # its rollouts go on after an event
 
