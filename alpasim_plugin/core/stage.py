@@ -10,6 +10,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.reading import read_json
+
 WRITE_EVERY_S = 0.5
 _here: list[tuple[Path, Stage]] = []  # the file of this process, and what it says; at most one
 
@@ -69,6 +72,6 @@ def stages_in(folder: Path) -> list[Stage]:
     """Return what the processes that write into a folder do, the longest first."""
     found = []
     for path in folder.glob("*"):
-        with suppress(OSError, ValueError, TypeError):  # it is written or removed just now
-            found.append(Stage(**json.loads(path.read_text(encoding="utf-8"))))
+        with suppress(SimrunError, TypeError):  # it is written or removed just now
+            found.append(Stage(**read_json(path)))
     return sorted(found, key=lambda one: one.began_s)

@@ -227,7 +227,7 @@ def classes_of(file: Path) -> list[str]:
         InputError: It is not Python.
     """
     try:
-        tree = ast.parse(file.read_bytes(), str(file))
+        tree = ast.parse(read_bytes(file), str(file))
     except (SyntaxError, ValueError) as error:
         raise InputError(f"{file}: {error}", "Correct the file.") from error
     return [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
