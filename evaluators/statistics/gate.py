@@ -494,7 +494,7 @@ def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -
     found = "no valid value" if mean is None else short(mean, metric.unit)
     text = f"{variant.renderer}: {metric.name} {found}, limit {limits}"
     worst = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
-    entry = {"mean": mean, **bounds, "n_rollouts": len(known)}
+    entry: dict[str, Any] = {"mean": mean, **bounds, "n_rollouts": len(known)}
     entry["worst"] = [
         {"scene": side.cells[i][1], "seed": side.cells[i][2], "was": None, "now": values[i]}
         for i in worst[:LISTED]
