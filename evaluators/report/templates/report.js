@@ -37,6 +37,11 @@
     });
   }
 
+  // A link to a folded part opens it.
+  for (const link of all("nav a")) {
+    link.addEventListener("click", () => { all(":scope > details", document.querySelector(link.hash)).forEach((fold) => { fold.open = true; }); });
+  }
+
   // A link to the frames of a changed outcome opens their card.
   for (const link of all("a.to-flip")) {
     link.addEventListener("click", () => { document.getElementById(link.hash.slice(1)).open = true; });
