@@ -108,6 +108,10 @@ PLUGIN_PANEL = "From installed packages"
 PLUGIN_GROUP = "simrun.commands"
 # Verbs that an optional package of ours brings.
 LABORATORY_VERBS = ("train", "bench")
+LABORATORY = (
+    "Install the laboratory in the clone of simrun: pip install -e alpasim_plugin/lab; beside a "
+    "wheel of simrun, the laboratory's wheel (simrun docs install)."
+)
 ANYWHERE = ("-j", "--json", "-q", "--quiet", "--debug")
 OWN_OPTIONS = ("--help", "-h", "--version", "--install-completion", "--show-completion")
 COMPLETION = "_SIMRUN_COMPLETE"  # set by a shell that asks what a Tab offers
@@ -173,7 +177,14 @@ def load_verb(verb: str) -> Any:
     from alpasim_plugin.cli.options import click_command, typer_of
 
     module_name, _, name = verbs()[verb].partition(":")
-    module = import_module(module_name)
+    try:
+        module = import_module(module_name)
+    except ModuleNotFoundError as error:
+        if verb not in LABORATORY_VERBS or not module_name.startswith(str(error.name)):
+            raise
+        raise InputError(
+            f"simrun {verb}: the laboratory is registered without its modules", LABORATORY
+        ) from error
     target = getattr(module, name)
     if not isinstance(target, typer.Typer):
         epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
@@ -238,7 +249,7 @@ def with_verb(args: list[str]) -> list[str]:
     if args[0] in LABORATORY_VERBS:
         raise InputError(
             f"simrun {args[0]}: the verb is not installed",
-            "Install the laboratory, which brings it: pip install alpasim-onefixer-lab.",
+            LABORATORY,
         )
     if re.fullmatch(r"[\w-]+", args[0]) and args[0][0] != "-" and not Path(args[0]).exists():
         near = difflib.get_close_matches(args[0].lower(), verbs(), 1, 0.7)

@@ -225,7 +225,7 @@ FAULTS: dict[str, dict[type[PurePursuit] | type[LaneCamera], str]] = {
         SwappedAxes: "sideways",
         EmptyPlan: "(0, 2)",
         ConstantPlan: "route_rig changed no plan",
-        Jitter: "one second ahead (median)",
+        Jitter: "from query to query",
         OtherCamera: "rear",
         StopsForever: "standstill",
     },

@@ -32,6 +32,9 @@ DO_THIS = (
     "write package.module:Class with the package installed or in the working directory, "
     "or file.py:Class"
 )
+IN_A_FILE = (
+    "Correct the file; it can import what is installed, and what lies beside it as 'import helper'."
+)
 _imported_code: dict[Path, str] = {}  # file -> its code digest when a part of it was first resolved
 _served: dict[str, str] = {}  # module -> file, of modules that no folder on Python's path has
 
@@ -198,7 +201,8 @@ def load(target: str, kind: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
-        raise InputError(f"{kind} {target!r}: {raised(error)}", _advice(name, error)) from error
+        hint = IN_A_FILE if name.endswith(".py") else DO_THIS
+        raise InputError(f"{kind} {target!r}: {raised(error)}", hint) from error
     if found is None:
         has = [key for key, value in vars(module).items() if inspect.isclass(value)]
         near = difflib.get_close_matches(attribute, has, 3, 0.0)
@@ -207,17 +211,6 @@ def load(target: str, kind: str) -> Any:
             f"Name one of its classes: {', '.join(near) or 'it has none'}.",
         )
     return found
-
-
-def _advice(name: str, error: BaseException) -> str:
-    """Return what to do about a module that cannot be imported."""
-    if "relative import" in str(error):
-        return "Write 'import helper' for a file beside it, or put an __init__.py into the folder."
-    if isinstance(error, FileNotFoundError | ModuleNotFoundError) and not name.endswith(".py"):
-        return DO_THIS
-    if isinstance(error, ModuleNotFoundError):
-        return f"Install {error.name}, or put it beside the file."
-    return "Correct the file." if name.endswith(".py") else DO_THIS
 
 
 def classes_of(file: Path) -> list[str]:
