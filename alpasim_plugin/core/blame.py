@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sysconfig
 import traceback
 from typing import Any
@@ -30,7 +31,8 @@ def raised(error: BaseException) -> str:
     where = ""
     if chosen:
         where = f" at {chosen[-1].filename}:{chosen[-1].lineno}, in {chosen[-1].name}"
-    return f"{type(error).__name__}: {error}{where}"
+    text = re.sub(r"simrun_file_\w{12}", "the file", str(error))  # as a file is imported
+    return f"{type(error).__name__}: {text}{where}"
 
 
 def is_own(part: Any) -> bool:
