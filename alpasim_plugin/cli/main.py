@@ -285,7 +285,8 @@ def _run(args: list[str]) -> int:
         return leaving.exit_code if args else InputError.exit_code
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
-        verb = error.ctx.command_path if error.ctx else "simrun"
+        context = getattr(error, "ctx", None)  # errors of options have one
+        verb = context.command_path if context else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error
     return 0
 

@@ -101,9 +101,8 @@ class Jitter(Follower):
         side = np.random.Generator(np.random.Philox(self.queries)).choice([-14.0, 14.0])
         x = plan.xy[:, 0]
         y = plan.xy[:, 1] + side * np.minimum(x / 20.0, 1.0) ** 2
-        return replace(
-            plan, xy=np.stack([x, y], axis=1), yaw=np.arctan2(*np.gradient([x, y], axis=1)[::-1])
-        )
+        yaw = np.arctan2(np.gradient(y), np.gradient(x)).astype(np.float64)
+        return replace(plan, xy=np.stack([x, y], axis=1), yaw=yaw)
 
 
 class OtherCamera(Follower):
@@ -201,9 +200,11 @@ class ByYellow(Looker):
             left_m = -(columns.mean() - c.K[0, 2]) * p[2] / c.K[0, 0] - self.BESIDE_M
         t = 0.1 * np.arange(41)
         bend = 2 * left_m / self.AHEAD_M**2
-        x = observation.ego.speed_mps * t
+        x: F64 = observation.ego.speed_mps * t
         times = observation.t_us + (1e6 * t).astype(np.int64)
-        return Plan(observation.t_us, times, np.stack([x, bend * x**2 / 2], axis=1), bend * x)
+        return Plan(
+            observation.t_us, times, np.stack([x, bend * x**2 / 2], axis=1), np.asarray(bend * x)
+        )
 
 
 class SwappedChannels(ByYellow):
