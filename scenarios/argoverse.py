@@ -470,10 +470,10 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     files = SourceFiles()
     inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
     outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
-    lens: dict[str, Kind] = dict.fromkeys(
+    numbers: dict[str, Kind] = dict.fromkeys(
         ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"), "number"
     )
-    inner = files.read_feather(inner_path, {"sensor_name": "text", **lens})
+    inner = files.read_feather(inner_path, {"sensor_name": "text", **numbers})
     outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS})
     mounts = dict(
         zip(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,89 +32,18 @@ FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
 
-@dataclass(frozen=True)
-class FTheta:
-    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and
-    radians.
-    """
-
-    pixel_to_angle: tuple[float, ...]
-    angle_to_pixel: tuple[float, ...]
-    max_angle_rad: float = 0.0
-
-
-@dataclass(frozen=True)
-class RecordedLens:
-    """An f-theta lens as calibrated: principal point and size in pixels of the recorded image, and
-    both polynomials.
-    """
-
-    cx: float
-    cy: float
-    width: int
-    height: int
-    lens: FTheta
-    backward_given: (
-        bool  # the file's polynomial maps pixels to angle; the other direction is fitted
-    )
-
-
-def lens_of(values: F64) -> RecordedLens:
-    """Make a lens of its calibration; the direction that is not given is fitted over the image.
-
-    Args:
-        values: ``(11,)``: cx, cy, width, height in pixels, six coefficients from the constant
-            upwards, and a flag: 1 where they map pixel radius to angle (rad), 0 where they map
-            angle to radius.
-    """
-    cx, cy, width, height = values[:4]
-    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - (cx, cy)
-    reach_px = float(np.linalg.norm(corners, axis=1).max())
-    given = values[4:10]
-    backward = bool(values[10] == 1.0)
-    if backward:
-        radius = np.linspace(0.0, reach_px, 2000)
-        angle = _polynomial(radius, given)
-        top = int(np.argmax(angle))  # a polynomial may turn over beyond the image's corners
-        radius, angle = radius[: top + 1], angle[: top + 1]
-        lens = FTheta(tuple(given.tolist()), tuple(_fit(angle, radius).tolist()), float(angle[-1]))
-    else:
-        angle = np.linspace(0.0, np.pi / 2, 4000)
-        radius = _polynomial(angle, given)
-        inside = np.nonzero(np.maximum.accumulate(radius) > reach_px)[0]
-        rising = np.nonzero(np.diff(radius) <= 0)[0]
-        end = int(min([len(angle), *inside[:1] + 1, *rising[:1] + 1]))
-        angle, radius = angle[:end], radius[:end]
-        lens = FTheta(tuple(_fit(radius, angle).tolist()), tuple(given.tolist()), float(angle[-1]))
-    return RecordedLens(float(cx), float(cy), int(width), int(height), lens, backward)
-
-
-def _polynomial(x: F64, coefficients: F64) -> F64:
-    return np.asarray(np.polynomial.polynomial.polyval(x, coefficients), dtype=np.float64)
-
-
-def _fit(x: F64, y: F64) -> F64:
-    """Return six coefficients of the least-squares inverse through the origin (constant term
-    zero).
-    """
-    scale = x[-1]
-    powers = np.stack([(x / scale) ** k for k in range(1, 6)], axis=1)
-    coefficients = np.linalg.lstsq(powers, y, rcond=None)[0]
-    return np.concatenate([[0.0], coefficients / scale ** np.arange(1, 6)])
-
-
-def front_camera(lens: RecordedLens, T_rig_camera: F64) -> CameraSpec:
+def front_camera(calibrated: F64, T_rig_camera: F64) -> CameraSpec:
     """Return the pinhole of 90 degrees width inside the front wide lens.
 
     Its principal point is the recorded one scaled to the rendered size, so every rendered pixel
     lies inside the recorded image.
 
     Args:
-        lens: The calibrated lens.
+        calibrated: ``(4,)`` principal point (x, y) and size of the lens, pixels.
         T_rig_camera: ``(4, 4)`` mount, camera to rig.
     """
     focal = WIDTH / 2 / np.tan(HORIZONTAL_FOV_RAD / 2)
-    cx, cy = lens.cx * WIDTH / lens.width, lens.cy * HEIGHT / lens.height
+    cx, cy = calibrated[:2] * [WIDTH, HEIGHT] / calibrated[2:4]
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_rig_camera))
 
@@ -196,7 +124,7 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
             f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",
         )
     try:
-        camera = front_camera(lens_of(_lens_numbers(sensor["properties"])), mount(sensor))
+        camera = front_camera(_lens_numbers(sensor["properties"]), mount(sensor))
     except (KeyError, TypeError, ValueError) as error:
         raise _no_ftheta(archive, f"{where}, {FRONT_WIDE}", error) from error
     return (camera,), (

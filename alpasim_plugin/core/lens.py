@@ -1,7 +1,7 @@
 """Lenses: which ray each pixel of a camera sees, and the pinholes that cover a lens.
 
-Any lens is rendered by ideal pinholes that cover it, then resampled: by one up to `WIDEST_RAD` from
-the axis, beyond by the sides of a cube. Rays are x right, y down, z forward; the centre of pixel
+Any lens is rendered by ideal pinholes that cover it, then resampled: by one up to
+`WIDEST_OF_ONE_RAD` from the axis, beyond by the sides of a cube. Rays are x right, y down, z forward; the centre of pixel
 (row i, column j) is (j + 0.5, i + 0.5).
 """
 
@@ -19,6 +19,7 @@ from alpasim_plugin.core.shutter import Along
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, LensModel
 
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the image
+WIDEST_OF_ONE_RAD = np.deg2rad(70.0)  # of a plane towards whose sides nothing is smeared
 WIDEST_OF_CUBE_RAD = np.deg2rad(110.0)  # of several planes
 MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
@@ -150,7 +151,7 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
         return (lens_of(camera),)
     check_lens(camera)
     rays = rays_of(camera)
-    if rays.widest_rad <= WIDEST_RAD:
+    if rays.widest_rad <= WIDEST_OF_ONE_RAD:
         return (_covered(camera, rays, rays.seen, ""),)
     ahead = np.stack([rays.ray @ np.array(axes[2]) for axes in SIDES.values()])
     nearest = ahead.argmax(axis=0)
@@ -287,7 +288,8 @@ def check_lens(camera: CameraSpec) -> None:
             turns = bool((np.diff(angle[angle < _limit(lens)]) <= 0).any())
         else:
             grows = _growing(lens)
-            turns = grows < _limit(lens) and _value(_radius_of_angle(lens), grows) < reach
+            farthest = float(_value(_radius_of_angle(lens), np.array([grows]))[0])
+            turns = grows < _limit(lens) and farthest < reach
     if turns:
         raise InputError(
             f"camera {camera.name!r}: a {lens.kind} lens that turns back within its image",

@@ -165,9 +165,10 @@ class Actors:
             present = self.standing.present(to_us)
             line, s_m, offset_m, speed = self._where(driving)
             xyz, yaw = self._lines.at(line, s_m, offset_m)
-            velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+            directions = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
             boxes = [driver.actor.box for driver in driving]
-            everybody = concatenate([fixed, bodies_from(xyz[:, :2], yaw, boxes, velocity)])
+            moving = bodies_from(xyz[:, :2], yaw, boxes, speed[:, None] * directions)
+            everybody = concatenate([fixed, moving])
             found = find_leaders(
                 self._lines,
                 line,

@@ -26,10 +26,9 @@ from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap, Markin
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.world.paint import painted_lines
-from scenarios.ftheta import RecordedLens
 from scenarios.recorded import SourceFiles
 from tests.fixers.cosmos_clip import read_cosmos, read_layer, read_lenses
-from tests.scenarios.ftheta_projection import project_ftheta
+from tests.scenarios.ftheta_projection import RecordedLens, project_ftheta
 
 WIDTH, HEIGHT = 1280, 704
 N_FRAMES = 57

@@ -27,9 +27,10 @@ from alpasim_plugin.core.geometry import (
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
-from scenarios.ftheta import FRONT_WIDE, RecordedLens, front_camera, lens_of
+from scenarios.ftheta import FRONT_WIDE, front_camera
 from scenarios.map_lines import is_left_of, lane_edges
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
+from tests.scenarios.ftheta_projection import RecordedLens, lens_of
 
 # Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
 # calibration of another car of the same fleet; with it the clip's own map falls on the publisher's
@@ -431,6 +432,8 @@ def read_cosmos(path: str | Path) -> RecordedLog:
         "road markings (6 classes of words and arrows) and traffic lights are not used",
         *lane_notes,
     )
+    wide = lenses[FRONT_WIDE]
+    front = np.array([wide.cx, wide.cy, wide.width, wide.height])
     return RecordedLog(
         scene_id=f"cosmos-{clip}",
         source="cosmos",
@@ -439,7 +442,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
         ego_log=ego_log,
         vehicle=Vehicle(),
         actors=(),
-        cameras=(front_camera(lenses[FRONT_WIDE], T_RIG_FRONT_WIDE),),
+        cameras=(front_camera(front, T_RIG_FRONT_WIDE),),
         world_origin=(0.0, 0.0, 0.0),
         content_hash=files.content_hash,
         notes=notes,

@@ -48,6 +48,7 @@ def test_a_shipped_rig_is_read_and_scaled(tmp_path: Path, rig: str, count: int) 
     cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras
     assert [camera.width for camera in cameras] == [192] * count
     assert cameras[0].T_rig_camera[0, 2] > 0.99
+    assert len(sides_of(cameras[0])) == 1
 
 
 def test_cameras_of_a_usdz_have_its_lenses(tmp_path: Path) -> None:

@@ -3,15 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scenarios.ftheta import front_camera, lens_of
-from tests.scenarios.ftheta_projection import project_ftheta
+from scenarios.ftheta import front_camera
+from tests.scenarios.ftheta_projection import lens_of, project_ftheta
 
 WIDE = [960.0, 740.0, 1920.0, 1080.0, 0.0, 1.0576e-3, 8.2e-9, -3.4e-11, 8.1e-14, -2.9e-17, 1.0]
 
 
 def test_every_rendered_pixel_was_recorded():
     lens = lens_of(np.array(WIDE))
-    camera = front_camera(lens, np.eye(4))
+    camera = front_camera(np.array(WIDE), np.eye(4))
     u, v = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
     rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ np.linalg.inv(camera.K).T
     pixels = project_ftheta(lens, rays)

@@ -167,7 +167,7 @@ class Straight:
         out: Any = cv2.remap(
             seen, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
         )
-        return out  # type: ignore[no-any-return]
+        return out
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:

@@ -106,8 +106,8 @@ def rasterize_prepared(
     if camera.rolling is not None:
         still = camera.motion(_IDENTITY, _IDENTITY)
         for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
-            moves = T is not None and T_start is not None
-            pose[POSE_TURN:] = camera.motion(T, T_start) if moves else still
+            moves = None if T is None or T_start is None else (np.asarray(T, np.float64), T_start)
+            pose[POSE_TURN:] = still if moves is None else camera.motion(*moves)
     spheres = np.array([prepared.sphere for prepared, _ in nodes], np.float64).reshape(-1)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = []
