@@ -39,7 +39,7 @@ def test_a_dead_link_fails_the_strict_build(repo: Path, tmp_path: Path, link: st
         copy(repo / name, tmp_path / name)
     with (tmp_path / "docs" / "why.md").open("a") as page:
         page.write(f"\n[a link]({link})\n")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q"]
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict"]
     done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode == 0) == (link == "report.md"), done.stderr
     for path in (tmp_path / "build" / "site").rglob("*.html"):
