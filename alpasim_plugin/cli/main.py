@@ -285,8 +285,8 @@ def _run(args: list[str]) -> int:
         return leaving.exit_code if args else InputError.exit_code
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
-        context = getattr(error, "ctx", None)  # errors of options have one
-        verb = context.command_path if context else "simrun"
+        refused_by = getattr(error, "ctx", None)  # errors of options have one
+        verb = refused_by.command_path if refused_by else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error
     return 0
 

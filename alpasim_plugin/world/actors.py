@@ -164,10 +164,10 @@ class Actors:
                 return
             present = self.standing.present(to_us)
             line, s_m, offset_m, speed = self._where(driving)
-            xyz, yaw = self._lines.at(line, s_m, offset_m)
-            directions = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+            xyz, yaws = self._lines.at(line, s_m, offset_m)
+            directions = np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
             boxes = [driver.actor.box for driver in driving]
-            moving = bodies_from(xyz[:, :2], yaw, boxes, speed[:, None] * directions)
+            moving = bodies_from(xyz[:, :2], yaws, boxes, speed[:, None] * directions)
             everybody = concatenate([fixed, moving])
             found = find_leaders(
                 self._lines,

@@ -122,8 +122,8 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
     by_class = failures["by_class"]
     if n_failed <= max_share * n:
         return Outcome("pass")
-    causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
-    text = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
+    counts = ", ".join(f"{name} {count}" for name, count in by_class.items())
+    text = f"{n_failed} of {n} rollouts could not be run or scored ({counts})"
     causes = {CAUSES.get(name, "infrastructure") for name in by_class}
     if causes == {"policy", "renderer"}:
         return Outcome("policy", (text,))

@@ -13,8 +13,9 @@ import stat
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -42,7 +43,7 @@ T = TypeVar("T")
 @contextmanager
 def open_regular(
     path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_PATH
-) -> Iterator[BinaryIO]:
+) -> Iterator[BufferedReader]:
     """Open a regular file for reading, after checking its kind and size on the open file itself.
 
     A pipe, socket or device is refused without waiting for its other end.
