@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from alpasim_plugin.core import places
 from alpasim_plugin.core.lazy import lazy_names
+from alpasim_plugin.core.reading import real
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy
@@ -46,7 +47,7 @@ def _refuse_hidden_packages() -> None:
     root = Path(__file__).resolve().parents[1]
     for name in OWN_PACKAGES[1:]:
         spec = find_spec(name)
-        if spec is None or spec.origin is None or root not in Path(spec.origin).resolve().parents:
+        if spec is None or spec.origin is None or root not in real(Path(spec.origin)).parents:
             places_found = spec and (spec.origin or list(spec.submodule_search_locations or ()))
             raise ImportError(
                 f"the package {name!r} of simrun is hidden by {places_found}: rename that folder, "

@@ -22,6 +22,7 @@ from alpasim_plugin.core.geometry import (
     se3,
     wrap_angle,
 )
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import (
     F64,
@@ -329,7 +330,7 @@ def read_argoverse(path: str | Path) -> RecordedLog:
         "no speed limits, stop lines or traffic signals: the map has none",
     ]
     return RecordedLog(
-        scene_id=f"av2-{folder.resolve().name}",
+        scene_id=f"av2-{real(folder).name}",
         source="argoverse",
         lane_map=lane_map,
         ground=ground,

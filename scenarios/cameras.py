@@ -4,6 +4,7 @@ to `CameraSpec`, checked before anything is built.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -141,7 +142,7 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
     else:
         assert given.from_ is not None, "a set has a rig or a file"
         path = drawn.document.folder_of(("cameras", "from")) / given.from_
-        if not path.exists():
+        if not os.path.exists(path):
             raise drawn.document.error(
                 ("cameras", "from"),
                 f"{path} does not exist",
@@ -173,7 +174,7 @@ def _named(
 
 def _from_file(path: Path) -> tuple[CameraSpec, ...]:
     """Read the cameras of an Argoverse 2 log or an AlpaSim scene."""
-    if path.is_dir():
+    if os.path.isdir(path):
         from scenarios.argoverse import read_calibration
 
         return read_calibration(path)

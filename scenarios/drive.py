@@ -8,6 +8,7 @@ distortion, each with its time, camera and use.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -395,7 +396,11 @@ def _photograph(folder: Path, frame: _Frame) -> Photograph:
 
 def _note_files(files: SourceFiles, model: Path) -> None:
     """Enter the files of the model into the content, each by its digest: they are large."""
-    found = sorted(path for path in model.rglob("*") if path.is_file()) if model.is_dir() else []
+    found = (
+        sorted(path for path in model.rglob("*") if os.path.isfile(path))
+        if os.path.isdir(model)
+        else []
+    )
     if not found:
         raise files.fail(
             model,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -240,7 +241,7 @@ def _background(drawn: Drawn) -> BackgroundFile | None:
     if background is None:
         return None
     path = document.folder_of(("background", "file")) / background.file
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise document.error(("background", "file"), f"{path} does not exist", "correct the path")
     matrix = np.eye(4) if background.transform is None else np.array(background.transform)
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):

@@ -7,6 +7,7 @@ Every failure names the file, and every byte read enters one hash.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -90,7 +91,7 @@ class SourceFiles:
         Raises:
             InputError: There is none, or more than one.
         """
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise self.fail(folder, "no such folder", f"give the folder that holds {what}")
         for pattern in patterns:
             found = sorted(folder.glob(pattern))

@@ -4,6 +4,7 @@ drives and their readers.
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from alpasim_plugin.core.config import Document, load_yaml
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
-from alpasim_plugin.core.reading import contents, parsing
+from alpasim_plugin.core.reading import contents, parsing, real
 from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
@@ -31,8 +32,8 @@ class Argoverse(Source):
 
     def matches(self, path: Path) -> bool:
         """Look for the ego's poses or the map."""
-        return path.is_dir() and (
-            (path / "city_SE3_egovehicle.feather").exists() or (path / "map").is_dir()
+        return os.path.isdir(path) and (
+            os.path.exists(path / "city_SE3_egovehicle.feather") or os.path.isdir(path / "map")
         )
 
     def read(self, path: Path, ego: str | None) -> RecordedLog:
@@ -65,7 +66,7 @@ class ImportedDrive(Source):
 
     def matches(self, path: Path) -> bool:
         """Look for the drive's own file."""
-        return (path / DRIVE_FILE).is_file()
+        return os.path.isfile(path / DRIVE_FILE)
 
     def read(self, path: Path, ego: str | None) -> RecordedLog:
         """Read a drive; the ego is the recording vehicle."""
@@ -102,7 +103,7 @@ def open_document(path: Path, source: str | None) -> Document:
     """
     kind = source or detect(path)
     if kind != "yaml":
-        place = str(path.resolve())
+        place = str(real(path))
         log = {kind: place} if kind in SHIPPED else {"source": kind, "path": place}
         return Document({"version": 1, "log": log}, {}, str(path))
     document = load_yaml(path)
@@ -128,7 +129,7 @@ def detect(path: Path) -> str:
     Raises:
         InputError: Nothing recognises it.
     """
-    if path.suffix in (".yaml", ".yml") and not path.is_dir():
+    if path.suffix in (".yaml", ".yml") and not os.path.isdir(path):
         return "yaml"
     name = source_of(path)
     if name is not None:
@@ -147,12 +148,12 @@ def detect(path: Path) -> str:
 def import_advice(path: Path) -> str | None:
     """Return the command that makes a scenario of a path; None where nothing suggests one."""
     out = f"-o OUT, then simrun OUT/{SCENARIO_FILE}"
-    if path.suffix.lower() in MODELS or (path / "meta.json").is_file():
+    if path.suffix.lower() in MODELS or os.path.isfile(path / "meta.json"):
         return f"make one: simrun import splat {path} --poses POSES {out}"
     if path.suffix.lower() in FILMS:
         return "find the film's poses with COLMAP, then simrun import drive (docs/real-drives.md)"
     places = [path / name for name in DRIVES]
-    if path.name == DRIVES[0] or any(one.exists() for one in places):
+    if path.name == DRIVES[0] or any(os.path.exists(one) for one in places):
         return f"make one: simrun import drive {path} {out}"
     return None
 
@@ -172,7 +173,7 @@ def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:
     assert log is not None
     kind, text, key = log.recorded
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)
-    if not path.exists():
+    if not os.path.exists(path):
         raise document.error(
             ("log", key),
             f"{path} does not exist",

@@ -62,7 +62,7 @@ def find(path_or_name: str | Path) -> Path:
         InputError: Neither exists; the nearest shipped names are given.
     """
     path, shipped = Path(path_or_name), shipped_names()
-    if exists(path):
+    if os.path.exists(path):
         return path
     name = str(path_or_name).removesuffix(".yaml")
     if name in shipped:
@@ -162,7 +162,7 @@ def _expand(
     text: str, base: Path | None, chain: tuple[Path, ...], opened: list[Path]
 ) -> list[ScenarioRef]:
     path = _locate(text, base)
-    if path.is_dir():
+    if os.path.isdir(path):
         if source_of(path) is not None:
             return [ScenarioRef(str(path))]
         files = [
@@ -178,7 +178,7 @@ def _expand(
         return [ScenarioRef(str(f)) for f in files]
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
         return [ScenarioRef(str(path))]
-    if path.resolve() in chain:
+    if real(path) in chain:
         raise InputError(f"{path}: a suite that contains itself", "remove the entry")
     opened.append(path)
     if len(opened) > MOST_SUITES:
@@ -192,7 +192,7 @@ def _expand(
     for i, entry in enumerate(spec.scenarios):
         item = SuiteItem(path=entry) if isinstance(entry, str) else entry
         try:
-            refs = _expand(item.path, path.resolve().parent, (*chain, path.resolve()), opened)
+            refs = _expand(item.path, real(path).parent, (*chain, real(path)), opened)
         except InputError as e:
             raise _placed(document, i, e) from e
         extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())
@@ -208,7 +208,7 @@ def _locate(text: str, base: Path | None) -> Path:
     candidates = [Path(os.path.normpath(base / text))] if base is not None else []
     candidates.append(Path(text))
     for path in candidates:
-        if exists(path):
+        if os.path.exists(path):
             return path
     names = {**shipped_names(), **suites()}
     name = text.removesuffix(".yaml")

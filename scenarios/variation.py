@@ -8,6 +8,7 @@ actor does not change the others.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Any
 
 from alpasim_plugin.core.config import Document, apply_overrides, dotted, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.seeding import stream
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
 from scenarios.schema_parts import Part
@@ -77,10 +79,10 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
 
 
 def _default_id(path: Path) -> str:
-    resolved = path.resolve()
+    resolved = real(path)
     if path.suffix in (".yaml", ".yml"):
         return f"{resolved.parent.name}-{resolved.stem}"
-    return resolved.stem if resolved.is_file() else resolved.name
+    return resolved.stem if os.path.isfile(resolved) else resolved.name
 
 
 def _check_names(document: Document, spec: ScenarioSpec) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +37,7 @@ def docs(
     as_json: Json = False,
 ) -> None:
     """Read a page of the documentation in the terminal, or list all."""
-    folder = next((path for path in FOLDERS if (path / "index.md").is_file()), None)
+    folder = next((path for path in FOLDERS if os.path.isfile(path / "index.md")), None)
     if folder is None:
         raise InputError(
             f"{FOLDERS[1]}: this installation has no pages",

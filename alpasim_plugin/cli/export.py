@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -88,7 +89,7 @@ def export(
 
 
 def _export_to_alpasim(items: Sequence[str], folder: Path, as_json: bool) -> None:
-    runs = [item for item in items if (Path(item) / RUN_INFO).exists()]
+    runs = [item for item in items if os.path.exists(Path(item) / RUN_INFO)]
     if runs and len(items) > 1:
         raise InputError(
             f"{' '.join(items)}: a run folder among several items", "Export one run at a time."
@@ -138,7 +139,7 @@ def export_recording(
     require_mcap()  # before anything is read
     root, cell = run_and_cell(Path(items[0]))
     wanted = wanted_of(root, cell, asked)
-    if (root / SUMMARY).exists():
+    if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
     run = read_so_far(root).run
     check_wanted(run, wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -105,7 +106,7 @@ def gate(
         repeatable,
     )
     files = write_gate_files(verdict, source, stored_run, out or run)
-    if out is None and (run / PAGES[0]).is_file():
+    if out is None and os.path.isfile(run / PAGES[0]):
         write_reports(run, flips=read_run_json(run).get("kind") != "score")
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
     show(as_json, facts, *verdict_lines(verdict))

@@ -274,6 +274,12 @@ def _run(args: list[str]) -> int:
             else f"simrun {__version__}"
         )
         return 0
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            f"the working folder: {error.strerror}", "Change into a folder that exists."
+        ) from error
     words = with_verb(args) or ["--help"]
     if words[0] in verbs():
         load_verb(words[0])  # until it is imported, a signal ends the process at once
@@ -328,7 +334,9 @@ def run_command(args: list[str]) -> int:
 
 
 def _unforeseen(error: Exception, command: str) -> SimrunError:
-    """Return the error for what no part of the program has foreseen."""
+    """Return the error for what no part of the program has foreseen; a path that the system refuses
+    is bad input.
+    """
     if isinstance(error, MemoryError):
         return InfrastructureError(
             f"{command}: out of memory: {error}", "Use fewer --workers, or free memory."
@@ -339,10 +347,10 @@ def _unforeseen(error: Exception, command: str) -> SimrunError:
                 f"{command}: {error.strerror}: {error.filename or 'where the output goes'}",
                 "Free space, then give the same command again.",
             )
-        if isinstance(error, PermissionError) and error.filename:
+        if error.filename:
             return InputError(
                 f"{error.filename}: {error.strerror}",
-                "Let this user read and write it, or name another file.",
+                "Correct the path, or let this user read and write it.",
             )
     return InternalError.of(error, command)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import keyword
+import os
 import re
 from importlib.resources import files
 from importlib.util import find_spec
@@ -46,7 +47,7 @@ def new(
             f"name {name!r}: not a name of a Python file",
             "use lower case, digits and underscores: my_policy",
         )
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError(f"--folder {folder}: no such folder", "make it first")
     words = {
         "name": name,
@@ -56,7 +57,7 @@ def new(
     }
     targets = {folder / words["file"]: f"{kind}.txt", folder / words["test"]: f"{kind}_test.txt"}
     for path in targets:
-        if path.exists():
+        if os.path.exists(path):
             raise InputError(f"{path}: it exists already", "choose another name or --folder")
     templates = files("alpasim_plugin.cli") / "templates"
     for path, template in targets.items():

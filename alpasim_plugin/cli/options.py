@@ -5,6 +5,7 @@ as an annotated parameter of a verb.
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -243,7 +244,7 @@ def refuse_existing(path: Path | None, option: str, overwrite: bool = False) -> 
     Raises:
         InputError: It exists, and ``--overwrite`` was not given.
     """
-    if path is not None and path.exists() and not overwrite:
+    if path is not None and os.path.exists(path) and not overwrite:
         raise InputError(f"{option} {path}: the file exists already", "Name another file.")
 
 
@@ -279,7 +280,7 @@ def run_and_cell(path: Path | None) -> tuple[Path, str]:
     is_newest = path is None or (path == Path() and not Path(RUN_INFO).exists())
     folder = run_or_newest(None) if is_newest or path is None else path
     for root in (folder, *folder.parents):
-        if (root / RUN_INFO).exists():
+        if os.path.exists(root / RUN_INFO):
             return root, "/".join(folder.relative_to(root).parts).removeprefix("rollouts/")
     raise InputError(
         f"{folder}: no run folder at it or above it",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import time
 from collections.abc import Mapping
@@ -160,7 +161,7 @@ class Progress(progress.Progress):
 def report_lines(root: Path) -> list[str]:
     """Return the lines that name a run's report and the command that replays its rollouts."""
     page, run = root / "report.html", shlex.quote(str(root))
-    report = shlex.quote(str(page)) if page.exists() else f"not written; simrun report {run}"
+    report = shlex.quote(str(page)) if os.path.exists(page) else f"not written; simrun report {run}"
     return [f"report   {report}", f"watch    simrun view {run}"]
 
 

@@ -4,6 +4,7 @@ run's report again from its tables.
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -75,7 +76,7 @@ def view(
         return
     root, cell = run_and_cell(path)
     wanted = wanted_of(root, cell, asked)
-    if (root / SUMMARY).exists():
+    if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
     so_far = read_so_far(root)
     for line in so_far.damage:

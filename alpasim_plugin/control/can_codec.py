@@ -10,6 +10,7 @@ checks have passed.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -101,13 +102,13 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
         InputError: No such map or database, or a map with an unknown key.
     """
     shipped = FOLDER / f"{name}.yaml"
-    path = shipped if shipped.is_file() else Path(name)
-    if not path.is_file():
+    path = shipped if os.path.isfile(shipped) else Path(name)
+    if not os.path.isfile(path):
         known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
         raise InputError(f"map={name}: no such map or file", f"known: {known}; or name a YAML file")
     found: CanMap = validate(CanMap, load_yaml(path))
     database = Path(dbc) if dbc is not None else path.parent / found.dbc
-    if not database.is_file():
+    if not os.path.isfile(database):
         raise InputError(
             f"database {database}: no such file",
             f"name it with dbc=FILE; the map {name!r} is for {found.dbc}",

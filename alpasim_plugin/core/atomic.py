@@ -84,11 +84,11 @@ def atomic_folder(folder: Path, do_this: str | None = None) -> Iterator[Path]:
     try:
         partial.mkdir(parents=True)
         yield partial
-        if folder.exists():
+        if os.path.exists(folder):
             folder.replace(old)
         partial.replace(folder)
     except OSError as error:
-        if old.exists() and not folder.exists():
+        if os.path.exists(old) and not os.path.exists(folder):
             old.replace(folder)
         raise disk_error(folder, error, do_this) from error
     finally:

@@ -6,6 +6,7 @@ CACHE / KIND / KEY/        what was made; it appears atomically
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable
@@ -51,7 +52,7 @@ def cached(
         InputError: What was just made cannot be read.
     """
     folder = places.cache() / kind / key
-    if not again and folder.exists():
+    if not again and os.path.exists(folder):
         try:
             return read(folder)
         except InputError as error:
@@ -62,7 +63,7 @@ def cached(
         # of a process that was killed while it made this entry
         for left_over in folder.parent.glob(f".{key}.*.tmp"):
             shutil.rmtree(left_over)
-        if not again and folder.exists():
+        if not again and os.path.exists(folder):
             try:
                 return read(folder)
             except InputError:

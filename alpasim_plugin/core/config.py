@@ -13,6 +13,7 @@ import copy
 import difflib
 import json
 import math
+import os
 import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +27,7 @@ from pydantic import BaseModel, ValidationError
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.limits import YAML_BYTES, YAML_VALUES
-from alpasim_plugin.core.reading import read_text
+from alpasim_plugin.core.reading import read_text, real
 
 MOST_FILES = 64  # of one document, through extends
 MOST_LEVELS = 40
@@ -74,7 +75,7 @@ class Document:
     def folder_of(self, loc: Sequence[str | int]) -> Path:
         """Return the folder against which a relative path written at ``loc`` is resolved."""
         mark = self.mark(loc)
-        return Path(mark.file).resolve().parent if mark.line else Path.cwd()
+        return real(Path(mark.file)).parent if mark.line else Path.cwd()
 
 
 class CoreLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # a base chosen at run time
@@ -113,7 +114,7 @@ def _load(path: Path, read: list[Path]) -> Document:
     """Read a file and its bases; ``read`` collects every reading, since files that name each other
     twice double at each step.
     """
-    read.append(path.resolve())
+    read.append(real(path))
     if len(read) > MOST_FILES:
         raise InputError(
             f"{path}: more than {MOST_FILES} files through extends, {len(set(read))} different ones",
@@ -131,8 +132,8 @@ def _load(path: Path, read: list[Path]) -> Document:
     merged: Any = {}
     marks: dict[Key, Mark] = {}
     for name in names:
-        base_path = path.resolve().parent / name
-        if not base_path.is_file():
+        base_path = real(path).parent / name
+        if not os.path.isfile(base_path):
             raise document.error(
                 ("extends",),
                 f"extends {name!r}, but {base_path} does not exist",

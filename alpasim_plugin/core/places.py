@@ -89,7 +89,7 @@ def temporary_folder(prefix: str) -> tempfile.TemporaryDirectory[str]:
 def is_writable(path: Path) -> bool:
     """Tell whether this user may write a folder, or make it."""
     nearest = _nearest(path)
-    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
+    return os.path.isdir(nearest) and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def _is_own(path: Path) -> bool:

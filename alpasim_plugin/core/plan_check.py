@@ -26,6 +26,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 
+REACH_M = 20_000.0  # of a plan, from where it is made
 ARRAYS = ("times_us", "xy", "yaw")
 UNITS = (
     (100.0, "centimetres"),
@@ -85,6 +86,9 @@ def shape_problem(plan: Any, min_rows: int = 1) -> str:
     bad = ~(np.isfinite(plan.xy).all(axis=1) & np.isfinite(plan.yaw))
     if bad.any():
         return f"the plan is not finite in {int(bad.sum())} of {n} rows, first in row {int(np.argmax(bad))}"
+    far_m = float(np.abs(plan.xy).max(initial=0.0))
+    if far_m > REACH_M:
+        return f"the plan reaches {far_m:.3g} m, farther than the {REACH_M:g} m of the longest road"
     return _samples_problem(getattr(plan, "samples", ()), n)
 
 
@@ -111,8 +115,8 @@ def _samples_problem(samples: Any, n: int) -> str:
     for sample in samples:
         if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
             return f"a sampled alternative is {_a(sample)}, not an array of numbers"
-        if sample.shape != (n, 3) or not np.isfinite(sample).all():
-            return f"a sampled alternative is not finite or has shape {sample.shape}, not ({n}, 3)"
+        if sample.shape != (n, 3) or not (np.abs(sample) <= REACH_M).all():
+            return f"a sampled alternative has shape {sample.shape}, not ({n}, 3), is not finite, or reaches farther than {REACH_M:g} m"
     return ""
 
 

@@ -5,6 +5,7 @@ Read `import_drive` downwards.
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -123,7 +124,7 @@ def import_drive(
     with working_folder(out) as work:
         drive = checked(read_source(folder), folder)
         key = key_of(drive, camera_height_m, lane_map)
-        if out.exists():
+        if os.path.exists(out):
             return finished(out, key)
         return _built(drive, folder, work, key, camera_height_m, lane_map, tell)
 
@@ -141,7 +142,7 @@ def working_folder(out: Path) -> Iterator[Path]:
     except InputError:
         shutil.rmtree(work, ignore_errors=True)
         raise
-    if not out.exists():
+    if not os.path.exists(out):
         work.replace(out)
 
 
@@ -245,7 +246,7 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
         repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map))).encode()
     )
     for one in drive.pictures:
-        status = one.file.stat() if one.file.is_file() else None
+        status = one.file.stat() if os.path.isfile(one.file) else None
         digest.update(
             f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode()
         )
@@ -257,7 +258,7 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
 
 def finished(out: Path, key: str) -> dict[str, Any]:
     """Return the quality of a finished import, or refuse another thing in its place."""
-    if not (out / SCENARIO_FILE).is_file() or not (out / KEY_FILE).is_file():
+    if not os.path.isfile(out / SCENARIO_FILE) or not os.path.isfile(out / KEY_FILE):
         raise InputError(
             f"{out}: it exists and is no imported drive",
             "name a folder that does not exist yet",
@@ -273,8 +274,8 @@ def finished(out: Path, key: str) -> dict[str, Any]:
 
 def begin(work: Path, key: str) -> None:
     """Make the working folder, or keep that of the same import; another one's is removed."""
-    if work.exists() and (
-        not (work / KEY_FILE).is_file() or read_json_object(work / KEY_FILE).get("key") != key
+    if os.path.exists(work) and (
+        not os.path.isfile(work / KEY_FILE) or read_json_object(work / KEY_FILE).get("key") != key
     ):
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
@@ -333,7 +334,7 @@ def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
     for i, one in enumerate(shown):
         path = work / one.file
         tell("writing photographs", i + 1, len(shown))
-        if path.is_file():
+        if os.path.isfile(path):
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
         bends = one.picture.lens.bends

@@ -7,6 +7,7 @@ the corner of the first one. The unit is arbitrary.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se3
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import natural_order, read_bytes
+from alpasim_plugin.core.reading import natural_order, read_bytes, real
 from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, timed
@@ -61,13 +62,15 @@ class _Image:
 def models_in(folder: Path) -> list[Path]:
     """Return the folders in or below a folder that hold models, in natural order."""
     tops = [folder / place for place in PLACES]
-    below = [one for top in tops if top.is_dir() for one in top.iterdir() if one.is_dir()]
-    found = {one.resolve(): one for one in (*tops, *below) if _ending(one) is not None}
+    below = [
+        one for top in tops if os.path.isdir(top) for one in top.iterdir() if os.path.isdir(one)
+    ]
+    found = {real(one): one for one in (*tops, *below) if _ending(one) is not None}
     return sorted(found.values(), key=lambda one: natural_order(one.as_posix()))
 
 
 def _ending(model: Path) -> str | None:
-    return next((end for end in (".bin", ".txt") if (model / f"cameras{end}").is_file()), None)
+    return next((end for end in (".bin", ".txt") if os.path.isfile(model / f"cameras{end}")), None)
 
 
 def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
@@ -135,9 +138,7 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     notes.append(
         f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
     )
-    return SourceDrive(
-        "colmap", folder.resolve().name, every, front, points=points, notes=tuple(notes)
-    )
+    return SourceDrive("colmap", real(folder).name, every, front, points=points, notes=tuple(notes))
 
 
 def _data(model: Path, name: str) -> bytes:
@@ -158,7 +159,7 @@ def _camera(name: str) -> str:
 def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     for base in (folder, model):
         for place in PICTURES:
-            if (base / place / name).is_file():
+            if os.path.isfile(base / place / name):
                 return base / place
     if not needed:
         return folder / PICTURES[0]

@@ -10,6 +10,7 @@ one.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import natural_order, parsing, read_bytes, read_text
+from alpasim_plugin.core.reading import natural_order, parsing, read_bytes, read_text, real
 from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, SourceDrive
@@ -46,7 +47,9 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 def is_kitti(folder: Path) -> bool:
     """Look for ``calib.txt`` beside a folder of left pictures."""
-    return (folder / "calib.txt").is_file() and any((folder / left).is_dir() for left, _ in PAIRS)
+    return os.path.isfile(folder / "calib.txt") and any(
+        os.path.isdir(folder / left) for left, _ in PAIRS
+    )
 
 
 def read_kitti(folder: Path) -> SourceDrive:
@@ -56,12 +59,12 @@ def read_kitti(folder: Path) -> SourceDrive:
         InputError: A file is missing or damaged, or a pose is no rigid motion; the message names
             it.
     """
-    left, right = next(pair for pair in PAIRS if (folder / pair[0]).is_dir())
+    left, right = next(pair for pair in PAIRS if os.path.isdir(folder / pair[0]))
     projections, unknown = _projections(folder / "calib.txt")
     poses, pictures = _poses(folder), []
     notes = [f"calib.txt: unknown rows are not read: {', '.join(unknown)}"] if unknown else []
     for name, side in ((left, "left"), (right, "right")):
-        if not (folder / name).is_dir():
+        if not os.path.isdir(folder / name):
             notes.append(f"no {name}: no second camera to judge the fit by")
             continue
         files = [path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES]
@@ -83,17 +86,17 @@ def read_kitti(folder: Path) -> SourceDrive:
                     {},
                 )
             )
-    if not (folder / "times.txt").is_file():
+    if not os.path.isfile(folder / "times.txt"):
         notes.append("no times.txt: 10 photographs a second are assumed, as KITTI takes them")
-    others = [name for name in ROWS if name not in (left, right) and (folder / name).is_dir()]
+    others = [name for name in ROWS if name not in (left, right) and os.path.isdir(folder / name)]
     if others:
         notes.append(f"not read: {', '.join(others)}")
     return SourceDrive(
         "kitti",
-        folder.resolve().name,
+        real(folder).name,
         tuple(pictures),
         "left",
-        ("right",) if (folder / right).is_dir() else (),
+        ("right",) if os.path.isdir(folder / right) else (),
         metric="the poses, metres",
         notes=tuple(notes),
     )
@@ -142,8 +145,8 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _poses(folder: Path) -> list[F64]:
-    places = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.resolve().name}.txt")
-    path = next((one for one in places if one.is_file()), None)
+    places = (folder / "poses.txt", folder.parent.parent / "poses" / f"{real(folder).name}.txt")
+    path = next((one for one in places if os.path.isfile(one)), None)
     if path is None:
         raise InputError(
             f"{folder}: no poses.txt",
@@ -204,7 +207,7 @@ def _camera(projections: dict[str, F64], name: str, path: Path) -> tuple[F64, F6
 
 def _times(folder: Path, count: int) -> list[int]:
     path = folder / "times.txt"
-    if not path.is_file():
+    if not os.path.isfile(path):
         return [i * PERIOD_US for i in range(count)]
     seconds = np.array([_numbers(line, where, 1)[0] for where, line in _lines(path)])
     if len(seconds) < count or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():

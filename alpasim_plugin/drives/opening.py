@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import contents, natural_order, parsing, some_of
+from alpasim_plugin.core.reading import contents, natural_order, parsing, real, some_of
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
@@ -44,12 +45,12 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
     Raises:
         InputError: There is nothing, no reader knows it, or it is damaged.
     """
-    if not folder.exists():
+    if not os.path.exists(folder):
         raise InputError(f"{folder}: it does not exist", f"give {FORMS}")
     if folder.name == FILE:
         folder = folder.parent
     with parsing(folder, f"give {FORMS}"):
-        if (folder / FILE).is_file():
+        if os.path.isfile(folder / FILE):
             return _transforms(folder, photographs)
         if is_kitti(folder):
             return read_kitti(folder)
@@ -64,7 +65,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     if not listed:
         raise InputError(f"{folder / FILE}: no frames", "list the photographs with their poses")
     notes = []
-    some = photographs or any(one.file.is_file() for one in listed)
+    some = photographs or any(os.path.isfile(one.file) for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())
     if "axes" not in document:
         if not some:
@@ -120,7 +121,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     )
     return SourceDrive(
         "transforms",
-        folder.resolve().name,
+        real(folder).name,
         tuple(pictures),
         front,
         kept,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,15 +74,15 @@ def import_splat(
     tell = report or (lambda stage, done, total: None)
     with working_folder(out) as work:
         drive = read_source(poses, photographs=False)
-        has_photographs = all(picture.file.is_file() for picture in drive.pictures)
+        has_photographs = all(os.path.isfile(picture.file) for picture in drive.pictures)
         drive = checked(drive, poses, has_photographs)
         tell("reading the model", 0, 1)
         cloud, kept = read_gaussians(file)
         if kept.n_kept == 0:
             raise InputError(f"{file}: {kept}", "Give a file with at least one drawable Gaussian.")
         cloud, frame_notes = _in_frame(file, cloud, poses, drive)
-        key = key_of(drive, None, file if file.is_file() else None)
-        if out.exists():
+        key = key_of(drive, None, file if os.path.isfile(file) else None)
+        if os.path.exists(out):
             return finished(out, key)
         size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"
         quality = "what the model was trained with is not known: held-out photographs may have been among it"
@@ -131,9 +132,10 @@ def _in_frame(
         InputError: The poses see too little of the model.
     """
     places = [
-        folder / TRAINED for folder in (file.parent, (poses if poses.is_dir() else poses.parent))
+        folder / TRAINED
+        for folder in (file.parent, (poses if os.path.isdir(poses) else poses.parent))
     ]
-    stated = next((place for place in places if place.is_file()), None)
+    stated = next((place for place in places if os.path.isfile(place)), None)
     notes: tuple[str, ...] = ()
     if stated is None:
         covered, moved = _covered(cloud, drive), cloud

@@ -11,6 +11,7 @@ settings that the weights were trained with. Only safetensors is read: a pickle 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,7 +72,7 @@ class FixerFactory(Generic[S]):
             if path is not None:
                 files[f"weights.{part}"] = path
         for key, path in files.items():
-            if not path.is_file():
+            if not os.path.isfile(path):
                 raise InputError(
                     f"{settings.name}: {key} = {path}: no such file",
                     f"correct --set fixer.{key}, or where it is written",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -254,7 +255,7 @@ def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S
     path = Path(str(resources.files("configs.fixers"))) / f"{name}.yaml"
     document = (
         load_yaml(path)
-        if path.is_file()
+        if os.path.isfile(path)
         else Document({"name": name}, {}, f"the defaults of {name}")
     )
     return validate(model, _absolute(_override(_without_shipped(document, overrides), overrides)))

@@ -358,7 +358,7 @@ def _write_scenes(
 
 
 def _check_free(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(os.scandir(out))):
+    if os.path.exists(out) and (not os.path.isdir(out) or any(os.scandir(out))):
         raise InputError(
             f"--alpasim {out}: it is there and not empty",
             "name a new folder, or remove it first",

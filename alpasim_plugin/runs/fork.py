@@ -12,6 +12,7 @@ renders every request, a policy gets every query. Their outputs before the insta
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -224,7 +225,7 @@ def fork_rollout(
             "Choose an instant within it, in seconds after the first frame.",
         )
     past.check_repeatable()
-    if (root / RUN_INFO).exists():
+    if os.path.exists(root / RUN_INFO):
         raise InputError(f"--out {root}: it holds a run already", "Choose another --out.")
     with writing(root):
         return _fork(past, change, root, command)

@@ -15,6 +15,8 @@ from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 
+ALPHA, DEPTH_M = 1.0, 1e6  # largest values of a frame's planes
+ROUNDING = 1e-3
 CHECK = "simrun check policy finds all faults of a policy"
 TRACEBACK = "Correct that line; --debug, and output.log of a rollout, have the traceback."
 
@@ -70,9 +72,14 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
         )
     if (frame.t_us, frame.camera) != (request.t_us, request.camera.name):
         return f"the frame is stamped {frame.camera!r} at {frame.t_us} us"
-    for label, plane in (("alpha", frame.alpha), ("depth", frame.depth)):
-        if plane is not None and (plane.shape != wanted[:2] or not np.isfinite(plane).all()):
-            return f"{label} has shape {plane.shape} or is not finite"
+    for label, plane, high in (("alpha", frame.alpha, ALPHA), ("depth", frame.depth, DEPTH_M)):
+        if plane is None:
+            continue
+        shape, dtype = getattr(plane, "shape", None), getattr(plane, "dtype", None)
+        if shape != wanted[:2] or np.dtype(dtype).kind != "f":
+            return f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {wanted[:2]}"
+        if not (plane.min() >= -ROUNDING and plane.max() <= high + ROUNDING):
+            return f"{label} is not finite, or not between 0 and {high:g}"
     return ""
 
 

@@ -74,7 +74,7 @@ def hardware() -> dict[str, Any]:
 
 def _cpu_name() -> str:
     info = Path("/proc/cpuinfo")
-    if info.exists():
+    if os.path.exists(info):
         for line in info.open(encoding="utf-8"):
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()

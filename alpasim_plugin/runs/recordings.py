@@ -20,7 +20,7 @@ from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.core.reading import read_json
+from alpasim_plugin.core.reading import read_json, real
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
@@ -180,7 +180,7 @@ def _label(name: str, taken: Sequence[str]) -> str:
 def _facts(run: Run, cell: WatchedCell) -> dict[str, str]:
     """Return where the recording comes from."""
     facts = {
-        "run": run.folder.resolve().name,
+        "run": real(run.folder).name,
         "key": run.info.get("key"),
         "scene": cell.scene,
         "policy": cell.policy,

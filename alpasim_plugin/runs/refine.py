@@ -8,6 +8,7 @@ what is made of it.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
@@ -24,7 +25,7 @@ import numpy as np
 from alpasim_plugin.core.atomic import atomic_folder, write_bytes
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.core.reading import natural_order
+from alpasim_plugin.core.reading import natural_order, real
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
@@ -248,7 +249,7 @@ def refine_video(
     with ExitStack() as stack:
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
-            readers[role] = PictureFolderReader(path) if path.is_dir() else VideoReader(path)
+            readers[role] = PictureFolderReader(path) if os.path.isdir(path) else VideoReader(path)
             stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
@@ -301,28 +302,30 @@ def check_names(files: RefineFiles) -> None:
     Raises:
         InputError: Naming the option.
     """
-    resolved = {path.resolve(): role for role, path in files.inputs.items()}
+    resolved = {real(path): role for role, path in files.inputs.items()}
     for role, path in files.results.items():
-        taken = resolved.get(path.resolve())
+        taken = resolved.get(real(path))
         if taken is not None:
             raise InputError(
                 f"{path}: the {role} would be written over the {taken}",
                 "give the result a name of its own",
             )
-        resolved[path.resolve()] = role
-        if not path.parent.is_dir():
+        resolved[real(path)] = role
+        if not os.path.isdir(path.parent):
             raise InputError(f"{path}: no folder {path.parent}", "make it first")
         if path.suffix.lower() not in ("", ".mp4"):
             raise InputError(
                 f"{path}: suffix {path.suffix!r} of the {role}",
                 "results are MP4 files or folders of PNG: name it .mp4, or without a suffix",
             )
-        if path.is_dir() and (path.suffix or any(file.suffix != ".png" for file in path.iterdir())):
+        if os.path.isdir(path) and (
+            path.suffix or any(file.suffix != ".png" for file in path.iterdir())
+        ):
             raise InputError(
                 f"{path}: the {role} is a folder with other things than pictures",
                 "name a new folder or file",
             )
-        if path.exists() and not files.overwrite:
+        if os.path.exists(path) and not files.overwrite:
             raise InputError(
                 f"{path}: the {role} exists already",
                 "choose another name, or pass --overwrite",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +16,7 @@ from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
@@ -190,7 +192,7 @@ def finish_run(
     if tuple(folders) != cells_of_run(info):
         info["rollouts"] = folders
     write_run_json(root, info)
-    REMADE.pop(root.resolve(), None)
+    REMADE.pop(real(root), None)
     summary = summary_of_run(root, info, manifests)
     from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
 
@@ -231,7 +233,7 @@ def claim(
         What ``run.json`` said before; empty for a new folder, or where it was damaged.
     """
     held: dict[str, Any] = {}
-    if (root / RUN_INFO).exists():
+    if os.path.exists(root / RUN_INFO):
         try:
             held = read_run_json(root)
         except InputError as error:

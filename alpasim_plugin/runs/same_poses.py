@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def store_same_poses(
     for manifest in failures[:MOST_FAILURES] if len(plan.renderers) > 1 else ():
         cell = cells[manifest["path"]]
         path = root / cell.folder / SAME_POSES
-        if path.exists():
+        if os.path.exists(path):
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
         failed_us = int((first_failure(manifest) or {})["t_us"])

@@ -12,7 +12,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading import file_sha256, real
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
@@ -83,7 +83,7 @@ def execute_score(
         "preset": preset.as_dict(),
     }
     key = digest(facts)[:12]
-    root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
+    root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
         _check_key(root, key)
         (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished

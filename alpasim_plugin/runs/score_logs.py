@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -54,24 +55,32 @@ def find_logs(items: Sequence[str]) -> list[Path]:
     found: dict[Path, Path] = {}
     for item in items:
         path = Path(item)
-        paths = [path] if path.is_file() else sorted(path.rglob("*.asl")) if path.is_dir() else []
+        paths = (
+            [path]
+            if os.path.isfile(path)
+            else sorted(path.rglob("*.asl"))
+            if os.path.isdir(path)
+            else []
+        )
         if not paths and glob.has_magic(item):
             hits = [Path(hit) for hit in sorted(glob.glob(item, recursive=True))]
             paths = [
                 log
                 for hit in hits
-                for log in ([hit] if hit.is_file() else sorted(hit.rglob("*.asl")))
+                for log in ([hit] if os.path.isfile(hit) else sorted(hit.rglob("*.asl")))
             ]
         if not paths:
             what = (
-                "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
+                "a folder without .asl logs"
+                if os.path.isdir(path)
+                else "no such file, folder or match"
             )
             raise InputError(
                 f"{item}: {what}",
                 "give rollout.asl files, folders that hold them, or a pattern in quotes",
             )
         for log in paths:
-            found.setdefault(log.resolve(), log)
+            found.setdefault(real(log), log)
     return list(found.values())
 
 
@@ -113,7 +122,7 @@ def _score(
     taken: set[str],
     names: set[str],
 ) -> LogScore:
-    name = log.resolve().parent.name
+    name = real(log).parent.name
     manifest: dict[str, Any] = {
         "renderer": UNKNOWN,
         "policy": UNKNOWN,
@@ -149,7 +158,7 @@ def _score(
     # A wrong --scene is an error of the command, not of the log.
     scene = scenes.of(rollout.scene_id).scene
     cameras = {image.camera for image in rollout.images}
-    if (log.parent / MANIFEST).exists() and preset.image_camera not in cameras:
+    if os.path.exists(log.parent / MANIFEST) and preset.image_camera not in cameras:
         preset = replace(preset, image_camera=None)  # our runs name their cameras as they like
     try:
         check_complete(log, rollout)
@@ -173,7 +182,7 @@ def check_vouched(log: Path) -> None:
     Raises:
         InputError: The log is damaged, or another one.
     """
-    if log.name != LOG_NAME or not (log.parent / MANIFEST).exists():
+    if log.name != LOG_NAME or not os.path.exists(log.parent / MANIFEST):
         return
     try:
         facts = read_manifest(log.parent)["files"].get(LOG_NAME)
@@ -182,7 +191,7 @@ def check_vouched(log: Path) -> None:
         problem = f"its {MANIFEST} is damaged: {error.message}"
     if problem is not None:
         run = next(
-            (folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None
+            (folder for folder in real(log).parents if os.path.exists(folder / RUN_INFO)), None
         )
         raise InputError(
             f"{log}: {problem}",
@@ -236,9 +245,9 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
     Raises:
         InputError: The file is invalid.
     """
-    for folder in list(log.resolve().parents)[:5]:
+    for folder in list(real(log).parents)[:5]:
         path = folder / "run_metadata.yaml"
-        if path.is_file():
+        if os.path.isfile(path):
             data = load_yaml(path).data
             uuid, name = (
                 data.get(key) if isinstance(data, dict) else None
@@ -313,7 +322,7 @@ class KnownScenes:
                     continue
                 scene_id = usdz_scene_id(Path(path))
                 before = self._archives.setdefault(scene_id, Path(path))
-                if before.resolve() != Path(path).resolve():
+                if real(before) != real(Path(path)):
                     raise InputError(
                         f"{before} and {path}: both have the id {scene_id!r}", "Remove one of them."
                     )
@@ -365,7 +374,7 @@ class KnownScenes:
 def _scene_files(place: str) -> list[str]:
     """Return the scene files of a path, a folder or a shipped name."""
     path = Path(place)
-    archives = sorted(path.rglob("*.usdz")) if path.is_dir() else []
+    archives = sorted(path.rglob("*.usdz")) if os.path.isdir(path) else []
     if archives:
         return [str(one) for one in archives]
     return [ref.path for ref in load_suite(place)]

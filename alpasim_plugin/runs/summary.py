@@ -4,6 +4,7 @@ manifests and tables.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
@@ -199,7 +201,7 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
             metric is another one in another run; a folder is named twice; no run has the baseline.
     """
     for number, run in enumerate(runs):
-        if run.resolve() in {other.resolve() for other in runs[:number]}:
+        if real(run) in {real(other) for other in runs[:number]}:
             raise InputError(f"{run}: named twice", "Name every run once.")
     infos = {run: _info_of(run) for run in runs}
     _check_alike(infos)
@@ -244,7 +246,7 @@ def _info_of(run: Path) -> dict[str, Any]:
         InputError: The run is not finished, or damaged.
     """
     info = read_run_json(run)
-    if not table_path(run, SUMMARY).is_file():
+    if not os.path.isfile(table_path(run, SUMMARY)):
         raise InputError(f"The run {run} is not finished.", AGAIN)
     ROLLOUTS_TABLE.check(table_path(run, ROLLOUTS), AGAIN, MetricTable.of_run(info).rates)
     return info

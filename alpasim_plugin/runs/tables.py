@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import parsing, read_json_as
+from alpasim_plugin.core.reading import parsing, read_json_as, real
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
@@ -36,7 +36,7 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     Raises:
         InputError: A table is missing or damaged, and so is a rollout.
     """
-    REMADE.pop(root.resolve(), None)
+    REMADE.pop(real(root), None)
     try:
         read_json_as(Summary, root / SUMMARY)
         ROLLOUTS_TABLE.check(root / ROLLOUTS)
@@ -59,7 +59,7 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     folder = TemporaryDirectory(prefix="simrun-tables-")
     with parsing(root, AGAIN, "manifests from which no table can be made"):
         summary_of_run(root, info, run.manifests, Path(folder.name))
-    REMADE[root.resolve()] = folder
+    REMADE[real(root)] = folder
 
 
 def again(info: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.escape import xml as clean
-from alpasim_plugin.core.reading import exists, read_text
+from alpasim_plugin.core.reading import read_text, real
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
@@ -187,7 +187,7 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
     }
     root = ET.Element("testsuites", {"name": "simrun", **counts})
     asked = run.info.get("asked") or []  # what the command named, if that was one thing
-    name = str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
+    name = str(asked[0]) if len(asked) == 1 else real(run.folder).name
     suite = ET.SubElement(root, "testsuite", {"name": clean(name), **counts})
     if run.info.get("started_at"):
         suite.set("timestamp", clean(str(run.info["started_at"])))
@@ -293,7 +293,7 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) ->
     write_text(page, cut(text))
     tests = _write_xml(folder / "gate.junit.xml", gate_junit(verdict, gate, run))
     append_job_summary(text)
-    if folder.resolve() != run.folder.resolve():
+    if real(folder) != real(run.folder):
         return [page, tests]
     return [page, tests, write_gate(run, verdict, gate)]
 
@@ -306,7 +306,7 @@ def append_job_summary(text: str) -> Path | None:
     if not named:
         return None
     path = Path(named)
-    before = read_text(path) if exists(path) else ""
+    before = read_text(path) if os.path.exists(path) else ""
     before = before.rstrip("\n") + "\n\n" if before else ""
     room = MAX_BYTES - len(before.encode())
     if room > len(CUT_NOTE):

@@ -4,6 +4,7 @@ report: baseline, every check, the worst scenes first.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def gate_section(run: Run) -> dict[str, Any] | None:
         InputError: gate.json is damaged.
     """
     path = run.folder / GATE_NAME
-    if not path.is_file():
+    if not os.path.isfile(path):
         return None
     stored = read_json(path)
     if stored["of"] != _content(run):

@@ -19,6 +19,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import WHY_NAME
 from evaluators.metrics.outcomes import (
@@ -229,7 +230,7 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> list[int]:
             names[parent] = frozenset()
             path = run.folder / parent
             if (
-                parent and path.is_dir() and path.resolve().is_relative_to(run.folder.resolve())
+                parent and os.path.isdir(path) and real(path).is_relative_to(real(run.folder))
             ):  # links may lead out of the run
                 with os.scandir(path) as found:
                     names[parent] = frozenset(
@@ -237,12 +238,12 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> list[int]:
                     )
         if leaf in names[parent]:
             state |= HAS_FOLDER | (
-                HAS_CLIP if has_clips and (run.folder / parent / leaf / CLIP).is_file() else 0
+                HAS_CLIP if has_clips and os.path.isfile(run.folder / parent / leaf / CLIP) else 0
             )
             state |= (
                 HAS_WHY
                 if state & (COLLIDED | OTHERWISE)
-                and (run.folder / parent / leaf / WHY_NAME).is_file()
+                and os.path.isfile(run.folder / parent / leaf / WHY_NAME)
                 else 0
             )
         states.append(state)

@@ -187,7 +187,7 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
     """
     found: dict[tuple[int, int], Path] = {}
     for root in roots:
-        if not root.is_dir():
+        if not os.path.isdir(root):
             raise InputError(
                 f"{root}: not a folder",
                 "name the folder that holds the run folders; simrun run writes them below runs/",
@@ -220,7 +220,7 @@ def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
         yield folder
         return
     for entry in entries:
-        if not entry.name.startswith(".") and entry.name not in SKIPPED and entry.is_dir():
+        if not entry.name.startswith(".") and entry.name not in SKIPPED and os.path.isdir(entry):
             yield from _run_folders(Path(entry.path), seen)
 
 

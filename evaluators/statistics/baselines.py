@@ -4,6 +4,7 @@ differs.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -155,7 +156,7 @@ def read_baseline(path: Path) -> Baseline:
     Raises:
         InputError: Missing, not JSON, or not a baseline of this version.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         return baseline_of(read_run(path))
     content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
     names = set(Baseline.__dataclass_fields__)

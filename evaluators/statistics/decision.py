@@ -15,6 +15,7 @@ Bonferroni does. All metrics are non-inferior if each is (intersection-union tes
 from __future__ import annotations
 
 import math
+import os
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -478,7 +479,7 @@ def read_decision(root: Path) -> Decision | None:
         InputError: It is damaged.
     """
     path = root / DECISION
-    if not path.exists():
+    if not os.path.exists(path):
         return None
     return read_json_as(Decision, path, do_this=AGAIN)
 

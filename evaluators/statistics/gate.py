@@ -131,9 +131,9 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
             column.
     """
     path = Path(path_or_name)
-    if not path.is_file():
+    if not os.path.isfile(path):
         path = LIBRARY / f"{path_or_name}.yaml"
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(
             f"{path_or_name}: no such file",
             f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",

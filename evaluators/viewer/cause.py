@@ -18,7 +18,7 @@ from markupsafe import Markup
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
-from alpasim_plugin.core.reading import inside, read_bytes
+from alpasim_plugin.core.reading import inside, read_bytes, real
 from alpasim_plugin.core.types import F64, U8, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
@@ -343,7 +343,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
         renderers=[name for name in names if name != rollout.renderer],
         has_images=bool(names),
         partings=[_parting(one, cause.start_us) for one in cause.partings],
-        run=run.folder.resolve().name,
+        run=real(run.folder).name,
         report=report,
         failed_s=None if cause.failed_us is None else (cause.failed_us - cause.start_us) * 1e-6,
     )

@@ -7,6 +7,7 @@ Changed outcomes come first, then events, then a few quiet ones, the most differ
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.rows import Rollout
@@ -257,7 +259,7 @@ def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
         )  # as it was named to simrun score, so from the same working directory
         path = None if stated is None else Path(str(stated))
     try:
-        return read_log(path) if path is not None and path.is_file() else None
+        return read_log(path) if path is not None and os.path.isfile(path) else None
     except SimrunError as error:
         return error  # the page says so in this rollout's place; the others are still shown
 
@@ -266,7 +268,7 @@ def read_log(path: Path) -> RolloutLog:
     """Read a log, or return what was read of it a moment ago: flips share their baseline's, and
     pages show what flips were found in.
     """
-    return _log_as_of(path, path.stat().st_mtime_ns if path.exists() else 0)
+    return _log_as_of(path, path.stat().st_mtime_ns if os.path.exists(path) else 0)
 
 
 @lru_cache(maxsize=6)  # two cells behind three renderers
@@ -407,7 +409,7 @@ def index_data(
             }
         )
     return {
-        "run": run.folder.resolve().name,
+        "run": real(run.folder).name,
         "renderers": run.policies if any(cell.by_policy for cell in cells) else run.renderers,
         "baseline": bases[0] if bases else baseline_of(run),
         "first_curves": run.table.first_curves(),

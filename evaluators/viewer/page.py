@@ -7,6 +7,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.reader import reporting
 from evaluators.opening import Run, read_run
 from evaluators.report.flips import FlipKey
@@ -107,7 +109,7 @@ def write_page(
             f"{run.folder}: no finished rollout that was asked for",
             "Ask for others; simrun report lists failures.",
         )
-    is_beside = path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file()
+    is_beside = real(path).parent == real(run.folder) and os.path.isfile(run.folder / REPORT)
     with reporting(run):
         shown = shown_by_default(cells, wanted)
         page = make_page(run, cells, shown, max_bytes, report=REPORT if is_beside else "")

@@ -5,6 +5,7 @@ A fixer behind a service is a pure step from a past and a render to a frame and 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -270,14 +271,14 @@ def sources_in(place: str | Path) -> list[str | Path]:
         InputError: A folder without a scene.
     """
     folder = Path(place)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         return [place]
     files: list[str | Path] = [
-        path for path in sorted(folder.iterdir()) if path.suffix in FILES and path.is_file()
+        path for path in sorted(folder.iterdir()) if path.suffix in FILES and os.path.isfile(path)
     ]
     if files:
         return files
-    logs: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    logs: list[str | Path] = [path for path in sorted(folder.iterdir()) if os.path.isdir(path)]
     if not logs:
         raise InputError(
             f"{place}: no {', '.join(FILES)} and no recorded log",

@@ -20,7 +20,6 @@ from __future__ import annotations
 from alpasim_plugin.core.reading.files import (
     check_regular,
     contents,
-    exists,
     file_sha256,
     inside,
     natural_order,
@@ -39,7 +38,6 @@ from alpasim_plugin.core.reading.files import (
 __all__ = [
     "check_regular",
     "contents",
-    "exists",
     "file_sha256",
     "inside",
     "natural_order",

@@ -98,21 +98,10 @@ def some_of(names: Sequence[str], most: int = 5) -> str:
 
 def contents(path: Path) -> str:
     """Say what a path is, for messages: a file, or a folder with its first names."""
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return "a file"
     names = sorted((one.name for one in path.iterdir()), key=natural_order)
     return f"a folder with {some_of(names) or 'nothing'}"
-
-
-def exists(path: Path | str) -> bool:
-    """Return whether something is at a path; a name that no file can have (too long, a null
-    character) is at none.
-    """
-    try:
-        os.stat(path)
-    except (OSError, ValueError):
-        return False
-    return True
 
 
 def real(path: Path | str) -> Path:
@@ -127,7 +116,7 @@ def inside(folder: Path, name: str) -> Path | None:
     it leads out of the folder.
     """
     path = folder / name
-    return path if exists(path) and real(path).is_relative_to(real(folder)) else None
+    return path if os.path.exists(path) and real(path).is_relative_to(real(folder)) else None
 
 
 def check_regular(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_PATH) -> None:

@@ -9,6 +9,7 @@ are shared by palette. Axes are those of a PLY.
 from __future__ import annotations
 
 import io
+import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +65,7 @@ KNOWN = {*_Meta.__annotations__, "shN", "asset", "antialias", "model"}  # keys o
 def is_sog(path: Path) -> bool:
     """Return whether a path is a folder with SOG's ``meta.json``, that file, or a zip."""
     return (
-        (path.is_dir() and (path / META).is_file())
+        (os.path.isdir(path) and os.path.isfile(path / META))
         or path.name == META
         or path.suffix.lower() == ".sog"
     )
@@ -76,8 +77,8 @@ def read_sog(path: Path) -> GaussianArrays:
     Raises:
         InputError: A plane is missing, damaged or too small; or another version.
     """
-    if path.is_dir() or path.name == META:
-        folder = path if path.is_dir() else path.parent
+    if os.path.isdir(path) or path.name == META:
+        folder = path if os.path.isdir(path) else path.parent
         return _read(lambda name: read_bytes(folder / Path(name).name, SOURCE_BYTES), folder / META)
     data = read_bytes(path, SOURCE_BYTES)
     with (

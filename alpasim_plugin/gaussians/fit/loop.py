@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -151,7 +152,7 @@ class SplatFit:
             {"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)},
             sort_keys=True,
         )
-        if folder is not None and (folder / STATE_FILE).exists():
+        if folder is not None and os.path.exists(folder / STATE_FILE):
             self._load(folder / STATE_FILE)
 
     def update(self) -> dict[str, float]:

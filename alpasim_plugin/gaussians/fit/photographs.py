@@ -23,6 +23,7 @@ names points to start from: a binary PLY with x, y, z and, if coloured, red, gre
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -185,11 +186,11 @@ def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], t
     Raises:
         InputError: Fewer than two exist.
     """
-    there = [picture for picture in pictures if picture.file.is_file()]
+    there = [picture for picture in pictures if os.path.isfile(picture.file)]
     missing = tuple(
         picture.file.as_posix().removeprefix(f"{folder.as_posix()}/")
         for picture in pictures
-        if not picture.file.is_file()
+        if not os.path.isfile(picture.file)
     )
     if len(there) < 2:
         found = f"{folder}: {len(there)} of {len(pictures)} listed images exist"
@@ -284,7 +285,7 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
     try:
         size = (
             (frame["w"], frame["h"])
-            if "w" in frame or not file.is_file()
+            if "w" in frame or not os.path.isfile(file)
             else check_image(read_bytes(file, SOURCE_BYTES), file)
         )
         width, height = int(size[0]), int(size[1])
@@ -359,8 +360,8 @@ def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     if not isinstance(name, str):
         raise InputError(f"{where}, {key}: {name!r}", "name a file, relative to the folder")
     path = folder / name
-    if (
-        not path.suffix and (folder / f"{name}.png").is_file()
+    if not path.suffix and os.path.isfile(
+        folder / f"{name}.png"
     ):  # NeRF's own scenes leave the ending out
         return folder / f"{name}.png"
     return path

@@ -10,6 +10,7 @@ ones that were seen.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +97,7 @@ class Reconstruction:
             InputError: The folder holds no finished reconstruction.
         """
         path = folder / INDEX_FILE
-        if not path.exists():
+        if not os.path.exists(path):
             raise InputError(
                 f"{folder}: no {INDEX_FILE}",
                 "make it with 'simrun import drive FOLDER -o OUT'",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -47,7 +48,7 @@ def inspect_run(root: Path, full: bool = False) -> Inspection:
         InputError: The folder holds no run, or its ``run.json`` is damaged.
     """
     cells = cells_of_run(read_run_json(root))
-    if not (root / ROLLOUTS_FOLDER).exists():
+    if not os.path.exists(root / ROLLOUTS_FOLDER):
         return Inspection(cells, (), (), (), tables_only=True)
     manifests = []
     damage: list[Damage] = []

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import exists, file_sha256
+from alpasim_plugin.core.reading import file_sha256
 
 
 class FileFacts(TypedDict):
@@ -45,7 +45,7 @@ def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:
         facts: What was stated of it when it was written.
         full: Read its content even if size and time are as stated.
     """
-    if not exists(path):
+    if not os.path.exists(path):
         return "missing"
     if not os.path.isfile(path):
         return "not a file"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +119,7 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
         full: Read every file, even where size and time are as stated.
     """
     folder = root / cell
-    if not (folder / MANIFEST).exists():
+    if not os.path.exists(folder / MANIFEST):
         return RolloutState(None)
     try:
         manifest = read_manifest(folder)

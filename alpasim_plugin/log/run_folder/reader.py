@@ -20,7 +20,14 @@ import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import inside, parsing, read_bytes, read_json_as, read_json_object
+from alpasim_plugin.core.reading import (
+    inside,
+    parsing,
+    read_bytes,
+    read_json_as,
+    read_json_object,
+    real,
+)
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
@@ -50,7 +57,7 @@ REMADE: dict[Path, TemporaryDirectory[str]] = {}  # run folder -> tables that we
 
 def table_path(root: Path, name: str) -> Path:
     """Return the file of a table of a run: in its folder, or where it was made again."""
-    remade = REMADE.get(root.resolve())
+    remade = REMADE.get(real(root))
     return root / name if remade is None else Path(remade.name, name)
 
 
@@ -186,7 +193,7 @@ class Run:
     def _read_steps(
         self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True
     ) -> pa.Table:
-        if not path.is_file():
+        if not os.path.isfile(path):
             return STEPS_TABLE.arrow().empty_table().select(list(columns))
         if path not in self._steps_checked:
             STEPS_TABLE.check(path)
@@ -253,7 +260,7 @@ def last_output(path: Path) -> list[str]:
     """Return the end of what a rollout printed, its traceback, and the name of the file; nothing
     where there is none.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         return []
     lines = read_bytes(path, SOURCE_BYTES).decode("utf-8", "replace").rstrip().splitlines()
     return [*(line.rstrip() for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
@@ -290,7 +297,7 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     Raises:
         InputError: It holds no run, or its description or its tables are damaged.
     """
-    if table_path(root, SUMMARY).exists():
+    if os.path.exists(table_path(root, SUMMARY)):
         run = read_run(root)
         return RunSoFar(run, len(run.rollouts), (), True)
     found = inspect_run(root)

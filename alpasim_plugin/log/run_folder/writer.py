@@ -88,7 +88,7 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
             path = here / name
             if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
                 continue
-            if path.is_dir() and not path.is_symlink():
+            if os.path.isdir(path) and not os.path.islink(path):
                 shutil.rmtree(path)
                 folders.remove(name)
             else:

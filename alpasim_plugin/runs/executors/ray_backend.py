@@ -27,7 +27,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunEr
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
-from alpasim_plugin.core.reading import exists, file_sha256, read_bytes
+from alpasim_plugin.core.reading import file_sha256, read_bytes
 from alpasim_plugin.core.subprocesses import own_path_only
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
@@ -245,7 +245,7 @@ def read_rollout(folder: Path, node: str) -> DrivenRollout:
     """Read the folder of a rollout that was just driven; of a failed one what its parts printed."""
     manifest = read_manifest(folder)
     names = [*manifest["files"]] or [OUTPUT_NAME]
-    files = {name: read_bytes(folder / name) for name in names if exists(folder / name)}
+    files = {name: read_bytes(folder / name) for name in names if os.path.exists(folder / name)}
     return DrivenRollout({"node": node, **manifest}, files)
 
 

@@ -1,0 +1,87 @@
+"""What a renderer or a policy returns against its contract is that part's failure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import PolicyError, RendererError
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.plan_check import plan_problem
+from alpasim_plugin.core.types import Frame, Plan, RenderRequest
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.runs.cameras import recorded_requests
+from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.rollout import run_rollout
+from policies.simple import ConstantVelocity
+from scenarios.load import load_scenario
+
+SCENE = load_scenario("smoke/straight")
+REQUEST = recorded_requests(SCENE, SCENE.start_us)[0]
+SHAPE = (REQUEST.camera.height, REQUEST.camera.width)
+GOOD = Frame(REQUEST.t_us, REQUEST.camera.name, np.full((*SHAPE, 3), 9, np.uint8))
+
+
+class Returns(Renderer):
+    def render(self, request: RenderRequest) -> Frame:
+        raise NotImplementedError
+
+    def __init__(self, frame: Any) -> None:
+        self.frame = frame
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
+        return [self.frame for _ in requests]
+
+
+def plane(value: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    return np.full(SHAPE, value, np.float32)
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"rgb": None},
+        {"rgb": GOOD.rgb.astype(float)},
+        {"alpha": plane(5.0)},
+        {"alpha": plane(-0.5)},
+        {"alpha": "opaque"},
+        {"depth": plane(-1e30)},
+        {"depth": plane(1e30)},
+        {"depth": plane(np.nan)},
+        {"depth": plane(1.0).T},
+        {"t_us": None},
+    ],
+    ids=str,
+)
+def test_a_frame_against_the_contract_is_the_renderers_failure(members: dict[str, Any]) -> None:
+    with pytest.raises(RendererError):
+        checked_frames(Returns(replace(GOOD, **members)), [REQUEST])
+
+
+@pytest.mark.parametrize("frame", [None, GOOD.rgb, "frame"], ids=["nothing", "array", "text"])
+def test_what_is_no_frame_is_the_renderers_failure(frame: Any) -> None:
+    with pytest.raises(RendererError):
+        checked_frames(Returns(frame), [REQUEST])
+
+
+def test_a_frame_within_rounding_is_taken() -> None:
+    frame = replace(GOOD, alpha=plane(1.0 + 1e-6), depth=plane(0.0))
+    assert checked_frames(Returns(frame), [REQUEST]) == [frame]
+
+
+class Far(ConstantVelocity):
+    def act(self, observation: Any) -> Plan:
+        plan = super().act(observation)
+        return replace(plan, xy=plan.xy * 1e30)
+
+
+def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure() -> None:
+    with pytest.raises(PolicyError):
+        run_rollout(SCENE, make_renderer("clean", SCENE), Far())
+    times_us = np.array([0, 1], np.int64)
+    samples = (np.full((2, 3), 1e30),)
+    assert plan_problem(Plan(times_us, np.zeros((2, 2)), np.zeros(2), samples=samples), 0)
