@@ -251,7 +251,7 @@ def with_verb(args: list[str]) -> list[str]:
             f"simrun {args[0]}: the verb is not installed",
             LABORATORY,
         )
-    if re.fullmatch(r"[\w-]+", args[0]) and args[0][0] != "-" and not Path(args[0]).exists():
+    if re.fullmatch(r"[\w-]+", args[0]) and args[0][0] != "-" and not os.path.exists(Path(args[0])):
         near = difflib.get_close_matches(args[0].lower(), verbs(), 1, 0.7)
         guess = f"Type 'simrun {near[0]}'; the" if near else "The"
         if near or len(args) == 1:

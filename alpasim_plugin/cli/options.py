@@ -256,7 +256,7 @@ def run_or_newest(run: Path | None) -> Path:
         InputError: What was named is no run folder, or none was named and there is none.
     """
     if run is not None:
-        if (run / RUN_INFO).exists():
+        if os.path.exists(run / RUN_INFO):
             return run
         raise InputError(f"{run}: not a run folder", "Name one that 'simrun list runs' shows.")
     infos = [*Path("runs").glob(f"*/{RUN_INFO}"), *Path("runs").glob(f"*/*/{RUN_INFO}")]
@@ -264,7 +264,7 @@ def run_or_newest(run: Path | None) -> Path:
         raise InputError("runs/: no run folder below it", "Name a run folder, or drive one first.")
 
     def age(path: Path) -> tuple[bool, int]:
-        return path.with_name(SUMMARY).exists(), path.stat().st_mtime_ns
+        return os.path.exists(path.with_name(SUMMARY)), path.stat().st_mtime_ns
 
     return max(infos, key=age).parent
 
@@ -277,7 +277,7 @@ def run_and_cell(path: Path | None) -> tuple[Path, str]:
     Raises:
         InputError: No run folder is at or above the path.
     """
-    is_newest = path is None or (path == Path() and not Path(RUN_INFO).exists())
+    is_newest = path is None or (path == Path() and not os.path.exists(Path(RUN_INFO)))
     folder = run_or_newest(None) if is_newest or path is None else path
     for root in (folder, *folder.parents):
         if os.path.exists(root / RUN_INFO):

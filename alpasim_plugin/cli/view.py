@@ -71,7 +71,7 @@ def view(
     """
     refuse_existing(out, "--out")
     path = run_or_newest(None) if what is None else Path(what)
-    if not any((folder / RUN_INFO).exists() for folder in (path, *path.parents)):
+    if not any(os.path.exists(folder / RUN_INFO) for folder in (path, *path.parents)):
         _view_scenario(str(what), asked, overrides, out, as_json)
         return
     root, cell = run_and_cell(path)

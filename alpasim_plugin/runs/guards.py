@@ -77,7 +77,9 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
             continue
         shape, dtype = getattr(plane, "shape", None), getattr(plane, "dtype", None)
         if shape != wanted[:2] or np.dtype(dtype).kind != "f":
-            return f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {wanted[:2]}"
+            return (
+                f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {wanted[:2]}"
+            )
         if not (plane.min() >= -ROUNDING and plane.max() <= high + ROUNDING):
             return f"{label} is not finite, or not between 0 and {high:g}"
     return ""

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import os
 import re
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -91,7 +92,7 @@ def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
 
 def _classless(kind: str, file: Path) -> InputError:
     """Return the error for a file without a class: it names the classes of the file, unrun."""
-    if not file.is_file():
+    if not os.path.isfile(file):
         return InputError(f"{file}: no such file", f"Name FILE.py:Class of a {kind}.")
     classes = classes_of(file)
     if not classes:
