@@ -19,7 +19,7 @@ from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.parts import names as part_names
-from alpasim_plugin.core.reading import read_text
+from alpasim_plugin.core.reading import read_text, real
 from scenarios.schema_parts import Part, within
 from scenarios.sources import import_advice, source_of
 

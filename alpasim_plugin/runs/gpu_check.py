@@ -21,6 +21,7 @@ import numpy as np
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
@@ -188,4 +189,4 @@ def _streaming(device: str, width: int, height: int) -> Callable[[], Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(SECTIONS[sys.argv[1]](sys.argv[2])))
+    say(json.dumps(SECTIONS[sys.argv[1]](sys.argv[2])))
