@@ -71,7 +71,10 @@ def serve(
         tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")
     ] = (),
     device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu",
-    history_mb: Annotated[int, Flag("Most memory of the histories, MiB.", min=16)] = 2048,
+    history_mb: Annotated[
+        int,
+        Flag("Most memory of what callers leave: histories, or images of sessions, MiB.", min=16),
+    ] = 2048,
     mask: Annotated[
         tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")
     ] = (),
@@ -98,7 +101,12 @@ def serve(
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s")
     if policy is not None:
         _serve_policy(
-            policy, listen or os.environ.get(ADDRESS, DRIVER_ADDRESS), scenes, host_policy, as_json
+            policy,
+            listen or os.environ.get(ADDRESS, DRIVER_ADDRESS),
+            scenes,
+            host_policy,
+            history_mb * MIB,
+            as_json,
         )
         return
     masks = dict(parted(item, "--mask") for item in mask)
@@ -140,7 +148,12 @@ def serve(
 
 
 def _serve_policy(
-    policy: str, listen: str, scenes: Sequence[str], host_policy: HostPolicy, as_json: bool
+    policy: str,
+    listen: str,
+    scenes: Sequence[str],
+    host_policy: HostPolicy,
+    budget: int,
+    as_json: bool,
 ) -> None:
     spec = resolve("policy", policy)
 
@@ -149,12 +162,15 @@ def _serve_policy(
         return made
 
     finder = scenario_finder(scenes)
-    service = DriverService(spec.name, spec.digest, make, finder, host_policy.expiry_s)
+    service = DriverService(
+        spec.name, spec.digest, make, finder, host_policy.expiry_s, budget=budget
+    )
     host = Host({"EgodriverService": service}, listen, host_policy, every=service.sessions.expire)
     facts = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     text = f"serving EgodriverService at {host.address}: {policy}"
     _host(host, facts, text, host_policy, as_json)
     counts: dict[str, float] = dict(service.counts)
+    counts["sessions closed for room"] = len(service.sessions.crowded_out)
     if service.drives_s:
         for percent in (50, 95, 99):
             time_ms = float(np.percentile(service.drives_s, percent)) * 1000

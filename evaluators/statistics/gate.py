@@ -7,6 +7,7 @@ were drawn from (`evaluators.statistics.paired`).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

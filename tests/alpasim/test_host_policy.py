@@ -4,6 +4,7 @@ what they leave behind ends.
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,8 +21,8 @@ from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.caches import SceneCache
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService, _unknown_scene
 from alpasim_plugin.alpasim.server.frames import FrameServer
-from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
-from alpasim_plugin.alpasim.server.status import CallTime, Late
+from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy, Sessions
+from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
@@ -342,3 +343,24 @@ def test_times_that_no_rollout_has_are_the_callers_fault() -> None:
         assert stub.drive(
             egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=2)
         ).trajectory.poses
+
+
+def test_one_budget_of_bytes_closes_the_sessions_that_nobody_used_for_longest() -> None:
+    clock = itertools.count()
+    sessions: Sessions[str] = Sessions(budget=100, clock=lambda: float(next(clock)))
+    for name in "abc":
+        sessions.open(name, name)
+    sessions.hold("a", 40)
+    sessions.hold("b", 40)
+    sessions.get("a")
+    sessions.hold("c", 40)
+    with pytest.raises(Full):
+        sessions.get("b")
+    assert sessions.get("a") == "a"
+    with pytest.raises(Full), sessions.working("a", 30):
+        pass
+    with sessions.working("a", 20):
+        assert sessions.held == 100
+    with pytest.raises(Full):
+        sessions.hold("a", 101)
+    assert sessions.held == 0

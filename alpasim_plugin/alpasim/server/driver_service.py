@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.server.hosting import SESSIONS, Host, Sessions
+from alpasim_plugin.alpasim.server.hosting import SESSION_BYTES, SESSIONS, Host, Sessions
 from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.alpasim.server.views import MAX_TIME_US, Straight, straight_of
 from alpasim_plugin.core.errors import InputError, PolicyError
@@ -34,6 +34,7 @@ from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading.images import check_image, picture_fault
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -69,6 +70,7 @@ class DriverService:
         scenario_of: Returns what a policy is made for, by scene id.
         expiry_s: A session that nobody used for so long is closed.
         most_sessions: How many may be open at a time.
+        budget: Bytes that all sessions together may keep and work on.
         clock: Monotonic seconds.
 
     Attributes:
@@ -86,10 +88,13 @@ class DriverService:
         expiry_s: float = 900.0,
         most_sessions: int = SESSIONS,
         clock: Callable[[], float] = time.monotonic,
+        budget: int = SESSION_BYTES,
     ) -> None:
         self._name, self._digest = name, digest
         self._make, self._scenario_of = make, scenario_of
-        self.sessions: Sessions[Driving] = Sessions(expiry_s, most_sessions, Driving.close, clock)
+        self.sessions: Sessions[Driving] = Sessions(
+            expiry_s, most_sessions, Driving.close, clock, budget
+        )
         self.drives_s: deque[float] = deque(maxlen=KEPT_TIMES)
         self.counts: Counter[str] = Counter()
 
@@ -128,7 +133,9 @@ class DriverService:
         self, request: egodriver_pb2.RolloutCameraImage, context: Any
     ) -> common_pb2.Empty:
         """Take a frame."""
-        self._session(request.session_uuid).take_image(request.camera_image)
+        session = self.sessions.get(request.session_uuid)
+        session.take_image(request.camera_image)
+        self.sessions.hold(request.session_uuid, session.held)
         return common_pb2.Empty()
 
     @answering
@@ -136,13 +143,13 @@ class DriverService:
         self, request: egodriver_pb2.RolloutEgoTrajectory, context: Any
     ) -> common_pb2.Empty:
         """Take motion."""
-        self._session(request.session_uuid).take_motion(request)
+        self.sessions.get(request.session_uuid).take_motion(request)
         return common_pb2.Empty()
 
     @answering
     def submit_route(self, request: egodriver_pb2.RouteRequest, context: Any) -> common_pb2.Empty:
         """Take the route."""
-        self._session(request.session_uuid).take_route(request.route)
+        self.sessions.get(request.session_uuid).take_route(request.route)
         return common_pb2.Empty()
 
     @answering
@@ -150,7 +157,7 @@ class DriverService:
         self, request: egodriver_pb2.GroundTruthRequest, context: Any
     ) -> common_pb2.Empty:
         """Take no notice: a policy under test has no use for the recorded future."""
-        self._session(request.session_uuid)
+        self.sessions.get(request.session_uuid)
         return common_pb2.Empty()
 
     @answering
@@ -159,7 +166,9 @@ class DriverService:
     ) -> egodriver_pb2.DriveResponse:
         """Answer with a plan, or with an empty one while the policy lacks frames."""
         began = time.perf_counter()
-        answer = self._session(request.session_uuid).drive(int(request.time_now_us))
+        session = self.sessions.get(request.session_uuid)
+        with self.sessions.working(request.session_uuid, session.decoded):
+            answer = session.drive(int(request.time_now_us))
         self.counts["drive" if answer.trajectory.poses else "drive without a frame"] += 1
         self.drives_s.append(time.perf_counter() - began)
         return answer
@@ -168,19 +177,10 @@ class DriverService:
         """Count a failed call; called by `answering`."""
         self.counts[f"{call} {code.name}"] += 1
 
-    def _session(self, name: str) -> Driving:
-        session = self.sessions.get(name)
-        if session is None:
-            raise InputError(
-                f"session {name!r}: it is not open, or has expired",
-                "call start_session first",
-            )
-        return session
-
 
 class Driving:
-    """A session. What it keeps is bounded: the newest frame of each camera, and the newest
-    `MOST_POSES` of the motion.
+    """A session. What it keeps is bounded: the newest image of each camera, as it came, and the
+    newest `MOST_POSES` of the motion. Images are decoded when the policy is asked.
 
     Args:
         request: That opened it.
@@ -197,7 +197,7 @@ class Driving:
         self._seed, self._scenario, self._make = int(request.random_seed), scenario, make
         self._native = _native(request.rollout_spec.vehicle.available_cameras)
         self._lock = threading.Lock()
-        self._frames: dict[str, tuple[Frame, Straight]] = {}
+        self._images: dict[str, tuple[int, bytes]] = {}  # end of the exposure, encoded
         self._sizes: dict[str, tuple[int, int]] = {}
         self._history = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
         self._state: Any = None
@@ -206,7 +206,7 @@ class Driving:
         self._cameras: Mapping[str, CameraSpec] = {}
 
     def take_image(self, image: egodriver_pb2.RolloutCameraImage.CameraImage) -> None:
-        """Keep a camera's newest frame, as the pinhole sees it that policies compute with.
+        """Keep a camera's newest image.
 
         Raises:
             InputError: The session has no such camera, or it is no image, or one of another size
@@ -218,21 +218,43 @@ class Driving:
                 "send only the cameras of the session",
             )
         check_time(image.frame_end_us, "submit_image_observation")
-        rgb = decode_image(
-            image.image_bytes, f"camera {image.logical_id!r} at {image.frame_end_us} us"
-        )
-        height, width = rgb.shape[:2]
-        if (held := self._sizes.setdefault(image.logical_id, (width, height))) != (width, height):
-            raise InputError(
-                f"camera {image.logical_id!r}: {width} x {height} pixels after {held[0]} x {held[1]}",
-                "send all images of a camera in one size",
-            )
-        lens = straight_of(self._native[image.logical_id].intrinsics, width, height)
-        frame = Frame(int(image.frame_end_us), image.logical_id, lens.image(rgb))
+        where = f"camera {image.logical_id!r} at {image.frame_end_us} us"
+        size = check_image(image.image_bytes, where)
+        if fault := picture_fault(image.image_bytes):
+            raise InputError(f"{where}: {fault}", "give a whole PNG or JPEG image")
         with self._lock:
-            newest = self._frames.get(image.logical_id)
-            if newest is None or newest[0].t_us <= frame.t_us:
-                self._frames[image.logical_id] = frame, lens
+            if (held := self._sizes.setdefault(image.logical_id, size)) != size:
+                raise InputError(
+                    f"camera {image.logical_id!r}: {size[0]} x {size[1]} pixels after {held[0]} x {held[1]}",
+                    "send all images of a camera in one size",
+                )
+            newest_us, _ = self._images.get(image.logical_id, (-1, b""))
+            if newest_us <= image.frame_end_us:
+                self._images[image.logical_id] = int(image.frame_end_us), image.image_bytes
+
+    @property
+    def held(self) -> int:
+        """Give the bytes of the images that it keeps."""
+        with self._lock:
+            return sum(len(data) for _, data in self._images.values())
+
+    @property
+    def decoded(self) -> int:
+        """Give the bytes that a query takes: the images that the policy sees, and each once more as
+        its pinhole sees it.
+        """
+        with self._lock:
+            sizes = [self._sizes[name] for name in self._cameras or self._sizes]
+            return sum(2 * 3 * width * height for width, height in sizes)
+
+    def _frame(self, name: str) -> Frame:
+        """Return a camera's newest image as the pinhole sees it that policies compute with."""
+        t_us, data = self._images[name]
+        rgb = decode_image(data, f"camera {name!r} at {t_us} us")
+        return Frame(t_us, name, self._lens(name).image(rgb))
+
+    def _lens(self, name: str) -> Straight:
+        return straight_of(self._native[name].intrinsics, *self._sizes[name])
 
     def take_motion(self, message: egodriver_pb2.RolloutEgoTrajectory) -> None:
         """Append poses; those at or before the newest one are left out."""
@@ -269,13 +291,11 @@ class Driving:
         """
         check_time(now_us, "drive")
         with self._lock:
-            if not len(self._history) or len(self._frames) < len(self._native):
+            if not len(self._history) or len(self._images) < len(self._native):
                 return egodriver_pb2.DriveResponse()
             ego, history = self._ego(), self._history
             policy = self._policy = self._policy or self._started(ego)
-            shown = {
-                name: frame for name, (frame, _) in self._frames.items() if name in self._cameras
-            }
+            shown = {name: self._frame(name) for name in self._images if name in self._cameras}
             observation = Observation(
                 now_us,
                 shown,
@@ -305,10 +325,8 @@ class Driving:
         """
         cameras = []
         for name, camera in self._native.items():
-            lens, mounting = (
-                self._frames[name][1],
-                read_transform(camera.rig_to_camera, f"mounting of camera {name!r}"),
-            )
+            lens = self._lens(name)
+            mounting = read_transform(camera.rig_to_camera, f"mounting of camera {name!r}")
             cameras.append(CameraSpec(name, *lens.size, lens.K, mounting))
         known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
         route = Route(

@@ -11,8 +11,10 @@ import ipaddress
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +35,7 @@ CALLS = 512  # threads for calls that are worked on, wait for that, or send thei
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
 SESSIONS = 64  # sessions at a time
+SESSION_BYTES = 2 << 30  # that all sessions together keep and work on
 UPKEEP_S = 2.0
 S = TypeVar("S")
 log = logging.getLogger("simrun.serve")
@@ -114,14 +117,28 @@ def is_local(address: str) -> bool:
         return False
 
 
+@dataclass
+class _Open(Generic[S]):
+    """An open session, when it was used last, and the bytes that it keeps."""
+
+    session: S
+    used_s: float
+    held: int = 0
+
+
 class Sessions(Generic[S]):
-    """Open sessions by name: no more than a number of them, and none that nobody used for long.
+    """Open sessions by name: no more than a number of them, none that nobody used for long, and in
+    all no more bytes than a budget.
 
     Args:
         expiry_s: One unused for so long is closed.
         most: How many may be open at a time.
         close: Gives back what a session holds.
         clock: Monotonic seconds.
+        budget: Bytes that all sessions together may keep and work on.
+
+    Attributes:
+        crowded_out: The newest names of sessions that were closed to make room for others.
     """
 
     def __init__(
@@ -130,13 +147,22 @@ class Sessions(Generic[S]):
         most: int = SESSIONS,
         close: Callable[[S], None] = lambda session: None,
         clock: Callable[[], float] = time.monotonic,
+        budget: int = SESSION_BYTES,
     ) -> None:
         self._expiry_s, self._most, self._close, self._clock = expiry_s, most, close, clock
-        self._open: dict[str, tuple[S, float]] = {}
+        self._budget = budget
+        self._working = 0
+        self._open: dict[str, _Open[S]] = {}
         self._lock = threading.Lock()
+        self.crowded_out: deque[str] = deque(maxlen=1000)
 
     def __len__(self) -> int:
         return len(self._open)
+
+    @property
+    def held(self) -> int:
+        """Give the bytes that all sessions keep and work on."""
+        return self._working + sum(one.held for one in self._open.values())
 
     def open(self, name: str, session: S) -> None:
         """Enter a session.
@@ -154,32 +180,84 @@ class Sessions(Generic[S]):
                     f"session {name!r}: {self._most} sessions are open",
                     f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s",
                 )
-            self._open[name] = session, self._clock()
+            self._open[name] = _Open(session, self._clock())
 
-    def get(self, name: str) -> S | None:
-        """Return a session, which is used by that; None if it is not open."""
+    def get(self, name: str) -> S:
+        """Return a session, which is used by that.
+
+        Raises:
+            InputError: It is not open.
+            Full: It was closed to make room for others.
+        """
+        with self._lock:
+            if name in self._open:
+                self._open[name].used_s = self._clock()
+                return self._open[name].session
+        if name in self.crowded_out:
+            raise Full(
+                f"session {name!r}: it was closed to make room for newer images",
+                "open it again with fewer sessions beside it, or give the server more --history-mb",
+            )
+        raise InputError(
+            f"session {name!r}: it is not open, or has expired", "call start_session first"
+        )
+
+    def hold(self, name: str, held: int) -> None:
+        """Enter how many bytes a session keeps; those that nobody used for longest are closed to
+        make room for it, and itself if that is not enough.
+
+        Raises:
+            Full: It keeps more than all sessions together may.
+        """
         with self._lock:
             if name not in self._open:
-                return None
-            session, _ = self._open[name]
-            self._open[name] = session, self._clock()
-            return session
+                return
+            self._open[name].held = held
+            oldest = sorted(self._open, key=lambda one: (one == name, self._open[one].used_s))
+            over = self.held - self._budget
+            crowded = []
+            for one in oldest:
+                if over > 0:
+                    over -= self._open[one].held
+                    crowded.append(one)
+            self.crowded_out.extend(crowded)
+        for one in crowded:
+            self.close(one)
+        self.get(name)
+
+    @contextmanager
+    def working(self, name: str, size: int) -> Iterator[None]:
+        """Work on some bytes during the block.
+
+        Raises:
+            Full: All sessions together would have more than they may.
+        """
+        with self._lock:
+            if self.held + size > self._budget:
+                raise Full(
+                    f"session {name!r}: its images take {size >> 20} MiB decoded, and "
+                    f"{self.held >> 20} of {self._budget >> 20} MiB are in use",
+                    "send smaller images, or give the server more --history-mb",
+                )
+            self._working += size
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._working -= size
 
     def close(self, name: str) -> None:
         """Close a session; one that is not open is fine."""
         with self._lock:
-            session, _ = self._open.pop(name, (None, 0.0))
-        if session is not None:
-            self._close(session)
+            closed = self._open.pop(name, None)
+        if closed is not None:
+            self._close(closed.session)
 
     def expire(self) -> None:
         """Close the sessions that nobody used for long."""
         with self._lock:
-            old = [
-                name
-                for name, (_, used_s) in self._open.items()
-                if self._clock() - used_s > self._expiry_s
-            ]
+            now_s = self._clock()
+            old = [name for name, one in self._open.items() if now_s - one.used_s > self._expiry_s]
         for name in old:
             self.close(name)
 
