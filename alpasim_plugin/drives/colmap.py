@@ -106,7 +106,7 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     unknown = sorted({one.camera for one in images} - set(cameras))
     if unknown:
         raise InputError(f"{model}: images of camera {unknown[0]}, which it does not have", DO_THIS)
-    if any((model / f"rigs{end}").is_file() for end in (".bin", ".txt")):
+    if any(os.path.isfile(model / f"rigs{end}") for end in (".bin", ".txt")):
         notes.append("rigs and frames are not read: each image has its own pose")
     root = _pictures_root(folder, model, images[0].name, photographs)
     shots = [
