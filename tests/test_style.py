@@ -133,6 +133,7 @@ READERS = {
     "alpasim_plugin.core.reading.arrays": "memory maps, after `check_regular`",
     "alpasim_plugin.core.reading.tables": "parquet, after `check_regular`",
     "alpasim_plugin.core.atomic": "what it has just written",
+    "alpasim_plugin.core.stage": "what our own workers do, in a temporary folder",
     "alpasim_plugin.core.lock": "a lock file, after a check of its own",
     "alpasim_plugin.gaussians.files.ply": "large arrays, of a stream from `open_regular`",
     "alpasim_plugin.cli.new": "templates inside the package",
