@@ -199,29 +199,33 @@ class LaneCamera(Policy):
         """
         x, y = _increasing(route)
         at = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
-        beside_m = float((np.interp(at, x, y) - lane.centre(at))[0])
+        lateral_offset_m = float((np.interp(at, x, y) - lane.centre(at))[0])
         turn = float(
             np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0]
             - np.arctan(lane.slope(at))[0]
         )
-        runs_beside = (
-            abs(beside_m) > OTHER_LANE * lane.mean[4]
+        is_other_lane = (
+            abs(lateral_offset_m) > OTHER_LANE * lane.mean[4]
             and abs(turn) < SAME_HEADING_RAD
             and x[-1] > at[0] + 2
         )
-        self.other_lane_frames = self.other_lane_frames + 1 if runs_beside else 0
+        self.other_lane_frames = self.other_lane_frames + 1 if is_other_lane else 0
         if self.other_lane_frames < OTHER_LANE_FRAMES:
             return lane
         self.other_lane_frames = 0
         found = search(
-            points, row_m, float(lane.mean[0]) + beside_m, float(lane.mean[1]), float(lane.mean[2])
+            points,
+            row_m,
+            float(lane.mean[0]) + lateral_offset_m,
+            float(lane.mean[1]),
+            float(lane.mean[2]),
         )
         if found is not None:
             return found
-        lanes = round(beside_m / float(lane.mean[4]))
+        lanes = round(lateral_offset_m / float(lane.mean[4]))
         return (
             shift(lane, lanes)
-            if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4]
+            if abs(lateral_offset_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4]
             else None
         )
 
@@ -232,13 +236,16 @@ class LaneCamera(Policy):
             if abs(turn) > TURN_OFF_RAD:
                 return True
             # Beside the route, a lane needs both borders: a single line is ambiguous.
-            beside_m = (
+            lateral_offset_m = (
                 route.offset_m
                 + at * route.heading_rad
                 + at**2 / 2 * route.curvature_1pm
                 - float(lane.centre(np.array([at]))[0])
             )
-            if abs(beside_m) > UNCERTAIN_M and min(lane.left_m, lane.right_m) < UNCERTAIN_PAINT_M:
+            if (
+                abs(lateral_offset_m) > UNCERTAIN_M
+                and min(lane.left_m, lane.right_m) < UNCERTAIN_PAINT_M
+            ):
                 return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
         heading, width = float(lane.mean[1]), float(lane.mean[4])

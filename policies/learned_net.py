@@ -129,16 +129,6 @@ def knot_weights() -> F64:
     return np.stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]], axis=1)
 
 
-def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the
-    knots, in metres and radians.
-    """
-    yaw = heading @ weights.T
-    middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
-    steps = GRID_M * torch.stack([torch.cos(middle), torch.sin(middle)], dim=-1)
-    return torch.cat([torch.zeros_like(steps[:, :1]), steps.cumsum(1)], dim=1), yaw
-
-
 def save_net(net: LearnedNet, path: Path, metadata: dict[str, str]) -> None:
     """Write the weights in float16."""
     write_safetensors(

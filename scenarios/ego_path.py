@@ -213,24 +213,6 @@ def speed_profile(t_us: I64, rows: Sequence[tuple[float, float]]) -> F64:
     return np.interp(t_s, times, values)
 
 
-def brake_rows(
-    speed_mps: float,
-    brake_at_us: int,
-    decel_mps2: float,
-    end_speed_mps: float,
-    resume_at_us: int | None,
-    accel_mps2: float = 2.0,
-) -> list[tuple[float, float]]:
-    """Return the speed rows of a driver who brakes and may drive on."""
-    t0 = brake_at_us * 1e-6
-    t1 = t0 + (speed_mps - end_speed_mps) / decel_mps2
-    rows = [(t0, speed_mps), (t1, end_speed_mps)]
-    if resume_at_us is not None:
-        t2 = max(resume_at_us * 1e-6, t1 + 1e-3)
-        rows += [(t2, end_speed_mps), (t2 + (speed_mps - end_speed_mps) / accel_mps2, speed_mps)]
-    return rows
-
-
 def integrate(t_us: I64, speed_mps: F64, s0_m: float) -> F64:
     """Return arc lengths ``(T,)`` of a speed that is linear between samples."""
     dt = np.diff(t_us).astype(np.float64) * 1e-6

@@ -18,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import densify, transform_points
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.limits import ASIDE_M
+from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
@@ -45,7 +45,7 @@ SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
-MAX_ASIDE_M = ASIDE_M.high
+MAX_OFFSET_M = LATERAL_OFFSET_M.high
 MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
     **dict.fromkeys(
@@ -319,7 +319,7 @@ def _section(
         side = section.side(sign)
         for k, lane in enumerate(side):
             outer_t = _outer(lane, sign, s, inner_t, middle)
-            if not np.abs(outer_t).max() <= MAX_ASIDE_M:
+            if not np.abs(outer_t).max() <= MAX_OFFSET_M:
                 return None
             kind = KINDS.get(lane.kind)
             wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M

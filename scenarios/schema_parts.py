@@ -340,16 +340,13 @@ class OncomingActor(_Actor):
 
 
 class HardBrakeActor(_InLane):
-    """A leader who brakes hard, and may drive on."""
+    """A leader who brakes hard."""
 
     kind: Literal["hard_brake"]
     speed_mps: float = within(b.CRUISE_MPS, "Speed before braking.")
     brake_at_us: int = within(b.TIME_US, "Start of braking after the log's start.")
     decel_mps2: float = Field(default=6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
     end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
-    resume_at_us: int | None = within(
-        b.TIME_US, "When it accelerates again to its first speed; none: never.", None
-    )
 
     @model_validator(mode="after")
     def _ordered(self) -> HardBrakeActor:
@@ -357,8 +354,6 @@ class HardBrakeActor(_InLane):
             raise ValueError(
                 f"end_speed_mps = {self.end_speed_mps} is not below speed_mps = {self.speed_mps} | lower it"
             )
-        if self.resume_at_us is not None and self.resume_at_us <= self.brake_at_us:
-            raise ValueError("resume_at_us is not after brake_at_us | give a later time")
         return self
 
 

@@ -14,7 +14,6 @@ from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.roads import Road, polyline
 from scenarios.ego_path import (
     EgoPath,
-    brake_rows,
     cut_in_track,
     grid,
     integrate,
@@ -172,13 +171,9 @@ def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
             )
         case HardBrakeActor():
             path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
-            rows = brake_rows(
-                actor.speed_mps,
-                actor.brake_at_us,
-                actor.decel_mps2,
-                actor.end_speed_mps,
-                actor.resume_at_us,
-            )
+            brake_s = actor.brake_at_us * 1e-6
+            slow_s = brake_s + (actor.speed_mps - actor.end_speed_mps) / actor.decel_mps2
+            rows = [(brake_s, actor.speed_mps), (slow_s, actor.end_speed_mps)]
             track = track_on_path(
                 path, t, integrate(t, speed_profile(t, rows), s0), box, actor.offset_m
             )

@@ -24,7 +24,7 @@ from scenarios.schema_parts import Part
 
 _LENGTHS, _SPEEDS = ("length_m",), ("speed_mps", "cruise_mps", "desired_speed_mps", "end_speed_mps")
 _CURVATURES = ("curvature_per_m", "start_curvature_per_m", "end_curvature_per_m")
-_TIMES = ("at_us", "brake_at_us", "resume_at_us")
+_TIMES = ("at_us", "brake_at_us")
 
 
 AS_WRITTEN = 0  # the scene seed that jitters nothing

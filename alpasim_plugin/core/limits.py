@@ -140,7 +140,7 @@ CURVATURE_PER_M = Bound("curvature", "1/m", -0.2, 0.2, "a car cannot turn on a r
 MAP_CURVATURE_PER_M = Bound(
     "curvature in a map", "1/m", -2, 2, "corners of junctions turn on half a metre"
 )
-ASIDE_M = Bound(
+LATERAL_OFFSET_M = Bound(
     "distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road"
 )
 BODY_M = Bound("side of a body", "m", 0.01, 200, "trains and buildings beside the road included")

@@ -216,22 +216,20 @@ def _blend(repaired, references, weight, offset_px, correction, scale, out, reco
     x0, x1, fx = _between(width, scale)
     v0, v1, fv = _between(height, scale * DETAIL)
     u0, u1, fu = _between(width, scale * DETAIL)
-    rows, near = (
-        np.empty((2, width // (scale * DETAIL)), np.float32),
-        np.empty((CHANNELS, width // scale), np.float32),
-    )
-    # What is said of the two coarser rows around a row of pixels, by whether their number is odd;
-    # the next row most often has the same.
-    moves, words = (
-        np.empty((count, 2, 2, width), np.float32),
-        np.empty((count, 2, CHANNELS, width), np.float32),
-    )
+    coarse_offset = np.empty((2, width // (scale * DETAIL)), np.float32)
+    coarse_correction = np.empty((CHANNELS, width // scale), np.float32)
+    # The two coarser rows around a row of pixels, by whether their number is odd; the next row of
+    # pixels most often lies between the same two.
+    offset_rows = np.empty((count, 2, 2, width), np.float32)
+    correction_rows = np.empty((count, 2, CHANNELS, width), np.float32)
     row_of = np.empty((count, 4), np.int64)
     place = np.empty((4, width), np.uint32)
     corners = np.empty((4, width), np.uint32)
     shares = np.empty((4, width), np.float32)
-    found, blended = np.empty((CHANNELS, width), np.float32), np.empty((3, width), np.float32)
-    total, share = np.empty(width, np.float32), np.empty(width, np.float32)
+    looked_up = np.empty((CHANNELS, width), np.float32)
+    blended = np.empty((3, width), np.float32)
+    total = np.empty(width, np.float32)
+    share = np.empty(width, np.float32)
     for b in range(batch):
         row_of[:] = -1
         for y in range(height):
@@ -243,34 +241,31 @@ def _blend(repaired, references, weight, offset_px, correction, scale, out, reco
                 for row in (v0[y], v1[y]):
                     if row_of[k, row % 2] != row:
                         row_of[k, row % 2] = row
-                        for j in range(rows.shape[1]):
+                        for j in range(coarse_offset.shape[1]):
                             for c in range(2):
-                                rows[c, j] = np.float32(scale) * offset_px[b, k, row, j, c]
-                        _stretched(rows, u0, u1, fu, moves[k, row % 2])
-                upper, lower = moves[k, v0[y] % 2], moves[k, v1[y] % 2]
+                                coarse_offset[c, j] = np.float32(scale) * offset_px[b, k, row, j, c]
+                        _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
+                upper, lower = offset_rows[k, v0[y] % 2], offset_rows[k, v1[y] % 2]
                 for x in range(width):
                     px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
                     py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
-                    px, py = (
-                        min(max(px, zero), np.float32(width - 1)),
-                        min(max(py, zero), np.float32(height - 1)),
-                    )
-                    left, top = np.int32(px), np.int32(py)
-                    a, g = px - np.float32(left), py - np.float32(top)
+                    px = min(max(px, zero), np.float32(width - 1))
+                    py = min(max(py, zero), np.float32(height - 1))
+                    left = np.int32(px)
+                    top = np.int32(py)
+                    a = px - np.float32(left)
+                    g = py - np.float32(top)
                     shares[3, x] = g * a
-                    shares[1, x], shares[2, x] = a - shares[3, x], g - shares[3, x]
+                    shares[1, x] = a - shares[3, x]
+                    shares[2, x] = g - shares[3, x]
                     shares[0, x] = one - a - shares[2, x]
-                    beside, under = (
-                        min(left + 1, width - 1) - left,
-                        (min(top + 1, height - 1) - top) * width,
-                    )
-                    at = top * width + left
-                    place[0, x], place[1, x], place[2, x], place[3, x] = (
-                        at,
-                        at + beside,
-                        at + under,
-                        at + beside + under,
-                    )
+                    to_right = min(left + 1, width - 1) - left
+                    to_below = (min(top + 1, height - 1) - top) * width
+                    first = top * width + left
+                    place[0, x] = first
+                    place[1, x] = first + to_right
+                    place[2, x] = first + to_below
+                    place[3, x] = first + to_right + to_below
                 image = references[b, k].reshape(-1)
                 for corner in range(4):
                     for x in range(width):
@@ -283,26 +278,30 @@ def _blend(repaired, references, weight, offset_px, correction, scale, out, reco
                             value += shares[corner, x] * np.float32(
                                 np.int32((corners[corner, x] >> shift) & np.uint32(255))
                             )
-                        found[c, x] = value
+                        looked_up[c, x] = value
                 for row in (y0[y], y1[y]):
                     if row_of[k, 2 + row % 2] != row:
                         row_of[k, 2 + row % 2] = row
                         if scale == 1:
-                            _said(weight[b, k], correction[b, k], row, words[k, row % 2])
+                            _correction_row(
+                                weight[b, k], correction[b, k], row, correction_rows[k, row % 2]
+                            )
                         else:
-                            _said(weight[b, k], correction[b, k], row, near)
-                            _stretched(near, x0, x1, fx, words[k, row % 2])
-                upper, lower = words[k, y0[y] % 2], words[k, y1[y] % 2]
+                            _correction_row(weight[b, k], correction[b, k], row, coarse_correction)
+                            _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
+                upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
                 for x in range(width):
                     share[x] = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
                 _exponentials(share)
                 for x in range(width):
-                    share[x] *= min(max(found[3, x] * half, nowhere), one)
+                    share[x] *= min(max(looked_up[3, x] * half, nowhere), one)
                     total[x] += share[x]
                 for c in range(3):
                     for x in range(width):
-                        said = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
-                        blended[c, x] += share[x] * (found[c, x] * level - one + said)
+                        correction_here = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
+                        blended[c, x] += share[x] * (
+                            looked_up[c, x] * level - one + correction_here
+                        )
             for x in range(width):
                 over = one / total[x]
                 for c in range(3):
@@ -338,7 +337,7 @@ def _between(length, scale):
 
 
 @njit(cache=True, nogil=True)
-def _said(weight, correction, row, out):
+def _correction_row(weight, correction, row, out):
     """Write a row of pixels of what a head says of cells: three corrections, then the logarithm of
     the weight.
     """

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from numba import njit
 
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
+from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget, on_boxes, place_boxes, warp
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
 
 I32 = npt.NDArray[np.int32]
@@ -39,21 +39,21 @@ UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two fram
 
 
 def carry(
-    pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, threads: int = 1
+    recorded_images: Sequence[RecordedImage], target: WarpTarget, T_world_rig: F64, threads: int = 1
 ) -> tuple[U8, ...]:
     """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of
     every pixel.
 
     Args:
-        pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
+        recorded_images: Recorded frames as of `with_users`, nearest first; the first two are compared.
         target: The view; where a ray meets the box of an actor, the render's depth counts.
         T_world_rig: ``(4, 4)`` of a rig near the view; the plane z = 0 of it is the ground.
-        threads: As many pictures are carried at a time; the result does not depend on it.
+        threads: As many images are carried at a time; the result does not depend on it.
 
     Returns:
-        For each picture ``(H, W, 4)`` uint8: see `warp`.
+        For each recorded image ``(H, W, 4)`` uint8: see `warp`.
     """
-    by_depth = _warp_all(pictures, target, np.inf, threads)
+    by_depth = _warp_all(recorded_images, target, np.inf, threads)
     depth = ground_hypothesis(target, T_world_rig)
     rows = np.flatnonzero(depth.any(axis=1))
     if not by_depth or not len(rows):
@@ -63,10 +63,10 @@ def carry(
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
     by_ground = _warp_all(
-        [_hidden_by_users(picture) for picture in pictures], view, FREE_SHARE, threads
+        [_hidden_by_users(recorded) for recorded in recorded_images], view, FREE_SHARE, threads
     )
     ground = view.depth > 0
-    if len(pictures) > 1:
+    if len(recorded_images) > 1:
         size = window_px(K)
         own = [image[lower] for image in by_depth[:2]]
         better = (
@@ -80,17 +80,17 @@ def carry(
 
 
 def _warp_all(
-    pictures: Sequence[Picture], target: WarpTarget, free_share: float, threads: int
+    recorded_images: Sequence[RecordedImage], target: WarpTarget, free_share: float, threads: int
 ) -> list[U8]:
     out: dict[int, U8] = {}
-    todo = iter(range(len(pictures)))  # shared: each thread takes the next
+    todo = iter(range(len(recorded_images)))  # shared: each thread takes the next
 
     def work() -> None:
         for i in todo:
-            out[i] = warp(pictures[i], target, free_share)
+            out[i] = warp(recorded_images[i], target, free_share)
 
-    run_on_threads(max(1, min(threads, len(pictures))), work)
-    return [out[i] for i in range(len(pictures))]
+    run_on_threads(max(1, min(threads, len(recorded_images))), work)
+    return [out[i] for i in range(len(recorded_images))]
 
 
 def window_px(K: F64) -> int:
@@ -128,22 +128,24 @@ def _ground(depth, down, height_m, out):
             out[row, column] = z if free else 0.0
 
 
-def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
+def with_users(recorded: RecordedImage, boxes: Mapping[str, Box]) -> RecordedImage:
     """Return a recorded frame that knows which of its pixels show road users."""
-    height, width = picture.depth.shape
-    placed = place_boxes((height, width), picture.K, picture.T_world_camera, picture.actors, boxes)
+    height, width = recorded.depth.shape
+    placed = place_boxes(
+        (height, width), recorded.K, recorded.T_world_camera, recorded.actors, boxes
+    )
     users = on_boxes((height, width), placed.seen)
-    return replace(picture, users=users) if users.any() else picture
+    return replace(recorded, users=users) if users.any() else recorded
 
 
-def _hidden_by_users(picture: Picture) -> Picture:
+def _hidden_by_users(recorded: RecordedImage) -> RecordedImage:
     """Return a recorded frame whose road users hide all ground behind them, however near to it they
     stand.
     """
     return (
-        picture
-        if picture.users is None
-        else replace(picture, depth=np.where(picture.users, np.float32(HIDING_M), picture.depth))
+        recorded
+        if recorded.users is None
+        else replace(recorded, depth=np.where(recorded.users, np.float32(HIDING_M), recorded.depth))
     )
 
 

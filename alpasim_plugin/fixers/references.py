@@ -32,7 +32,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from alpasim_plugin.fixers.ground import carry, window_px, with_users
-from alpasim_plugin.fixers.warp import Picture, WarpTarget
+from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
 SECOND_M, TURN_M = (
@@ -40,7 +40,7 @@ SECOND_M, TURN_M = (
     10.0,
 )  # a second apart counts as so many metres, and so does a view that is turned by a radian
 FARTHEST_M = 25.0  # a recorded frame from farther away is no reference
-# the distance of a frame that the last picture had counts as this share of it, so that references
+# the distance of a frame that the last image had counts as this share of it, so that references
 # do not flicker
 STAY = 0.75
 # a recorded frame from longer before or after is no reference: light, and what stands about, has
@@ -129,7 +129,7 @@ class ReferenceSession:
         self.threads = threads
         self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
-        self._pictures: OrderedDict[int, Picture] = OrderedDict()
+        self._recorded: OrderedDict[int, RecordedImage] = OrderedDict()
 
     def of(self, request: RenderRequest, frame: Frame) -> tuple[U8, ...]:
         """Return the references of a rendered frame, nearest first; none without depth.
@@ -147,8 +147,8 @@ class ReferenceSession:
             self._last[frame.camera] = chosen
         at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
         T_world_rig = se3(self._ego_log.xyz[at], self._ego_log.quat[at])
-        pictures = [self._picture(i) for i in chosen]
-        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in pictures)
+        recorded_images = [self._recorded_image(i) for i in chosen]
+        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in recorded_images)
         around = window_px(
             request.camera.K
         )  # what `carry` decides of a pixel depends on those around it
@@ -164,17 +164,17 @@ class ReferenceSession:
             )
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
             for whole, part in zip(
-                out, carry(pictures, target, T_world_rig, self.threads), strict=True
+                out, carry(recorded_images, target, T_world_rig, self.threads), strict=True
             ):
                 band.put(whole, part[own])
         return out
 
-    def _picture(self, i: int) -> Picture:
-        if i not in self._pictures:
+    def _recorded_image(self, i: int) -> RecordedImage:
+        if i not in self._recorded:
             frame = self.index.recorded[i]
-            picture = Picture(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
-            self._pictures[i] = with_users(picture, self._boxes)
-            if len(self._pictures) > KEPT_FRAMES:
-                self._pictures.popitem(last=False)
-        self._pictures.move_to_end(i)
-        return self._pictures[i]
+            recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
+            self._recorded[i] = with_users(recorded, self._boxes)
+            if len(self._recorded) > KEPT_FRAMES:
+                self._recorded.popitem(last=False)
+        self._recorded.move_to_end(i)
+        return self._recorded[i]

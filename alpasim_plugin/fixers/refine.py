@@ -36,7 +36,7 @@ class ChangeLimit:
     """How much a fixer may change a frame that was given as reliable, before it is taken not to
     know this kind of video.
 
-    A fixer trained on one kind of picture damages others, and says nothing of it. What it should
+    A fixer trained on one kind of image damages others, and says nothing of it. What it should
     repair is marked by a low opacity; a whole video without opacity is declared reliable, so a
     frame that comes out very different is damage.
 

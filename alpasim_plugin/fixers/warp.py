@@ -60,7 +60,7 @@ class WarpTarget:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RecordedImage:
     """A recorded frame in memory: see `RecordedFrame`; ``users`` are the pixels of its road users
     ``(H, W)``, None where there are none.
     """
@@ -103,14 +103,14 @@ class Lookup(NamedTuple):
     seen: SeenBoxes | None = None
 
 
-def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8:
+def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
     A pixel's surface point is moved with the box it lies in, from where the actor is now to where
     it was when the frame was recorded, and looked up there, between pixels bicubically.
 
     Args:
-        picture: The recorded frame.
+        recorded: The recorded frame.
         target: The view.
         free_share: See `Lookup`.
 
@@ -122,14 +122,14 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
     """
     placed = target.placed
     absent = np.full((4, 4), np.nan)
-    T_then_box = np.array([picture.actors.get(name, absent) for name in placed.names])
+    T_then_box = np.array([recorded.actors.get(name, absent) for name in placed.names])
     lookup = Lookup(
         target.depth,
         target.K,
         target.T_world_camera,
-        picture.K,
-        inverse(picture.T_world_camera),
-        picture.depth,
+        recorded.K,
+        inverse(recorded.T_world_camera),
+        recorded.depth,
         placed.T_box_world,
         T_then_box.reshape(-1, 4, 4),
         placed.sizes,
@@ -137,7 +137,7 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
         placed.seen,
     )
     x, y, held = warp_coordinates(lookup)
-    rgb = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.dstack([rgb, held])
 
 
@@ -255,7 +255,7 @@ def _held(surface, rz, free_share):
 def _coordinates_on_box(
     depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held
 ):
-    """Fill in what moves with one box in the part of the picture that it may be seen in; see
+    """Fill in what moves with one box in the part of the image that it may be seen in; see
     `SeenBoxes`.
 
     ``project`` maps the box's axes to the recorded frame's homogeneous pixels; it is not finite
@@ -343,7 +343,7 @@ def _walls(sizes: F64) -> F64:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_box(ray, eye, walls, pixels, out):
-    """Add the pixels that show one box to the part of a picture that it may be seen in, by the slab
+    """Add the pixels that show one box to the part of an image that it may be seen in, by the slab
     method (Kay and Kajiya, 1986).
     """
     for row in range(out.shape[0]):

@@ -43,7 +43,7 @@ PREDICTED_US, PREDICTED_STEP_US = (
     2_000_000,
     100_000,
 )  # of the plan that stands in the log for a held command
-FORWARD_M, BACKWARD_M, ASIDE_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
+FORWARD_M, BACKWARD_M, LATERAL_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
 ROUTE_POINTS, ROUTE_M = 20, 200.0  # rows of the route, and the bound of its coordinates
 SPEED_MPS = 100.0
 ROLLOUT_SEEDS = 2**31
@@ -103,8 +103,8 @@ class Trajectories:
 
     def __init__(self, vehicle: Vehicle, horizon_us: int, step_us: int) -> None:
         n = horizon_us // step_us
-        low = np.tile([-BACKWARD_M, -ASIDE_M, -np.pi], (n, 1))
-        high = np.tile([FORWARD_M, ASIDE_M, np.pi], (n, 1))
+        low = np.tile([-BACKWARD_M, -LATERAL_M, -np.pi], (n, 1))
+        high = np.tile([FORWARD_M, LATERAL_M, np.pi], (n, 1))
         self.space = Box(low, high, dtype=np.float64)
         self.controller = make_controller("bicycle", vehicle)
         self._after_us = step_us * np.arange(n + 1, dtype=np.int64)
@@ -260,7 +260,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
                 Plan(observation.t_us, times, np.column_stack([ahead, still]), still)
             )
         self._observation = observation
-        *_, facts = scorer.judge(recorder.taken())
+        *_, facts = scorer.score(recorder.taken())
         info = {"seed": seed, "scene": scenario.scene_id, "t_us": observation.t_us, **facts}
         return self._seen(), info
 
@@ -281,7 +281,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             self._observation = episode.driving.send(plan)
         except StopIteration:
             self._over = True
-        worth, ended, facts = episode.scorer.judge(episode.recorder.taken())
+        worth, ended, facts = episode.scorer.score(episode.recorder.taken())
         timed_out = self._over and not ended and not episode.loop.path_end.passed
         if self._over and not ended:
             ended = "time" if timed_out else "path_end"

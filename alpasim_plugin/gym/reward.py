@@ -57,7 +57,7 @@ class Scorer:
         self._kinds = {actor.actor_id: actor for actor in scenario.actors}
         self._before: Instant | None = None
 
-    def judge(self, instants: Sequence[Instant]) -> tuple[float, str, dict[str, float]]:
+    def score(self, instants: Sequence[Instant]) -> tuple[float, str, dict[str, float]]:
         """Score what happened since the last call.
 
         Args:

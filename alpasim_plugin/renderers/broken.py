@@ -54,7 +54,7 @@ class ShiftedRenderer(Renderer):
 
 
 class StaleRenderer(Renderer):
-    """Show an earlier picture of the same camera under the new time: the newest one that is
+    """Show an earlier image of the same camera under the new time: the newest one that is
     ``age_us`` old, or always the first one.
     """
 
@@ -63,7 +63,7 @@ class StaleRenderer(Renderer):
         self._past: dict[str, deque[tuple[int, U8]]] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame and swap its picture for an older one; before there is one that old, for
+        """Render one frame and swap its image for an older one; before there is one that old, for
         the first.
         """
         frame = self.clean.render(request)
@@ -76,7 +76,7 @@ class StaleRenderer(Renderer):
 
 
 def black(rgb: U8) -> U8:
-    """Return a black picture."""
+    """Return a black image."""
     return np.zeros_like(rgb)
 
 
@@ -86,7 +86,7 @@ def mirrored(rgb: U8) -> U8:
 
 
 def blurred(rgb: U8) -> U8:
-    """Blur the picture with a standard deviation of `BLUR_SHARE` of its width."""
+    """Blur the image with a standard deviation of `BLUR_SHARE` of its width."""
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
 
 

@@ -39,7 +39,7 @@ class ReconstructionRecipe:
 
     Attributes:
         splat: How Gaussians are fitted.
-        aside_m: Where the views lie that they are fitted to: to the left of the logged path.
+        lateral_offset_m: Where the views lie that they are fitted to: to the left of the logged path.
         fit_actors: Fit actors as rigid nodes; otherwise all are spliced in from the scene as built.
         depth_every: At every such instant all cameras' views give points to start from.
         range_error: Spread of these points' distance from their view, as a share of it.
@@ -51,7 +51,7 @@ class ReconstructionRecipe:
     """
 
     splat: SplatRecipe
-    aside_m: float
+    lateral_offset_m: float
     fit_actors: bool
     depth_every: int = 6
     range_error: float = 0.1
@@ -104,9 +104,13 @@ def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
         densify_every=0,
     )
     on_path = amount.kind == "reconstruction"
-    aside_m = 0.0 if on_path else amount.shift_m
+    lateral_offset_m = 0.0 if on_path else amount.shift_m
     return ReconstructionRecipe(
-        splat, aside_m, on_path, range_error=amount.depth_error, pose_error_m=amount.pose_error_m
+        splat,
+        lateral_offset_m,
+        on_path,
+        range_error=amount.depth_error,
+        pose_error_m=amount.pose_error_m,
     )
 
 

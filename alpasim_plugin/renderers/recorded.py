@@ -26,14 +26,13 @@ from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
-SIDE_PX = 16
 INTERVAL_US, FIRST_US = (
     500_000,
     50_000,
 )  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
 # the error of poses is drawn this often and interpolated: registration drifts, it does not jump
 POSE_KNOT_US = 700_000
-# of rendered pictures and depths that a built scene's recording keeps: 48 of 512x288, three of
+# of rendered images and depths that a built scene's recording keeps: 48 of 512x288, three of
 # 1920x1080
 KEPT_BYTES = 50_000_000
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
@@ -57,13 +56,13 @@ def built_recording(
         scenario: Its log, cameras and actors.
         scene: The scene as built.
         model: The reconstruction.
-        recipe: How that was fitted: how far aside its views lie, and how wrong their poses are;
+        recipe: How that was fitted: how far to the left its views lie, and how wrong their poses are;
             None: on the log, without error.
     """
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
-    aside = np.eye(4)
-    aside[1, 3] = recipe.aside_m if recipe else 0.0
+    T_rig_offset = np.eye(4)
+    T_rig_offset[1, 3] = recipe.lateral_offset_m if recipe else 0.0
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
     shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
 
@@ -71,14 +70,14 @@ def built_recording(
     def read(number: int) -> tuple[U8, F32]:
         """Return the built scene's image, and the model's depth from the believed pose."""
         true, believed, actors = shots[number]
-        picture = scene.render(true, actors, 1).to_uint8()
-        return picture, model(believed, actors).surface_depth()
+        image = scene.render(true, actors, 1).to_uint8()
+        return image, model(believed, actors).surface_depth()
 
     frames = []
     for t_us in times:
         actors = log_actors(scenario, t_us)
         for spec in scenario.cameras:
-            T_world_camera = interpolate(log, t_us) @ aside @ spec.T_rig_camera
+            T_world_camera = interpolate(log, t_us) @ T_rig_offset @ spec.T_rig_camera
             true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
             error = np.eye(4)
             if recipe:
@@ -150,29 +149,7 @@ def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
     )
 
 
-def posed_photograph(
-    one: Photograph, width: int, height: int | None = None
-) -> tuple[PinholeCamera, U8]:
-    """Read a photograph at sides that are multiples of 16, as fixers need; its height is cut at the
-    middle.
-
-    Args:
-        one: The photograph.
-        width: Pixels across at most, never more than it has.
-        height: Pixels down at most; None keeps what there is.
-
-    Returns:
-        Its camera, and its picture ``(H, W, 3)``.
-    """
-    whole = photograph_camera(one, min(width, one.width) // SIDE_PX * SIDE_PX)
-    kept = max(SIDE_PX, min(height or whole.height, whole.height) // SIDE_PX * SIDE_PX)
-    top = (whole.height - kept) // 2
-    K = whole.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
-    picture = photograph_picture(one, whole)[top : top + kept]
-    return PinholeCamera(whole.width, kept, K, whole.T_camera_world), np.ascontiguousarray(picture)
-
-
-def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:
+def photograph_image(one: Photograph, camera: PinholeCamera) -> U8:
     """Read a photograph at the size of its camera ``(H, W, 3)``.
 
     Raises:
@@ -197,4 +174,4 @@ def of_use(scenario: Scenario, use: str) -> Sequence[Photograph]:
 
 
 def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:
-    return photograph_picture(one, camera), depth()
+    return photograph_image(one, camera), depth()

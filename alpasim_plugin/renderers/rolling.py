@@ -31,7 +31,7 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
         device: That of ``draw``.
 
     Returns:
-        The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of
+        The image; a pixel that nobody looks at is black and opaque. Depth is along the axis of
         the pose at the pixel's time. ``stats`` are the largest of any band.
     """
     spec = request.camera

@@ -147,12 +147,14 @@ class Actors:
     def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
         dt_s = (to_us - from_us) * 1e-6 / n
-        yaw = yaw_of(ego.T_world_rig)
-        direction = np.array([np.cos(yaw), np.sin(yaw)])
+        ego_yaw = yaw_of(ego.T_world_rig)
+        direction = np.array([np.cos(ego_yaw), np.sin(ego_yaw)])
         centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
         fixed = concatenate(
             [
-                bodies_from(centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction),
+                bodies_from(
+                    centre, np.array([ego_yaw]), [self.vehicle.box], ego.speed_mps * direction
+                ),
                 self.replay.bodies(poses),
             ]
         )

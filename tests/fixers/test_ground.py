@@ -22,7 +22,7 @@ from alpasim_plugin.fixers.ground import (
 from alpasim_plugin.fixers.warp import (
     INCONSISTENT,
     VALID,
-    Picture,
+    RecordedImage,
     WarpTarget,
     on_boxes,
     place_boxes,
@@ -69,9 +69,9 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
     return T, np.where(np.isfinite(depth), depth, 0).astype(np.float32), rgb
 
 
-def recorded(x_m: float, wall_m: float = np.inf) -> Picture:
+def recorded(x_m: float, wall_m: float = np.inf) -> RecordedImage:
     T, depth, rgb = street(x_m, wall_m)
-    return Picture(K, T, rgb, depth, NOBODY)
+    return RecordedImage(K, T, rgb, depth, NOBODY)
 
 
 def plain_ground(view: WarpTarget, T_world_rig: F64) -> F32:
@@ -149,7 +149,7 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     rgb[rear] = (
         0  # it hid the road, of which its own reconstruction knows nothing, and has left since
     )
-    recorded_car = Picture(K, T, rgb, depth, {"car": then})
+    recorded_car = RecordedImage(K, T, rgb, depth, {"car": then})
     here, own, _ = street(9.0)
     image, _ = carry(
         [with_users(recorded_car, box), recorded(9.5)],

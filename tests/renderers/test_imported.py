@@ -16,7 +16,7 @@ from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.reconstruction import ImportedRenderer, exposure_near
-from alpasim_plugin.renderers.recorded import posed_photograph
+from alpasim_plugin.renderers.recorded import photograph_camera, photograph_image
 from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, recorded_drive
 
 
@@ -95,8 +95,9 @@ def test_recorded_frames_are_those_of_the_fit_alone(drive: Scenario) -> None:
 
 
 def test_a_missing_photograph_is_named(drive: Scenario, tmp_path: Path) -> None:
+    gone = replace(drive.recording[0], path=str(tmp_path / "gone.png"))
     with pytest.raises(InputError):
-        posed_photograph(replace(drive.recording[0], path=str(tmp_path / "gone.png")), WIDE)
+        photograph_image(gone, photograph_camera(gone, WIDE))
 
 
 def test_exposure_follows_the_place_and_the_camera(drive: Scenario) -> None:

@@ -9,7 +9,6 @@ from alpasim_plugin.core.geometry import speeds, yaw_from_quat
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.path import polyline_path
 from scenarios.ego_path import (
-    brake_rows,
     cut_in_track,
     grid,
     integrate,
@@ -34,17 +33,9 @@ def test_grid_ends_exactly_at_the_end() -> None:
 
 def test_hard_brake_stops_after_the_physical_distance() -> None:
     t = grid(0, 8_000_000)
-    s = integrate(t, speed_profile(t, brake_rows(12.0, 2_000_000, 6.0, 0.0, None)), 10.0)
+    s = integrate(t, speed_profile(t, [(2.0, 12.0), (4.0, 0.0)]), 10.0)
     assert s[-1] == pytest.approx(10 + 12 * 2 + 12**2 / (2 * 6), abs=1e-9)
     assert s[-1] == s[-20]
-
-
-def test_a_driver_who_resumes_reaches_the_first_speed_again() -> None:
-    t = grid(0, 12_000_000)
-    v = speed_profile(t, brake_rows(8.0, 1_000_000, 4.0, 2.0, 5_000_000))
-    assert v[0] == 8.0
-    assert v.min() == 2.0
-    assert v[-1] == 8.0
 
 
 def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt() -> None:

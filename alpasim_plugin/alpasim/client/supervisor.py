@@ -42,8 +42,8 @@ def main(grace_s: float, command: list[str]) -> int:
         return NOT_STARTED
     while child.poll() is None:
         ready, _, _ = select.select([sys.stdin.fileno(), bell], [], [])
-        told = os.read(bell, 64) if bell in ready else b""
-        if sys.stdin.fileno() in ready or signal.SIGTERM in told:
+        woken_by = os.read(bell, 64) if bell in ready else b""
+        if sys.stdin.fileno() in ready or signal.SIGTERM in woken_by:
             end_group(child, grace_s)
             break
     _signal_group(child.pid, signal.SIGKILL)  # what the command left running behind it

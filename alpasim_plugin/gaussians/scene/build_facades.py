@@ -1,7 +1,7 @@
 """Build houses along the road: extruded boxes whose walls carry windows, doors and shop fronts.
 
 A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels use coarser
-patterns with the same mean look. Windows are cells, not holes: what a picture shows of a facade at
+patterns with the same mean look. Windows are cells, not holes: what an image shows of a facade at
 street distances is colour and rhythm.
 """
 

@@ -25,9 +25,9 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
+from alpasim_plugin.lab.bench.photograph import posed_photograph
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
-from alpasim_plugin.renderers.recorded import posed_photograph
 
 DOING = "measuring renderers against photographs"
 SETS = ("held-out", "never-fitted")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +16,6 @@ from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PIXEL_VARIANTS, pixel_variant
-from alpasim_plugin.lab.training.ranks import in_ranks
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
 
@@ -26,8 +24,6 @@ EPILOG = """
 Examples:
 
 - `simrun train per-frame data/pairs --video data/video --out runs/s --steps 20000 --decay-from 16000`
-
-- `simrun train per-frame data/pairs --out runs/s --threads 1 --processes 2`: two cores, three streams each
 
 - `simrun train per-frame data/pairs --out runs/s2 --init runs/s/state.safetensors --warmup 0`: further, on other data
 """
@@ -125,14 +121,6 @@ def per_frame(
         Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")
     ] = "fp32",
     threads: options.Threads = None,
-    processes: Annotated[
-        int,
-        typer.Option(
-            "--processes",
-            min=1,
-            help="Processes that share the streams of a batch; a divisor of --streams.",
-        ),
-    ] = 1,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
@@ -182,5 +170,4 @@ def per_frame(
     distance = progress.perceptual_term(metric_weights) if needs_distance else None
     dtype = torch.bfloat16 if precision == "bf16" else None
     run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
-    work = partial(train_per_frame, run, out, distance, stop_at)
-    progress.wrote(in_ranks(work, processes, progress.update), as_json)
+    progress.wrote(train_per_frame(run, out, distance, stop_at, progress.update), as_json)

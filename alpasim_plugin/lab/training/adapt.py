@@ -2,7 +2,7 @@
 photographs that nobody trained on gain.
 
 Training shows the model where photographs were taken that it was fitted to, with the other
-photographs as references; the judge is the photographs that were held out of the fit. New weights
+photographs as references; they are measured by the photographs that were held out of the fit. New weights
 are accepted where the mean gain in PSNR over them is above 0 with 95 % confidence (Student's t over
 photographs), for the alternative is to keep what ships.
 """
@@ -35,7 +35,7 @@ from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
 
-FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to judge by
+FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to measure by
 WIDTH_PX = 512  # of the photographs, at most
 LR = 2e-4
 WARMUP = 5
@@ -87,10 +87,10 @@ def adapt(
     """
     with tempfile.TemporaryDirectory(prefix="simrun-adapt-") as scratch:
         root = Path(scratch)
-        judge = _pairs(scenario, root, seed)
-        before = _psnr(judge, weights, seed)
+        held_out = _pairs(scenario, root, seed)
+        before = _psnr(held_out, weights, seed)
         trained = _trained(root, weights, updates, distance, seed, report)
-        after = _psnr(judge, trained, seed)
+        after = _psnr(held_out, trained, seed)
         found = compared(before, after)
         if found.accepted:
             write_bytes(out, read_bytes(trained))
@@ -112,7 +112,7 @@ def compared(before: F64, after: F64) -> Adapted:
 
 
 def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
-    """Write the split ``train`` and return the sequence that judges."""
+    """Write the split ``train`` and return the held-out sequence."""
     camera = next((one.name for one in scenario.cameras), "")
     taken = sorted(
         (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
@@ -126,7 +126,7 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     shots = [Shot.read(one, WIDTH_PX) for one in taken]
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
-    for split, shown in (("train", fitted), ("judge", held)):
+    for split, shown in (("train", fitted), ("held_out", held)):
         info: dict[str, Any] = {
             "scene_id": scenario.scene_id,
             "seed": seed,
@@ -136,16 +136,16 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
         write_drive_sequence(
             scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1
         )
-    return PairSequence(root / "pairs" / "judge" / "drive_0")
+    return PairSequence(root / "pairs" / "held_out" / "drive_0")
 
 
-def _psnr(judge: PairSequence, weights: Path, seed: int) -> F64:
+def _psnr(held_out: PairSequence, weights: Path, seed: int) -> F64:
     """Return the PSNR of each held-out photograph behind the fixer, in order of time, so that it
     has its history.
     """
     name, overrides = bundle_fixer(weights)
     spec = resolve("fixer", name, overrides)
-    clip = quality_clip(judge)
+    clip = quality_clip(held_out)
     made = run_variant(
         clip,
         Variant("adapted", spec),

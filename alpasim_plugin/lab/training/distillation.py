@@ -75,7 +75,7 @@ class Distillation:
 
 @dataclass(frozen=True)
 class RolloutNoise:
-    """Noise of a rollout and of the scores that judge it.
+    """Noise of a rollout and of its scores.
 
     Args:
         eps: Of the source of every step up to the exit, each ``(B, C, N, H, W)``.

@@ -41,11 +41,11 @@ from alpasim_plugin.gaussians.fit.photographs import read_points
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.log_views import log_actors
+from alpasim_plugin.lab.bench.photograph import posed_photograph
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
 from alpasim_plugin.lab.training.photograph_pairs import PhotographPairs, PhotographRecipe
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.recorded import posed_photograph
 
 DRIVE = "drive"  # the family of these sequences
 

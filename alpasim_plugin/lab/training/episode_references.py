@@ -19,7 +19,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.fixers.ground import carry
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, on_boxes
+from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, RecordedImage, on_boxes
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 
@@ -97,7 +97,7 @@ def pair_references(
             for slot, j in enumerate(used)
         ]
         pictures = [
-            _misplaced(_picture(sequence, at), error)
+            _misplaced(_recorded_image(sequence, at), error)
             for at, error in zip(places, draw.errors, strict=False)
         ]
         for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)))):
@@ -190,7 +190,7 @@ def smooth_field(rng: np.random.Generator, size: tuple[int, ...], spread_px: flo
     return smooth
 
 
-def _misplaced(picture: Picture, error: F64) -> Picture:
+def _misplaced(picture: RecordedImage, error: F64) -> RecordedImage:
     if not error.any():
         return picture
     T = np.eye(4)
@@ -205,7 +205,7 @@ def _opened(sequence: PairSequence) -> tuple[SequenceReferences, ReferenceIndex]
 
 
 @lru_cache(maxsize=PICTURES)
-def _picture(sequence: PairSequence, i: int) -> Picture:
+def _recorded_image(sequence: PairSequence, i: int) -> RecordedImage:
     found = _opened(sequence)
     assert found is not None
     return found[0].picture(i)

@@ -5,7 +5,7 @@ weights and a model card out.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from alpasim_plugin.lab.training.model_card import ModelCard, curves
 from alpasim_plugin.lab.training.pixel_rollout import Distance
 from alpasim_plugin.lab.training.pixel_task import FrameStreams, PixelTask
 from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PixelVariant
-from alpasim_plugin.lab.training.ranks import ALONE, Ranks, Report
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
 BLOCK = re.compile(r"(encode|decode|middle)\w*\.\d+\.")  # a residual block of a stage
@@ -66,8 +65,7 @@ def train_per_frame(
     out: Path,
     distance: tuple[str, Distance] | None,
     stop_at: int | None = None,
-    ranks: Ranks = ALONE,
-    report: Report | None = None,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
 ) -> Path:
     """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write
     OUT/fixer.safetensors and its card.
@@ -77,7 +75,6 @@ def train_per_frame(
         out: Folder of the run.
         distance: Name and function of the perceptual term, or None.
         stop_at: Update after which to stop and write the weights; a later call continues.
-        ranks: The processes that train together; see `alpasim_plugin.lab.training.ranks.in_ranks`.
         report: Called after every update with its number and the logged values.
 
     Raises:
@@ -85,15 +82,13 @@ def train_per_frame(
         InfrastructureError: The loss is not finite.
     """
     net = initial_generator(run)
-    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed, ranks)
+    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed)
     facts = {
         **task.facts,
         "init": file_sha256(run.init) if run.init else None,
         "precision": str(run.precision),
     }
-    trainer = Trainer(
-        net, out, run.schedule, task.batch, task.loss, facts, run.precision, task, ranks
-    )
+    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision, task)
     if run.init is not None and _is_checkpoint(run.init):
         trainer.begin_from(run.init)
 
@@ -104,8 +99,6 @@ def train_per_frame(
             report(step, numbers)
 
     trainer.run(reported, stop_at)
-    if not ranks.is_first:
-        return out / BUNDLE_FILE
     path = write_bundle(run, out / BUNDLE_FILE, trainer.averaged(), trainer.step)
     rows, hours = curves(out / LOG_FILE)
     training = {"schedule": asdict(run.schedule), "updates": trainer.step, **facts}

@@ -15,7 +15,6 @@ from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelGenerator, PixelState
 from alpasim_plugin.lab.training.pixel_rollout import Distance, PixelSample, pixel_losses
 from alpasim_plugin.lab.training.pixel_variants import PixelVariant
-from alpasim_plugin.lab.training.ranks import ALONE, Ranks
 
 SEEN = 2  # frames of the perceptual term in an update
 
@@ -64,8 +63,8 @@ class FrameBatch(Protocol):
 class FrameStreams(Protocol):
     """Batches by number of update."""
 
-    def update(self, i: int, slots: slice) -> FrameBatch:
-        """Return the frames of some streams in update ``i``, a function of ``i`` only."""
+    def update(self, i: int) -> FrameBatch:
+        """Return the frames of update ``i``, a function of ``i`` only."""
         ...
 
     @property
@@ -96,7 +95,6 @@ class PixelTask:
         steps: Updates of the run, which a variant of several stages divides.
         distance: Name and function of the perceptual term, or None.
         seed: Of the noise.
-        ranks: The processes that share the batches, each with some of the streams.
     """
 
     def __init__(
@@ -107,7 +105,6 @@ class PixelTask:
         steps: int,
         distance: tuple[str, Distance] | None,
         seed: int = 0,
-        ranks: Ranks = ALONE,
     ) -> None:
         self.net, self.streams, self.variant, self.steps, self.distance, self.seed = (
             net,
@@ -117,7 +114,6 @@ class PixelTask:
             distance,
             seed,
         )
-        self.slots = ranks.rows(streams.batch)
         self._state: PixelState | None = None
 
     @property
@@ -134,7 +130,7 @@ class PixelTask:
 
     def batch(self, index: int) -> NoisyBatch:
         """Return the frames and noise of update ``index``."""
-        got, slots = self.streams.update(index, self.slots), self.slots
+        got = self.streams.update(index)
         render, truth, sdmap, opacity = (
             x.permute(0, 1, 3, 4, 2).contiguous()
             for x in (got.render, got.target, got.map, got.opacity)
@@ -142,16 +138,13 @@ class PixelTask:
         source = torch.Generator().manual_seed(
             derive_seed("training", self.seed, "pixel.noise", index) % 2**63
         )
-        # Drawn for all streams, so that a stream's noise does not depend on which process has it.
-        whole = (self.streams.batch, *render.shape[1:])
-        eps, eps_flow = (
-            torch.randn(shape, generator=source)[slots] for shape in (whole, (whole[0], *whole[2:]))
-        )
-        t = torch.rand(whole[0], generator=source)[slots]
+        batch, frames = render.shape[:2]
+        eps = torch.randn(render.shape, generator=source)
+        eps_flow = torch.randn((batch, *render.shape[2:]), generator=source)
+        t = torch.rand(batch, generator=source)
         rng = stream("training", self.seed, "pixel.frames", index)
-        frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
-        t_history = torch.rand(whole[0], frames, generator=source)[slots]
+        t_history = torch.rand(batch, frames, generator=source)
         flow_frame, top, left = (
             int(rng.integers(frames)),
             *(int(rng.integers(_corners(side))) for side in render.shape[2:4]),

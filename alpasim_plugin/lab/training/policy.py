@@ -19,11 +19,11 @@ from alpasim_plugin.lab.training.policy_expert import SIGHT_M
 from alpasim_plugin.lab.training.trainer import Loss
 from policies.learned_input import level_view, network_input
 from policies.learned_net import (
+    GRID_M,
     KNOTS_M,
     PROXIMITY_M,
     SPEED_UNIT_MPS,
     LearnedNet,
-    integrate_path,
     knot_weights,
 )
 
@@ -63,6 +63,16 @@ class PolicyBatch:
     speed: Tensor  # (B,) metres per second
     speeds: Tensor  # (B, 8) changes of speed, metres per second
     leader: Tensor  # (B, 2) proximity of the leader and its speed, as in `Prediction`
+
+
+def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the
+    knots, in metres and radians.
+    """
+    yaw = heading @ weights.T
+    middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
+    steps = GRID_M * torch.stack([torch.cos(middle), torch.sin(middle)], dim=-1)
+    return torch.cat([torch.zeros_like(steps[:, :1]), steps.cumsum(1)], dim=1), yaw
 
 
 class PolicyTask:

@@ -26,7 +26,7 @@ from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.references import ReferenceIndex
-from alpasim_plugin.fixers.warp import Picture, WarpTarget
+from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
 from alpasim_plugin.lab.training.pair_store import PairSequence
 
 FOLDER = "references"
@@ -86,10 +86,10 @@ class SequenceReferences:
         pose: F64 = self.T_world_camera[i] @ inverse(self.T_rig_camera)
         return pose
 
-    def picture(self, i: int) -> Picture:
+    def picture(self, i: int) -> RecordedImage:
         """Return recorded frame ``i``."""
         depth = self.rgb_depth[i].astype(np.float32)
-        picture = Picture(
+        picture = RecordedImage(
             self.K,
             self.rgb_T_world_camera[i],
             np.ascontiguousarray(self.rgb[i]),

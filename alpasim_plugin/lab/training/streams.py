@@ -246,9 +246,9 @@ class TrainingStreams:
                     "crop less",
                 )
 
-    def update(self, i: int, some: slice = slice(None)) -> StreamBatch:
-        """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
-        slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
+    def update(self, i: int) -> StreamBatch:
+        """Return the batch of update ``i``, counted from 0."""
+        slots = [self.episode_of(slot, i) for slot in range(self.batch)]
         shown = [self._show(episode, at) for episode, at in slots]
         render, opacity, sdmap, target, references, users = (
             torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True)

@@ -24,7 +24,6 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.reading import parse_json, parsing, read_text
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.fixers.network.checkpoints import listed, load_weights
-from alpasim_plugin.lab.training.ranks import ALONE, Ranks
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
@@ -145,7 +144,6 @@ class Trainer(Generic[Batch]):
         facts: Identity of the run; a folder of another run is refused.
         autocast: Precision of the forward pass, or None.
         carried: What the task carries from batch to batch, or None.
-        ranks: The processes that share the batches; ``batch`` and ``carried`` are this one's rows.
         parts: Schedules of the module's parts, by the first names of their parameters (``dit``,
             ``vae.decoder``; the empty name is the whole). A part without a gradient in an update
             keeps its weights, moments and average.
@@ -165,10 +163,8 @@ class Trainer(Generic[Batch]):
         facts: Mapping[str, Any],
         autocast: torch.dtype | None = None,
         carried: Carried | None = None,
-        ranks: Ranks = ALONE,
         parts: Mapping[str, PartSchedule] = WHOLE,
     ) -> None:
-        self.ranks = ranks
         self.module, self.folder, self.schedule = module, folder, schedule
         self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
@@ -196,8 +192,7 @@ class Trainer(Generic[Batch]):
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
-        if self.ranks.is_first:
-            self._cut_log()
+        self._cut_log()
 
     def run(
         self,
@@ -213,9 +208,8 @@ class Trainer(Generic[Batch]):
         last = min(until or self.schedule.steps, self.schedule.steps)
         while self.step < last:
             numbers = self._update()
-            if self.ranks.is_first:
-                self._write_log(numbers)
-            if report is not None and self.ranks.is_first:
+            self._write_log(numbers)
+            if report is not None:
                 report(self.step, numbers)
             if self.step % self.schedule.save_every == 0 or self.step == last:
                 self.save()
@@ -266,12 +260,7 @@ class Trainer(Generic[Batch]):
                 f"moment.{key}.{name}": value
                 for key, value in self.optimiser.state.get(p, {}).items()
             }
-        tensors |= {
-            f"{CARRIED}{name}": value.contiguous()
-            for name, value in self.ranks.joined(self._kept).items()
-        }
-        if not self.ranks.is_first:
-            return
+        tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self._kept.items()}
         meta = {
             "step": str(self.step),
             "facts": self._facts,
@@ -292,14 +281,11 @@ class Trainer(Generic[Batch]):
                 device, self._autocast or torch.bfloat16, enabled=self._autocast is not None
             ):
                 loss, numbers = self._loss(batch, index)
-            if (
-                not torch.isfinite(loss) and self.ranks.count == 1
-            ):  # several notice together, by the norm of their mean gradient
+            if not torch.isfinite(loss):
                 self._stop(batch, f"loss {loss.item()} in batch {index}")
             (loss / n).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": float(loss.detach()), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
-        self._average_ranks(sums)
         norms = self._clip()
         if not all(map(math.isfinite, norms.values())):
             self._stop(batch, f"gradient norm {norms} at update {self.step}")
@@ -330,15 +316,6 @@ class Trainer(Generic[Batch]):
                 norms[key] = float(nn.utils.clip_grad_norm_(list(own.values()), clip))
         return norms
 
-    def _average_ranks(self, numbers: dict[str, float]) -> None:
-        """Replace gradients and logged values by their means over the ranks."""
-        if self.ranks.count > 1:
-            logged = torch.tensor([*numbers.values()], dtype=torch.float32)
-            self.ranks.average(
-                [*(p.grad for p in self.parameters.values() if p.grad is not None), logged]
-            )
-            numbers.update(zip(numbers, logged.tolist(), strict=True))
-
     def _update_average(self) -> None:
         """Update the EMA; its decay is lower in early updates, so that the initial weights have
         little influence.
@@ -350,7 +327,7 @@ class Trainer(Generic[Batch]):
                     self.average[name].lerp_(p, 1 - decay)
 
     def _stop(self, batch: Batch, found: str) -> None:
-        path = self.folder / (BAD_FILE if self.ranks.is_first else f"{self.ranks.rank}-{BAD_FILE}")
+        path = self.folder / BAD_FILE
         with atomic_file(path) as partial:
             torch.save(batch, partial)
         self.save()
@@ -390,9 +367,6 @@ class Trainer(Generic[Batch]):
                 if key.startswith(CARRIED)
             }
             if self._carried is not None:
-                self._kept = {
-                    name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()
-                }
                 self._carried.carry(self._kept)
             self._take(tensors)
 

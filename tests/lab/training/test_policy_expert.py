@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
+from alpasim_plugin.lab.training.policy import integrate_path
 from alpasim_plugin.lab.training.policy_expert import (
     DrivingStyle,
     ReferenceLine,
@@ -18,7 +20,7 @@ from alpasim_plugin.lab.training.policy_expert import (
 )
 from alpasim_plugin.world.idm import NO_BODIES, NO_LEADER, Leader, bodies_from
 from alpasim_plugin.world.path import smooth_path
-from policies.learned_net import KNOTS_M, TIMES_S
+from policies.learned_net import KNOTS_M, TIMES_S, knot_weights, path_grid
 
 STRAIGHT = smooth_path(np.stack([np.linspace(0.0, 200.0, 60), np.zeros(60)], axis=1))
 ANGLE = np.linspace(0.0, 2.0, 120)
@@ -115,3 +117,15 @@ def test_only_bodies_that_reach_into_the_way_are_leaders() -> None:
     assert leader.gap_m == pytest.approx(60.0 - 2.25 - 13.8, abs=0.05)
     assert leader.speed_mps == pytest.approx(5.0)
     assert leader_on(line, 10.0, 3.8, 0.94, NO_BODIES).index == -1
+
+
+def test_headings_of_a_circle_lay_out_the_circle() -> None:
+    heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
+    points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
+    s = path_grid()
+    np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
+    np.testing.assert_allclose(
+        points[0].numpy(),
+        40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1),
+        atol=2e-3,
+    )
