@@ -46,7 +46,6 @@ def list_names(
     since: Annotated[
         str | None, Flag("Runs begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")
     ] = None,
-    last: Annotated[int | None, Flag("The newest N runs.", min=1)] = None,
     metric: Annotated[tuple[str, ...], Flag("Show this metric of each run. Repeatable.")] = (),
     as_json: Json = False,
 ) -> None:
@@ -54,9 +53,9 @@ def list_names(
     if kind == "runs":
         from alpasim_plugin.cli.list_runs import list_runs
 
-        list_runs(roots or (Path("runs"),), renderer, policy, since, last, metric, as_json)
+        list_runs(roots or (Path("runs"),), renderer, policy, since, metric, as_json)
         return
-    if roots or renderer or policy or since or last or metric:
+    if roots or renderer or policy or since or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
     if kind is None:
         known = {name: f"simrun list {name}" for name in get_args(Kind)}

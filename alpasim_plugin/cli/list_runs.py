@@ -21,7 +21,6 @@ def list_runs(
     renderers: tuple[str, ...],
     policies: tuple[str, ...],
     since: str | None,
-    last: int | None,
     metrics: Sequence[str],
     as_json: bool,
 ) -> None:
@@ -31,7 +30,6 @@ def list_runs(
         roots: Folders that are searched.
         renderers, policies: Patterns that a run must match.
         since: Earliest start, as a date or an age (``7d``).
-        last: Only the newest of them.
         metrics: Metrics of ``summary.json`` to print beside each run.
         as_json: Print one JSON document.
 
@@ -41,7 +39,7 @@ def list_runs(
     started = None if since is None else as_day(since, "--since", datetime.now(UTC))
     choice = Choice(renderers, policies, started)
     entries = find_runs(roots, with_summary=True)
-    chosen = [entry for entry in entries if choice.takes(entry)][:last]
+    chosen = [entry for entry in entries if choice.takes(entry)]
     stored = {
         name
         for entry in chosen

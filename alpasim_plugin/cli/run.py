@@ -117,10 +117,6 @@ def run(
         bool,
         Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report"),
     ] = True,
-    wait: Annotated[
-        bool,
-        Flag("If another process writes the run folder, wait instead of failing.", "--wait"),
-    ] = False,
     time_limit: Annotated[
         float | None,
         Flag("Seconds after which a rollout that hangs is ended and reported.", min=0.001),
@@ -199,7 +195,6 @@ def run(
                     command=command,
                     progress=progress,
                     report=report,
-                    wait=wait,
                     limit_s=time_limit,
                     executor=ray,
                 )
@@ -213,7 +208,6 @@ def run(
                     resume,
                     repeat,
                     report,
-                    wait=wait,
                     limit_s=time_limit,
                     executor=ray,
                 )

@@ -67,7 +67,7 @@ def one_writer(
             if not wait:
                 raise InfrastructureError(
                     f"{what}: another process is writing it",
-                    "wait for it (--wait), or name another folder",
+                    "wait until it ends, or name another folder",
                 ) from None
             waiting(f"waiting: another process writes {what}")
             lock.acquire()

@@ -139,7 +139,6 @@ def execute_decision(
     progress: DecisionProgress,
     *,
     report: bool = True,
-    wait: bool = False,
     limit_s: float | None = None,
     executor: Executor = LOCAL,
 ) -> Decided:
@@ -153,7 +152,6 @@ def execute_decision(
         command: For ``run.json``.
         progress: Shows rollouts and interim analyses.
         report: Write ``report.html``.
-        wait: Wait for a process that writes the folder; otherwise refuse.
         limit_s: Seconds that one rollout may take.
         executor: As for a run; the decision does not depend on it.
 
@@ -164,7 +162,7 @@ def execute_decision(
     test = _SequentialTest(plan, question)
     threads = thread_budget(workers, SCENES_PER_LOOK * 2 * len(plan.seeds), executor)
     how = HowToRun(threads, limit_s=limit_s, executor=executor)
-    with writing(root, wait, progress.noticed):
+    with writing(root):
         held = claim(root, plan, command, threads, False, progress.noticed)
         # The kind is written at once: the plan's scenes are not all wanted.
         write_run_json(root, read_run_json(root) | {"kind": KIND})

@@ -113,7 +113,6 @@ def execute_run(
     repeat: bool = False,
     report: bool = True,
     *,
-    wait: bool = False,
     limit_s: float | None = None,
     executor: Executor = LOCAL,
 ) -> RunResult:
@@ -128,7 +127,6 @@ def execute_run(
         resume: Continue in the folder of another command.
         repeat: Drive a rollout of each policy a second time to see whether it is repeatable.
         report: Write ``report.html``; otherwise `write_reports` makes it later.
-        wait: Wait for a process that writes the folder; otherwise refuse.
         limit_s: Seconds that one rollout may take.
         executor: Where rollouts run; the results do not depend on it.
 
@@ -137,7 +135,7 @@ def execute_run(
         InfrastructureError: Another process writes the folder, or it is read-only.
     """
     threads = thread_budget(workers, len(plan.cells), executor)
-    with writing(root, wait, progress.noticed):
+    with writing(root):
         held = claim(root, plan, command, threads, resume, progress.noticed)
         progress.started(plan, root, threads)
         began = time.perf_counter()

@@ -128,7 +128,6 @@ def test_a_run_with_a_policy_that_prints_gives_one_document(
         ("Transposed", "xy (2, 41)"),
         ("BadReset", "KeyError: 'route'"),
         ("NoSensors", "sensors is 'front'"),
-        ("Fails", "weights.pt is missing"),
     ],
 )
 def test_in_a_run_the_faults_of_a_policy_are_its_own(

@@ -146,7 +146,7 @@ def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(
 ) -> None:
     monkeypatch.setattr(main, "verbs", lambda: {"run": "alpasim_plugin.cli.run:run"})
     assert run_command(["train", "fixer"]) == 2
-    assert "alpasim-onefixer-lab" in two_parts(capsys.readouterr().err)[1]
+    assert "alpasim_plugin/lab" in two_parts(capsys.readouterr().err)[1]
 
 
 # --- what nothing has foreseen

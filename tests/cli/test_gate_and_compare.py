@@ -28,7 +28,6 @@ def plan(**fields) -> Plan:
         "scenes": SCENES,
         "seeds": (0, 1),
         "steps": 40,
-        "pictures": False,
         "clips": False,
         "invalid": (),
     }

@@ -46,7 +46,6 @@ def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> No
     words += [
         "--shard",
         "1/1",
-        "--wait",
         "--workers",
         "3",
         "--out",
@@ -56,7 +55,7 @@ def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> No
     given = called(run, "execute_run", "--renderer", "clean", *words)
     assert given["executor"] == Executor("ray", "", 2, 0.5, 7.5)
     assert (given["workers"], given["limit_s"]) == (3, 90.0)
-    assert (given["report"], given["wait"], given["resume"]) == (False, True, False)
+    assert (given["report"], given["resume"]) == (False, False)
 
 
 def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(

@@ -168,7 +168,7 @@ def test_import_form_makes_a_class_with_or_without_the_scenario() -> None:
     [
         ("pure-persuit", "did you mean 'pure-pursuit'"),
         ("no_such_package.x:Y", "ModuleNotFoundError"),
-        (f"{__name__}:Missing", "AttributeError"),
+        (f"{__name__}:Missing", "has no 'Missing'"),
         (f"{__name__}:NotAPolicy", "without sensors, reset"),
     ],
 )

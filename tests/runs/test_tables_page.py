@@ -28,7 +28,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "scenes": SCENES,
         "seeds": (0, 1),
         "steps": 20,
-        "pictures": False,
         "clips": False,
     }
     make_run(root / "runs" / "mine", Plan(renderers=("clean", "3dgs"), fail=[FAILED], **small))

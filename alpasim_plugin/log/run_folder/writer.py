@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
-from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
@@ -45,21 +44,17 @@ _TEMPORARY = re.compile(
 
 
 @contextmanager
-def writing(
-    root: Path, wait: bool = False, waiting: Callable[[str], None] = warn
-) -> Iterator[None]:
+def writing(root: Path) -> Iterator[None]:
     """Be the only writer of a run folder during the block; left-overs of killed writers are removed
     first.
 
     Args:
         root: The run folder; made if it does not exist.
-        wait: Wait for another writer; otherwise refuse.
-        waiting: Called once with a line that says who is waited for.
 
     Raises:
         InfrastructureError: Another process writes the folder, or it is read-only.
     """
-    with one_writer(root / LOCK, f"folder {root}", wait, waiting) as held:
+    with one_writer(root / LOCK, f"folder {root}") as held:
         remove_left_overs(root, held.since_ns)
         yield
 
