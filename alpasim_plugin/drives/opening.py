@@ -20,6 +20,7 @@ from alpasim_plugin.gaussians.fit.photographs import (
     FILE,
     KNOWN_KEYS,
     Picture,
+    inside,
     present,
     read_pictures,
     read_points,
@@ -109,7 +110,11 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         raise InputError(f"{folder / FILE}, unit: {unit!r}", 'give metres, "unit": "m", or no unit')
     metric = "the file's word that its unit is the metre" if unit else None
     points = document.get("ply_file_path") if photographs else None
-    cloud = None if points is None else read_points(folder / str(points))
+    cloud = (
+        None
+        if points is None
+        else read_points(inside(folder, folder / str(points), f"{folder / FILE}, ply_file_path"))
+    )
     given = (
         None
         if cloud is None

@@ -186,6 +186,17 @@ def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path: Path)
         read_source(folder)
 
 
+def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path: Path) -> None:
+    transforms(tmp_path / "b", ["1.png", "2.png"])
+    folder = transforms(tmp_path / "a", ["1.png", "2.png"])
+    text = (folder / "transforms.json").read_text()
+    for outside in ("../b/images/", f"{tmp_path}/b/images/"):
+        (folder / "transforms.json").write_text(text.replace("images/", outside))
+        with pytest.raises(InputError):
+            read_source(folder)
+        read_source(folder, photographs=False)
+
+
 def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path: Path) -> None:
     folder = transforms(tmp_path / "a", ["1.png", "2.png"])
     document = json.loads((folder / "transforms.json").read_text())

@@ -177,16 +177,22 @@ def read_views(
         )
         views.append(replace(picture.view(), sky=sky, mask=mask, actors=actors))
     points = document.get("ply_file_path")
-    return views, None if points is None else read_points(folder / points)
+    return views, None if points is None else read_points(
+        inside(folder, folder / str(points), "ply_file_path")
+    )
 
 
 def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
     """Return the pictures whose files exist, and the names of the others.
 
     Raises:
-        InputError: Fewer than two exist.
+        InputError: Fewer than two exist, or one lies outside of the folder.
     """
-    there = [picture for picture in pictures if os.path.isfile(picture.file)]
+    there = [
+        picture
+        for picture in pictures
+        if os.path.isfile(picture.file) and inside(folder, picture.file, picture.where)
+    ]
     missing = tuple(
         picture.file.as_posix().removeprefix(f"{folder.as_posix()}/")
         for picture in pictures
@@ -347,12 +353,26 @@ def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:
     if key not in picture.more:
         return None
     image = read_photograph(
-        _file(folder, picture.more, key, picture.where),
+        inside(folder, _file(folder, picture.more, key, picture.where), picture.where),
         picture.lens,
         picture.where,
         cv2.IMREAD_GRAYSCALE,
     )
     return np.asarray(picture.lens.straightened(image) > 127)
+
+
+def inside(folder: Path, path: Path, where: str) -> Path:
+    """Return the path of a file that a folder's document names.
+
+    Raises:
+        InputError: It leads out of the folder.
+    """
+    if not os.path.abspath(path).startswith(os.path.join(os.path.abspath(folder), "")):
+        raise InputError(
+            f"{where}: {path} lies outside of {folder}",
+            "Put the file with the poses into a folder that holds what it names",
+        )
+    return path
 
 
 def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
