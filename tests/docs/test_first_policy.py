@@ -15,6 +15,7 @@ from alpasim_plugin.cli.main import run_command
 INSIDE = " " * 8
 
 
+@pytest.mark.slow
 def test_every_step_of_the_page_does_what_it_says(
     repo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

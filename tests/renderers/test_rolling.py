@@ -88,7 +88,17 @@ HARD = {
 
 
 @pytest.mark.parametrize("device", ["cpu", "bands"])
-@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "all",
+        "turning on the spot",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("driving", "turning", "passing car")
+        ),
+    ],
+)
 def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
     scenario: Scenario, draw: Draw, name: str, device: str
 ) -> None:
