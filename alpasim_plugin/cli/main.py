@@ -223,7 +223,8 @@ def usual(args: list[str]) -> list[str]:
         else:
             words.append(word)
     if words[:1] == ["help"]:
-        return [*words[1:2], "--help"]
+        is_known = len(words) == 1 or words[1] in verbs()
+        return [*words[1:2], "--help"] if is_known else words[1:2]
     if words and words[0] in ("version", "-v", "-V"):
         return ["--version", *words[1:]]
     if len(words) > 1 and words[0] in ANYWHERE and words[1] in verbs():

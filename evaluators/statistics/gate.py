@@ -257,10 +257,11 @@ def judge(
     base_sides = sides if stored is None else _sides(stored)
     is_paired = any(rule.is_paired for rule in spec.metrics.values())
     base = _base(list(sides), spec, list(base_sides), owner, is_paired)
+    compares = is_paired or stored is not None or spec.baseline is not None
     checks: list[Check] = []
     for variant in _judged(list(sides), spec, base, is_paired):
         side = sides[variant]
-        if is_paired:
+        if compares:
             other = _partner(variant, base, list(base_sides), owner)
             label = short_name(other, variant)
             other_side = as_policy(base_sides[other], variant.policy)
@@ -280,7 +281,7 @@ def judge(
     failures = failures_of(rollouts)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
     outcomes.append(outcome_of_failures(failures, spec.max_failed))
-    name = stored_name
+    name = "limits alone" if stored is None else stored_name
     if base is not None and stored is None:
         kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
         name = f"{kind}{base.name} of the same run"
@@ -432,7 +433,8 @@ def _of_suite(
     named, others = checks[: len(rules)], checks[len(rules) :]
     if any(check.cause == "regression" for check in named):
         return named
-    return [*named, *(check for check in others if check.cause == "regression")]
+    happened = [change.n_new > 0 for change in changes[len(rules) :]]
+    return [*named, *(check for check, new in zip(others, happened, strict=True) if new)]
 
 
 def _suite_check(

@@ -326,6 +326,18 @@ def test_a_stored_baseline_meets_the_renderer_of_the_same_name() -> None:
     assert verdict.baseline == "main.json"
 
 
+def test_a_gate_of_limits_names_a_new_collision_where_there_is_a_baseline() -> None:
+    stored = rows()
+    collided = add(1.0, "collision_any", ONE)(rows())
+    limits = gate(metrics={"lateral_distance_m": MetricRule(max=9.0)})
+    assert judged(collided, limits, stored, "main.json").exit_code == 1
+    assert judged(rows(), limits, stored, "main.json").exit_code == 0
+    assert judged(collided, limits).baseline == "limits alone"
+    accepted = judged(collided, limits.model_copy(update={"max_new": 1}), stored, "main.json")
+    assert accepted.exit_code == 0
+    assert any("collision_any" in check.text for check in accepted.checks)
+
+
 def test_names_that_are_not_there_are_refused() -> None:
     one = rows("clean")
     for run, spec in (

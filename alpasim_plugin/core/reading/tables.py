@@ -72,7 +72,7 @@ def _open(source: Any, where: Path | str, do_this: str) -> Any:
     if source is where:
         check_regular(source, do_this=do_this)
     with parsing(where, do_this, NO_PARQUET):
-        file = pq.ParquetFile(source)
+        file = pq.ParquetFile(source, page_checksum_verification=True)
         facts = file.metadata
         TABLE_ROWS.check(facts.num_rows, where)
         TABLE_COLUMNS.check(facts.num_columns, where)

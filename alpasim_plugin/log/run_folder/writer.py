@@ -162,7 +162,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a table as parquet atomically, compressed with zstd."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
     write_bytes(path, sink.getvalue().to_pybytes())
 
 
@@ -173,7 +173,7 @@ def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         atomic_file(path) as partial,
-        pq.ParquetWriter(partial, schema, compression="zstd") as writer,
+        pq.ParquetWriter(partial, schema, compression="zstd", write_page_checksum=True) as writer,
     ):
         held: list[pa.Table] = []
         rows = 0

@@ -27,6 +27,7 @@ from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import write_splat
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.run_folder.writer import write_parquet
 from scenarios.load import load_scenario
 from tests.core.reading.past_failures import png_header
 from tests.gaussians.gaussian_scenes import random_cloud
@@ -97,3 +98,19 @@ def test_damaged_files_are_refused_or_read(
     path.write_bytes(content)
     with suppress(SimrunError):
         READERS[name][1](path)
+
+
+def test_a_bit_that_turned_in_a_table_is_never_read_as_another_value(tmp_path: Path) -> None:
+    path = tmp_path / "rollouts.parquet"
+    table = pa.table({"collision_any": [1.0, 0.0, 1.0, 0.0] * 8, "scene": ["a", "b"] * 16})
+    write_parquet(path, table)
+    data = path.read_bytes()
+    refused = 0
+    for place in range(4, len(data) - 8, 7):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        try:
+            found = read_parquet(path, {"collision_any": "number"})
+            assert found.column("collision_any").equals(table["collision_any"])
+        except SimrunError:
+            refused += 1
+    assert refused > 5
