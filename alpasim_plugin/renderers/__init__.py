@@ -5,6 +5,7 @@ from __future__ import annotations
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.renderers.weather import in_weather
 
 
 def make_renderer(
@@ -29,4 +30,4 @@ def make_renderer(
     renderer: Renderer = build(
         unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads
     )
-    return renderer
+    return in_weather(renderer, scenario.environment)

@@ -17,6 +17,7 @@ from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.reconstruction import ImportedRenderer, exposure_near
 from alpasim_plugin.renderers.recorded import photograph_camera, photograph_image
+from alpasim_plugin.renderers.weather import FOG_SRGB
 from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, recorded_drive
 
 
@@ -48,6 +49,15 @@ def test_the_sky_is_opaque_and_has_no_depth(frame: Frame) -> None:
     assert np.all(frame.depth[up] == 0)
     assert abs(float(frame.rgb[up].mean()) - SKY_LEVEL * EXPOSURE) < 3
     assert frame.depth[-1, WIDE // 2] > 1
+
+
+def test_fog_hides_the_sky_of_an_imported_drive(drive: Scenario) -> None:
+    foggy = replace(drive, environment=replace(drive.environment, fog_visibility_m=50.0))
+    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
+    T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
+    request = RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us))
+    shown = make_renderer("3dgs", foggy, threads=1).render(request)
+    assert (shown.rgb[: HIGH // 2 - 4] == FOG_SRGB).all()
 
 
 def test_a_hole_below_the_horizon_stays_a_hole(drive: Scenario) -> None:
