@@ -2,7 +2,7 @@
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:5]
 
-Then ``python docs/scripts/headline.py`` writes what README.md and docs/results.md say of it. SCENES
+Then ``python docs/scripts/headline.py`` writes what README.md and docs/experiments/index.md say of it. SCENES
 is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen
 ones; RUNS (default: runs/closed-loop) keeps the run folders, so a second call continues an
 interrupted first one. Behind a policy's name stands its number of seeds.

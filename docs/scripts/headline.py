@@ -1,4 +1,4 @@
-"""Write the headline about driving into README.md and docs/results.md, from one record:
+"""Write the headline about driving into README.md and docs/experiments/index.md, from one record:
 docs/experiments/fixer-closed-loop.md.
 
     python docs/scripts/headline.py [--check]
@@ -24,7 +24,7 @@ BASELINE = "3dgs"
 TRUE = "clean"
 FIXED, BARE = "onefixer", "onefixer[references=0]"
 EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
-SAFER = "| Does it make driving safer? "  # how rows of docs/results.md begin
+SAFER = "| Does it make driving safer? "  # how rows of docs/experiments/index.md begin
 KEEPS = "| Does it keep the car on its path? "
 
 
@@ -144,11 +144,11 @@ def sentence(record: Record) -> str:
 
 
 def rows(record: Record) -> dict[str, str]:
-    """Return the rows of docs/results.md, by how they begin."""
+    """Return the rows of docs/experiments/index.md, by how they begin."""
     diff, low, high = record.difference(FIXED)
     wide = record.over_families(FIXED)
     family, rest = record.without(FIXED)
-    link = "[closed loop](experiments/fixer-closed-loop.md)"
+    link = "[closed loop](fixer-closed-loop.md)"
     return {
         SAFER: f"{SAFER}`{POLICY}`, {record.scenes} test scenes x {record.seeds} seeds, "
         f"{record.length}: off-road or at-fault contact, `{TRUE}` {record.share(TRUE)}, "
@@ -163,7 +163,7 @@ def rows(record: Record) -> dict[str, str]:
 
 def written(record: Record) -> dict[Path, str]:
     """Return the pages as they should be."""
-    readme, results = DOCS.parent / "README.md", DOCS / "results.md"
+    readme, results = DOCS.parent / "README.md", DOCS / "experiments" / "index.md"
     text = results.read_text(encoding="utf-8")
     for begins, row in rows(record).items():
         text, found = re.subn(rf"^{re.escape(begins)}.*$", lambda _, row=row: row, text, flags=re.M)

@@ -183,7 +183,7 @@ PRESETS: dict[str, Preset] = {
 DEFAULT = "strict"  # for verdicts of our own; the others are conventions that are named
 
 # Least and greatest share of contacts, in percent, that fall between two logged instants, in two
-# samples (docs/presets.md).
+# samples (docs/metrics.md).
 UNSEEN = {"100 ms": (2, 5), "200 ms": (3, 14), "500 ms": (8, 49)}
 
 

@@ -394,7 +394,7 @@ METRICS = MetricTable(
             margin=0.1,
             cap=LEFT_ROUTE_M,
             reference=CENTRE,
-            formula="distance from `c` to `P` as it stands: the paper's route distance, which [charges for driving past the end](presets.md)",
+            formula="distance from `c` to `P` as it stands: the paper's route distance, which [charges for driving past the end](metrics.md#presets)",
         ),
         "lateral_bias_m": _metres(
             "mean signed distance to the side of the recorded path, left of it positive",

@@ -3,7 +3,7 @@ range in which the score then lies.
 
 A part that a log cannot give is not measured, never 0. The score is then known only if the others
 decide it; its least and its greatest possible value are always given. What each benchmark publishes
-and how far our logs go is in docs/presets.md.
+and how far our logs go is in docs/metrics.md.
 """
 
 from __future__ import annotations

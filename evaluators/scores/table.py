@@ -42,7 +42,7 @@ ENDS = {  # ending of a score's name -> what it adds, and where it has no value
     "_least": ("; nothing for what is not measured", "never"),
     "_most": ("; full marks for what is not measured", "never"),
 }
-NOT_MEASURED = "[what it reads is not there](presets.md#other-benchmarks)"
+NOT_MEASURED = "[what it reads is not there](metrics.md#other-benchmarks)"
 
 
 def _share(text: str, invalid: str) -> MetricInfo:

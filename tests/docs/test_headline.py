@@ -47,7 +47,7 @@ def headline(repo: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_readme_and_results_say_what_the_record_says(headline: ModuleType) -> None:
     pages = headline.written(headline.read_record(headline.RECORD.read_text(encoding="utf-8")))
-    assert {path.name for path in pages} == {"README.md", "results.md"}
+    assert {path.name for path in pages} == {"README.md", "index.md"}
     for path, text in pages.items():
         assert path.read_text(encoding="utf-8") == text, "run python docs/scripts/headline.py"
 
