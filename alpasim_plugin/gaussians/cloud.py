@@ -14,7 +14,7 @@ import numpy.typing as npt
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.gaussians.constants import LOG_SCALE_LIMIT
+from alpasim_plugin.gaussians.constants import EPS2D_PX2, LOG_SCALE_LIMIT, MIP_PX2
 from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
 
 FloatArray = npt.NDArray[np.floating]
@@ -63,9 +63,12 @@ class GaussianCloud:
         opacities: ``(N,)`` linear, 0..1.
         sh: ``(N, K, 3)`` colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16; RGB = 0.5 + sum_k
             Y_k(view direction) sh_k.
+        antialias_px2: Variance of the 2D filter that the model was trained with and that an
+            opacity pays for (Mip-Splatting, equation 10), pixels^2: ``MIP_PX2`` or ``EPS2D_PX2``;
+            0 for a model trained without antialiasing.
 
     Raises:
-        InputError: Shapes disagree or K is not a full degree. Values are not inspected here: see
+        InputError: Shapes disagree, K is not a full degree or the filter is another. Values are not inspected here: see
             `cleaned`.
     """
 
@@ -74,8 +77,10 @@ class GaussianCloud:
     scales: FloatArray
     opacities: FloatArray
     sh: FloatArray
+    antialias_px2: float = 0.0
 
     def __post_init__(self) -> None:
+        found = {}
         for name in ("means", "quats", "scales", "opacities", "sh"):
             value = np.asarray(getattr(self, name))
             if value.dtype not in (np.float32, np.float64):
@@ -85,14 +90,18 @@ class GaussianCloud:
             value = value.view()
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+            found[name] = value.shape
         n = self.means.shape[0] if self.means.ndim else -1
-        found = {name: value.shape for name, value in vars(self).items()}
         colours = [(n, size, 3) for size in SH_SIZES]
         wanted = ((n, 3), (n, 4), (n, 3), (n,))
         if n < 0 or tuple(found.values())[:4] != wanted or found["sh"] not in colours:
             raise InputError(
                 f"{n} means: {', '.join(f'{name} {shape}' for name, shape in found.items())}",
                 "give means (N,3), quats (N,4), scales (N,3), opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
+            )
+        if self.antialias_px2 not in (0.0, MIP_PX2, EPS2D_PX2):
+            raise InputError(
+                f"a 2D filter of {self.antialias_px2} px^2", f"give 0, {MIP_PX2} or {EPS2D_PX2}"
             )
 
     def __len__(self) -> int:
@@ -233,7 +242,14 @@ class GaussianCloud:
         of a slice.
         """
         i = index if isinstance(index, slice) else np.asarray(index)
-        return GaussianCloud(*(array[i] for array in vars(self).values()))
+        return GaussianCloud(
+            self.means[i],
+            self.quats[i],
+            self.scales[i],
+            self.opacities[i],
+            self.sh[i],
+            self.antialias_px2,
+        )
 
     def transformed(self, T: F64) -> GaussianCloud:
         """Return the cloud moved by a rigid transform, colours turning with the object.
@@ -264,15 +280,25 @@ class GaussianCloud:
     def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
         """Join clouds in the order given (which decides equal depths); lower degrees are padded
         with zero coefficients.
+
+        Raises:
+            InputError: They were trained with different antialiasing.
         """
         if not clouds:
             return GaussianCloud.empty()
+        filters = {cloud.antialias_px2 for cloud in clouds}
+        if len(filters) > 1:
+            raise InputError(
+                f"clouds of different antialiasing: {sorted(filters)} px^2",
+                "draw them as parts of a scene, each with its own",
+            )
         size = max(cloud.sh.shape[1] for cloud in clouds)
         rows = []
         for c in clouds:
             sh = np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0)))
             rows.append((c.means, c.quats, c.scales, c.opacities, sh))
-        return GaussianCloud(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+        columns = [np.concatenate(column) for column in zip(*rows, strict=True)]
+        return GaussianCloud(*columns, antialias_px2=filters.pop())
 
 
 def quat_multiply(a: F64, b: F64) -> F64:
@@ -333,6 +359,7 @@ class GaussianArrays(NamedTuple):
         opacities: ``(N,)`` linear, 0..1.
         sh: ``(N, K, 3)`` colour coefficients, constant term first.
         notes: What the file says that was applied, or is not drawn.
+        antialias_px2: See `GaussianCloud`.
     """
 
     means: FloatArray
@@ -341,6 +368,7 @@ class GaussianArrays(NamedTuple):
     opacities: FloatArray
     sh: FloatArray
     notes: tuple[str, ...] = ()
+    antialias_px2: float = 0.0
 
 
 def sigmoid(x: FloatArray) -> F64:
@@ -367,12 +395,16 @@ def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
     kept = min(k, SH_SIZES[-1])
     cloud, report = GaussianCloud.cleaned(*arrays[:4], arrays.sh[:, :kept])
     notes = arrays.notes
+    if arrays.antialias_px2:
+        notes += (
+            f"trained with antialiasing: drawn so, with a filter of {arrays.antialias_px2} px^2",
+        )
     if k > kept:
         left_out = float(np.nanmax(np.abs(arrays.sh[:, kept:]), initial=0.0))
         notes += (
             f"harmonics of degree {SH_SIZES.index(kept) + 1} and above are left out; the largest coefficient is {left_out:.2g}",
         )
-    return cloud, replace(report, notes=notes)
+    return replace(cloud, antialias_px2=arrays.antialias_px2), replace(report, notes=notes)
 
 
 def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:

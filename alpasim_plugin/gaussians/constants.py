@@ -15,6 +15,7 @@ import numpy as np
 NEAR_M = 0.1  # a 5 cm splat closer than this smears over the whole frame
 FAR_M = 1.0e10
 EPS2D_PX2 = 0.3  # low-pass added to the screen covariance
+MIP_PX2 = 0.1  # that of Mip-Splatting and Brush, for models trained with antialiasing
 ALPHA_MAX = float(np.float32(0.99))
 ALPHA_MIN = float(np.float32(1.0 / 255.0))
 TRANSMITTANCE_STOP = float(np.float32(1.0e-4))
@@ -40,15 +41,16 @@ CAM_WIDTH, CAM_HEIGHT = 8, 9
 CAM_TIME_U, CAM_TIME_V, CAM_TIME_0 = 10, 11, 12
 CAM_REACH = 13
 
-# A node's pose, one float64 array: rotation node to camera, camera centre in the node, and the depth
-# range.
+# A node's pose, one float64 array: rotation node to camera, camera centre in the node, the 2D filter
+# of its cloud (`GaussianCloud.antialias_px2`) and the depth range.
 POSE_ROTATION = 0
 POSE_CENTRE = 9
-POSE_NEAR = 12
-POSE_FAR = 13
-POSE_TURN = 14  # rotation vector and shift of the node as the camera sees it, over the shutter
-POSE_SHIFT = 17
-POSE_SIZE = 20
+POSE_ANTIALIAS = 12
+POSE_NEAR = 13
+POSE_FAR = 14
+POSE_TURN = 15  # rotation vector and shift of the node as the camera sees it, over the shutter
+POSE_SHIFT = 18
+POSE_SIZE = 21
 
 # One group of sixteen prepared Gaussians: columns of sixteen lanes each.
 GEO_FACTOR = 0  # nine columns: R_q diag(s), row by row

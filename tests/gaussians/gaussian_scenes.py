@@ -78,3 +78,32 @@ def assert_same_image(
         assert odd <= odd_share, (
             f"{name}: {odd:.2%} of pixels differ by more than {tolerance}, at most {error.max():.3g}"
         )
+
+
+def needle(length_px: float, angle: float) -> GaussianCloud:
+    quat = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+    return splats([0.1, -0.05, 2.0], [[length_px / 40, 0.02, 0.003]], 0.9, quats=quat)
+
+
+def kilometre_splats() -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600])
+    return splats(means, 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
+
+
+HARD = {
+    "no Gaussian": random_cloud(0),
+    "all shapes": random_cloud(200, 4),
+    "constant colours": random_cloud(60, 5, degree=0),
+    "harmonics of degree 1": random_cloud(60, 6, degree=1),
+    "harmonics of degree 2": random_cloud(60, 7, degree=2),
+    "saturated layers": splats(np.column_stack([np.zeros((8, 2)), np.arange(2.0, 10)]), 5.0, 1.0),
+    "kilometre splats": kilometre_splats(),
+    "zero scale": splats([0, 0, 3.0], 0.0, 0.9),
+    "centre behind": splats([0, 0, -0.5], 3.0, 0.9),
+    "far off axis": splats([9.8, 0, 1.7], 0.3, 0.95),
+    "needle of 10 pixels": needle(10, 0.3),
+    "needle of 1,000 pixels": needle(1_000, 1.1),
+    "needle of 10,000 pixels": needle(10_000, 2.0),
+    "overflowing width": splats([0, 0, 5.0], [[np.exp(19.9), 1e-30, 1.0]], 0.5),
+}

@@ -5,6 +5,7 @@ countless splats, bad numbers.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,9 +14,10 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.cloud import quat_multiply
-from alpasim_plugin.gaussians.constants import ALPHA_MAX
+from alpasim_plugin.gaussians.constants import ALPHA_MAX, EPS2D_PX2, MIP_PX2
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.gaussians.gaussian_scenes import (
+    HARD,
     LSB,
     assert_same_image,
     camera,
@@ -377,3 +379,35 @@ def test_quaternion_product_is_the_product_of_rotations():
     a, b = random_cloud(20, 1), random_cloud(20, 2)
     product = GaussianCloud(a.means, quat_multiply(a.quats, b.quats), a.scales, a.opacities, a.sh)
     assert np.abs(product.rotations() - a.rotations() @ b.rotations()).max() < 1e-12
+
+
+@pytest.mark.parametrize("antialias_px2", [MIP_PX2, EPS2D_PX2])
+@pytest.mark.parametrize("name", HARD)
+def test_a_model_of_antialiasing_matches_float64(name, antialias_px2):
+    cloud, behind = replace(HARD[name], antialias_px2=antialias_px2), (0.2, 0.3, 0.4)
+    wanted = rasterize_reference(cloud, camera(), behind, brute=True)
+    assert_same_image(rasterize(cloud, camera(), behind), wanted, LSB)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_antialiasing_keeps_what_a_small_splat_covers_in_all(backend):
+    # The integral of alpha over the image is that without any filter, 2 pi sigma^2 opacity, in
+    # place of 2 pi (sigma^2 + 0.3) opacity.
+    sigma_px = 0.5
+    cloud = splats([0, 0, 10.0], sigma_px * 10 / camera().fx, 0.9)
+    plain, kept = (
+        rasterize(replace(cloud, antialias_px2=px2), camera(), backend=backend).alpha.sum()
+        for px2 in (0.0, EPS2D_PX2)
+    )
+    assert plain == pytest.approx(2 * np.pi * (sigma_px**2 + EPS2D_PX2) * 0.9, rel=0.03)
+    assert kept == pytest.approx(2 * np.pi * sigma_px**2 * 0.9, rel=0.03)
+
+
+def test_antialiasing_is_refused_by_what_does_not_draw_it():
+    cloud = replace(wall(3.0), antialias_px2=MIP_PX2)
+    for wrong in (
+        lambda: rasterize(cloud, camera(), backend="torch"),
+        lambda: GaussianCloud.concatenate([cloud, wall(2.0)]),
+    ):
+        with pytest.raises(InputError, match="antialiasing"):
+            wrong()

@@ -24,9 +24,10 @@ from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.reading.files import parsing, some_of, unzstd
 from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, quat_multiply
+from alpasim_plugin.gaussians.constants import EPS2D_PX2
 from alpasim_plugin.gaussians.files.ply import (
-    UNFILTERED,
     PlyHeader,
+    antialias_in,
     read_ply_element,
     read_ply_header,
     stated_in,
@@ -78,6 +79,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         opacities=rgba[:, 3],
         sh=np.concatenate([dc[:, None, :], _read_sh(header, len(rows))], axis=1).astype(np.float32),
         notes=stated_in(header),
+        antialias_px2=antialias_in(header),
     )
 
 
@@ -193,8 +195,8 @@ def read_splat(path: Path | str) -> GaussianArrays:
 
 
 def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write a cloud as ``.splat``; bands above the constant colour are lost and colours are clipped
-    to 0..1.
+    """Write a cloud as ``.splat``; bands above the constant colour are lost, antialiasing cannot be
+    stated, and colours are clipped to 0..1.
 
     Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in
     float32.
@@ -280,10 +282,12 @@ def read_spz(path: Path | str) -> GaussianArrays:
         streams = _plain_streams(path, data, header)
         extensions = data[16 + sum(header.stream_bytes) :]
     system = _stated_axes(path, extensions) if header.flags & EXTENDED else SYSTEMS[0]
-    notes: tuple[str, ...] = (UNFILTERED,) if header.flags & ANTIALIASED else ()
+    notes: tuple[str, ...] = ()
     if system != SYSTEMS[0]:
-        notes += (f"axes {system} as the file states them, turned into those of a PLY",)
-    return _in_ply_axes(_decode(header, streams), system)._replace(notes=notes)
+        notes = (f"axes {system} as the file states them, turned into those of a PLY",)
+    arrays = _in_ply_axes(_decode(header, streams), system)
+    antialias_px2 = EPS2D_PX2 if header.flags & ANTIALIASED else 0.0
+    return arrays._replace(notes=notes, antialias_px2=antialias_px2)
 
 
 def _stated_axes(path: Path, data: bytes) -> str:

@@ -30,6 +30,7 @@ from alpasim_plugin.gaussians.cloud import (
     logit,
     sigmoid,
 )
+from alpasim_plugin.gaussians.constants import EPS2D_PX2, MIP_PX2
 
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _REQUIRED = (
@@ -48,7 +49,8 @@ _BESIDE = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "versio
 _FLAT = 1e-3  # thickness of a 2D Gaussian, in its smaller scale
 # Comments that state how a model is to be drawn or how its axes lie.
 _STATED = re.compile(r"ax[ie]s|coordinate|handed|unit|scale|antialias|rendermode|frame", re.I)
-UNFILTERED = "the model was trained with antialiasing, which is not drawn: thin and far Gaussians look more opaque"
+# What Brush and Postshot write of antialiasing, and the 2D filter that they mean, pixels^2.
+_ANTIALIASED = {"SplatRenderMode: mip": MIP_PX2, "antialiased 1": EPS2D_PX2}
 
 
 def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
@@ -89,10 +91,12 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
         scales = np.concatenate([scales, thickness], axis=1)
         notes += ("2D Gaussians are drawn as flat ellipsoids",)
     opacities = sigmoid(_columns(rows, ["opacity"])[:, 0])
+    antialias_px2 = antialias_in(header)
     filtered = [name for name in chosen.properties if name.lower() == "filter_3d"]
     if filtered:
         scales, opacities = smoothed(scales, opacities, _columns(rows, filtered))
-        notes += ("the 3D filter of Mip-Splatting is applied to scales and opacities", UNFILTERED)
+        notes += ("the 3D filter of Mip-Splatting is applied to scales and opacities",)
+        antialias_px2 = MIP_PX2
     return GaussianArrays(
         means=_columns(rows, ("x", "y", "z")),
         quats=_columns(rows, [f"rot_{i}" for i in range(4)]),
@@ -100,6 +104,7 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
         opacities=opacities,
         sh=_sh_from_columns(rows, n_rest),
         notes=notes,
+        antialias_px2=0.0 if flat else antialias_px2,
     )
 
 
@@ -117,21 +122,27 @@ def smoothed(scales: F64, opacities: F64, width: NDArray[np.floating]) -> tuple[
 
 def stated_in(header: PlyHeader) -> tuple[str, ...]:
     """Return notes on the comments of a file that state how it is to be drawn."""
-    notes = [f"the file says {text!r}" for text in header.comments if _STATED.search(text)]
-    antialiased = False
-    for text in header.comments:  # of Brush and of Postshot; the last one counts
-        words = [*text.lower().replace(":", " ").split(), "", ""]
-        if words[0] in ("splatrendermode", "antialiased"):
-            antialiased = words[1] in ("mip", "1", "true")
-    if antialiased:
-        notes.append(UNFILTERED)
-    return tuple(notes)
+    return tuple(f"the file says {text!r}" for text in header.comments if _STATED.search(text))
+
+
+def antialias_in(header: PlyHeader) -> float:
+    """Return the 2D filter that comments of Brush or of Postshot state, pixels^2; the last one
+    counts, and 0 is none.
+    """
+    filters = {text.lower(): px2 for text, px2 in _ANTIALIASED.items()}
+    stated = 0.0
+    for comment in header.comments:
+        text = comment.lower()
+        if text.startswith(("splatrendermode", "antialiased")):
+            stated = filters.get(text, 0.0)
+    return stated
 
 
 def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
     """Write a cloud as a binary little-endian PLY that other 3DGS tools read.
 
-    Means, rotations and colours survive a round trip bit for bit. Scales and opacities pass through
+    Antialiasing is stated in a comment. Means, rotations and colours survive a round trip bit for
+    bit. Scales and opacities pass through
     a logarithm, which float32 cannot hold exactly (relative error up to 5e-7).
 
     Args:
@@ -143,14 +154,17 @@ def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
     """
     path = Path(path)
     rows = ply_rows(cloud)
-    header = _header(len(rows), [f"float {name}" for name in rows.dtype.names or ()])
+    comments = [text for text, px2 in _ANTIALIASED.items() if px2 == cloud.antialias_px2]
+    header = _header(len(rows), [f"float {name}" for name in rows.dtype.names or ()], comments)
     with atomic_file(path) as partial, partial.open("wb") as stream:
         stream.write(header)
         stream.write(rows.tobytes())
 
 
-def _header(count: int, properties: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+def _header(count: int, properties: Sequence[str], comments: Sequence[str] = ()) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {text}" for text in comments]
+    lines += [f"element vertex {count}"]
     lines += [f"property {name}" for name in properties]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 

@@ -25,8 +25,8 @@ from alpasim_plugin.core.reading import parse_json, read_bytes
 from alpasim_plugin.core.reading.files import as_shape, parsing, some_of
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
+from alpasim_plugin.gaussians.constants import EPS2D_PX2
 from alpasim_plugin.gaussians.files.packed import with_largest
-from alpasim_plugin.gaussians.files.ply import UNFILTERED
 
 META = "meta.json"
 DO_THIS = "write it again as SOG of version 2 (splat-transform), or give the PLY"
@@ -128,8 +128,9 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     sh = np.concatenate([constant[:, None], rest], axis=1)
     quats = _rotations(plane(meta["quats"]["files"][0], n))
     antialiased = document.get("antialias") or model == "antialiased"
-    notes = (UNFILTERED,) if antialiased else ()
-    return GaussianArrays(means, quats, scales, colour[:, 3] / 255.0, sh, notes)
+    antialias_px2 = EPS2D_PX2 if antialiased else 0.0
+    opacities = colour[:, 3] / 255.0
+    return GaussianArrays(means, quats, scales, opacities, sh, antialias_px2=antialias_px2)
 
 
 def _plane(data: bytes, where: str) -> U8:

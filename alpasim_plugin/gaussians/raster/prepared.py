@@ -44,6 +44,7 @@ class PreparedCloud:
         index: int64, position of each lane's Gaussian in the cloud given.
         spheres: float64, bounding sphere per bundle.
         sphere: float64 ``(SPHERE_SIZE,)``, bounding sphere of all.
+        antialias_px2: See `GaussianCloud`.
     """
 
     n_input: int
@@ -55,6 +56,7 @@ class PreparedCloud:
     index: npt.NDArray[np.int64]
     spheres: F64
     sphere: F64
+    antialias_px2: float
 
     def __len__(self) -> int:
         """Return the number of Gaussians kept."""
@@ -117,6 +119,7 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
         np.concatenate([index, np.zeros(-n % _LANES, np.int64)]).astype(np.int64),
         _bounding_spheres(means, reach, BUNDLE),
         _bounding_spheres(means, reach, max(n, 1)) if n else np.zeros(SPHERE_SIZE),
+        cloud.antialias_px2,
     )
 
 

@@ -40,6 +40,7 @@ from alpasim_plugin.gaussians.constants import (
     L12,
     L22,
     PEAK,
+    POSE_ANTIALIAS,
     POSE_CENTRE,
     POSE_FAR,
     POSE_NEAR,
@@ -302,7 +303,8 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     mm = _dot(m, m)
     nn = _dot(n, n)
     mn = _dot(m, n)
-    eps = v.splat(_EPS)
+    antialias = _f(pose[POSE_ANTIALIAS])
+    eps = v.splat(antialias if antialias > 0 else _EPS)
     c11, c22 = mm + eps, nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
     radius_x, radius_y = extent * v.sqrt(c11), extent * v.sqrt(c22)
@@ -323,7 +325,8 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     x02 = v.fnma(m[2], n[0], m[0] * n[2])
     x12 = v.fnma(m[2], n[1], m[1] * n[2])
     minors = x01 * root, x02 * root, x12 * root
-    variance = _dot(minors, minors) + eps * ((c11 + nn) * inverse_c22)
+    raw_variance = _dot(minors, minors)
+    variance = raw_variance + eps * ((c11 + nn) * inverse_c22)
     deviation = v.sqrt(variance)
     scale = v.splat(_f(EXPONENT_SCALE))
     l11 = scale / deviation
@@ -331,6 +334,13 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     l12 = v.negative(l11 * slope)
     l22 = scale * root
     peak = v.load(geometry, geo + GEO_PEAK * 16)
+    if antialias > 0:
+        # The share of the determinants: an opacity times its root, and so many octaves less.
+        v.store(lanes, PEAK * 16, raw_variance / variance)
+        for lane in range(PEAK * 16, PEAK * 16 + 16):
+            lanes[lane] = np.log2(lanes[lane]) / _f(16.0)
+        peak = peak + v.load(lanes, PEAK * 16)
+        chosen &= v.bits(peak >= v.splat(_f(_CUT)))
     block_half = v.splat(_BLOCK_HALF)
     corner_s, corner_t = block_half * (l11 + v.absolute(l12)), block_half * l22
     block_radius = (

@@ -27,6 +27,7 @@ from alpasim_plugin.gaussians.constants import (
     BUNDLE,
     FAR_M,
     NEAR_M,
+    POSE_ANTIALIAS,
     POSE_CENTRE,
     POSE_FAR,
     POSE_NEAR,
@@ -103,6 +104,7 @@ def rasterize_prepared(
     behind = background_image(background, camera)
     view = camera_numbers(camera)
     poses = node_poses([T for _, T in nodes], camera, near_m)
+    poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
     if camera.rolling is not None:
         still = camera.motion(_IDENTITY, _IDENTITY)
         for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
@@ -271,8 +273,8 @@ def node_poses(
     camera: PinholeCamera,
     near_m: float,
 ) -> F64:
-    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large
-    coordinates happen here, in float64.
+    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``, of clouds without antialiasing;
+    all differences of large coordinates happen here, in float64.
 
     Args:
         T_world_nodes: Rigid transforms; None is the identity.
@@ -293,7 +295,7 @@ def node_poses(
     rotation = T_world_node[:, :3, :3]
     placed = np.zeros((len(given), POSE_SIZE))
     placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
-    placed[:, POSE_CENTRE:POSE_NEAR] = np.einsum(
+    placed[:, POSE_CENTRE:POSE_ANTIALIAS] = np.einsum(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
     )
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M

@@ -346,9 +346,15 @@ def rasterize_torch(
     UTM-sized coordinates cost no precision.
 
     Raises:
-        InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
+        InputError: The cloud holds Gaussians that cannot be drawn or was trained with antialiasing,
+            or the background does not fit.
     """
     cloud.require_drawable()
+    if cloud.antialias_px2:
+        raise InputError(
+            f"a cloud trained with antialiasing ({cloud.antialias_px2} px^2): a fit knows none",
+            "draw it with another backend",
+        )
     behind = torch.as_tensor(background_image(background, camera)).expand(
         camera.height, camera.width, 3
     )

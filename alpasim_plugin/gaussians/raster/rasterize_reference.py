@@ -2,7 +2,8 @@
 implementation for the fast backends.
 
 Zwicker et al., EWA Splatting (2002), with the first-order projection of Kerbl et al., 3D Gaussian
-Splatting (2023), and the constants of `alpasim_plugin.gaussians.constants`.
+Splatting (2023), and the constants of `alpasim_plugin.gaussians.constants`; the 2D filter of
+antialiased models is that of Yu et al., Mip-Splatting (2024), equation 10.
 """
 
 from __future__ import annotations
@@ -102,8 +103,12 @@ def project_gaussians(
         jacobian @ T[:3, :3] @ cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :], 1, 0
     )
     raw = np.stack([np.sum(m * m, axis=1), np.sum(m * n, axis=1), np.sum(n * n, axis=1)], axis=1)
-    cov = raw + np.array([EPS2D_PX2, 0.0, EPS2D_PX2])
-    det = np.sum(np.cross(m, n) ** 2, axis=1) + EPS2D_PX2 * (raw[:, 0] + raw[:, 2]) + EPS2D_PX2**2
+    eps = cloud.antialias_px2 or EPS2D_PX2
+    cov = raw + np.array([eps, 0.0, eps])
+    raw_det = np.sum(np.cross(m, n) ** 2, axis=1)
+    det = raw_det + eps * (raw[:, 0] + raw[:, 2]) + eps**2
+    if cloud.antialias_px2:
+        opacity = opacity * np.sqrt(raw_det / det)
     extent = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 

@@ -19,7 +19,13 @@ from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, EXTENT_MAX_SIGMA, NEAR_M, TILE
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MIN,
+    EXTENT_MAX_SIGMA,
+    NEAR_M,
+    POSE_ANTIALIAS,
+    TILE,
+)
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.rasterize_cpu import node_poses
 
@@ -61,6 +67,7 @@ class UploadedClouds:
         for cloud in clouds:
             cloud.require_drawable()
         self.sizes = [len(cloud) for cloud in clouds]
+        self.antialias_px2 = [cloud.antialias_px2 for cloud in clouds]
         self.first = [0, *np.cumsum(self.sizes).tolist()]
         self.sh_size = max((cloud.sh.shape[1] for cloud in clouds), default=1)
         opacity = _joined([cloud.opacities.astype(np.float64) for cloud in clouds], ())
@@ -98,6 +105,7 @@ class UploadedClouds:
         behind = background_image(background, camera)
         spans = self._spans([cloud for cloud, _ in nodes])
         poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
+        poses[:, POSE_ANTIALIAS] = [self.antialias_px2[cloud] for cloud, _ in nodes]
         while True:
             image, pairs, visible = self._image(spans, poses, camera, near_m)
             if pairs <= self.capacity:

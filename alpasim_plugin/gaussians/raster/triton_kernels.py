@@ -15,7 +15,7 @@ import triton.language as tl
 
 from alpasim_plugin.gaussians import constants, sh
 
-POSE = 12  # float64 per node: rotation node to camera by rows, camera centre in the node
+POSE = 13  # float64 per node: rotation node to camera by rows, camera centre in it, its 2D filter
 SPAN = 3  # int32 per block: number of the node, first Gaussian, number of Gaussians
 CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
 RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
@@ -104,7 +104,7 @@ def project(
     lane = tl.arange(0, BLOCK)
     present = lane < tl.load(spans + block * 3 + 2)
     i = (tl.load(spans + block * 3 + 1) + lane).to(tl.int64)
-    pose = poses + node * 12
+    pose = poses + node * 13
     r00 = tl.load(pose)
     r01 = tl.load(pose + 1)
     r02 = tl.load(pose + 2)
@@ -158,15 +158,18 @@ def project(
     n2 = jy0 * f02 + jy1 * f12 + jy2 * f22
     mm = m0 * m0 + m1 * m1 + m2 * m2
     nn = n0 * n0 + n1 * n1 + n2 * n2
-    c11 = mm + _EPS2D_PX2
-    c22 = nn + _EPS2D_PX2
+    antialias = tl.load(pose + 12).to(tl.float32)
+    eps = tl.where(antialias > 0, antialias, _EPS2D_PX2)
+    c11 = mm + eps
+    c22 = nn + eps
     c12 = m0 * n0 + m1 * n1 + m2 * n2
     # The determinant as a sum of squares (Cauchy-Binet) does not cancel for needles.
     cross0 = m1 * n2 - m2 * n1
     cross1 = m2 * n0 - m0 * n2
     cross2 = m0 * n1 - m1 * n0
-    det = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
-    det += _EPS2D_PX2 * (mm + nn) + _EPS2D_PX2 * _EPS2D_PX2
+    raw_det = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
+    det = raw_det + eps * (mm + nn) + eps * eps
+    opacity *= tl.where(antialias > 0, tl.sqrt(raw_det / det), 1.0)
     l11 = tl.sqrt(c22 / det)
     l22 = 1.0 / tl.sqrt(c22)
     extent = tl.load(extents + i, present, 0.0)
