@@ -6,6 +6,7 @@ Every file is made here; photographs are left out where they do not matter.
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -272,20 +273,113 @@ def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(
     [
         ("cameras.txt", "8 PINHOLE 320 128 180 180 160 54\n", "camera 7"),
         ("images.txt", "IMAGE_ID QW QX QY QZ\n", "IMAGE_ID"),
-        ("rigs.txt", "1 1 CAMERA 7\n", None),
+        ("rigs.txt", "1 2 CAMERA 7\n", "rigs.txt"),
+        ("frames.txt", "1 1 one 0 0 0 0 0 0 1 CAMERA 7 1\n", "frames.txt"),
     ],
 )
-def test_what_a_colmap_model_lacks_or_has_besides_is_said(
-    tmp_path: Path, file: str, text: str, found: str | None
+def test_what_a_colmap_model_lacks_is_said(
+    tmp_path: Path, file: str, text: str, found: str
 ) -> None:
     model = tmp_path / "sparse/0"
     colmap(model, [f"{i}.png" for i in range(13)])
     (model / file).write_text(text)
-    if found is None:
-        assert any("rigs" in note for note in read_source(tmp_path, photographs=False).notes)
-    else:
-        with pytest.raises(InputError, match=found):
-            read_source(tmp_path, photographs=False)
+    with pytest.raises(InputError, match=found):
+        read_source(tmp_path, photographs=False)
+
+
+SIDE = np.eye(4)
+SIDE[:3] = [[0, 0, -1, 0], [0, 1, 0, 0.1], [1, 0, 0, -0.3]]  # from the front camera to the left one
+
+
+def rig(
+    model: Path, folders: tuple[str, str], left: list[int], binary: bool = False, turn: float = 1.0
+) -> Path:
+    """Write a rig of two cameras, 7 ahead and 9 to the left, which has images of some frames only;
+    frames and images are numbered against their order.
+    """
+    model.mkdir(parents=True)
+    lens = f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 160 54"
+    (model / "cameras.txt").write_text(f"7 {lens}\n9 {lens}\n")
+    (model / "points3D.txt").write_text("1 1.0 0.0 0.0 90 90 90 0.5 1 0\n")
+
+    def numbers(T: np.ndarray) -> str:
+        return " ".join(repr(float(v)) for v in [*quat_from_matrix(T[:3, :3]), *T[:3, 3]])
+
+    images, frames = [], []
+    for i, pose in enumerate(poses(13)):
+        ahead, aside = 100 - i, 200 - i
+        T_rig_world = np.linalg.inv(pose)
+        images.append(f"{ahead} {numbers(T_rig_world)} 7 {folders[0]}{i}.png")
+        data = f"1 CAMERA 7 {ahead}"
+        if i in left:
+            images.append(f"{aside} {numbers(SIDE @ T_rig_world)} 9 {folders[1]}{i}.png")
+            data = f"2 CAMERA 9 {aside} CAMERA 7 {ahead}"
+        frames.append(f"{50 - i} 3 {numbers(T_rig_world)} {data}")
+    mount = SIDE.copy()
+    mount[0, 2] *= turn
+    (model / "images.txt").write_text("\n\n".join(images) + "\n")
+    (model / "rigs.txt").write_text(f"# rigs\n3 2 CAMERA 7 CAMERA 9 1 {numbers(mount)}\n")
+    (model / "frames.txt").write_text("# frames\n" + "\n".join(frames[::-1]) + "\n")
+    if binary:
+        as_binary(model)
+    return model
+
+
+def as_binary(model: Path) -> None:
+    """Turn a rig's text files into binary ones."""
+    p = (FOCAL, FOCAL, 160.0, 54.0)
+    cameras = [struct.pack("<IiQQ4d", n, 1, WIDTH, HEIGHT, *p) for n in (7, 9)]
+    images = []
+    for line in (model / "images.txt").read_text().split("\n\n"):
+        words = line.split()
+        pose = struct.pack("<7d", *map(float, words[1:8]))
+        head = struct.pack("<I", int(words[0])) + pose + struct.pack("<I", int(words[8]))
+        images.append(head + words[9].encode() + b"\0" + struct.pack("<Q", 0))
+    mount = map(float, (model / "rigs.txt").read_text().split()[-7:])
+    rigs = [struct.pack("<IIiIiIB7d", 3, 2, 0, 7, 0, 9, 1, *mount)]
+    frames = []
+    for line in (model / "frames.txt").read_text().splitlines()[1:]:
+        words = line.replace("CAMERA", "0").split()
+        head = struct.pack("<II7dI", int(words[0]), 3, *map(float, words[2:9]), int(words[9]))
+        data = [int(word) for word in words[10:]]
+        taken = [struct.pack("<iIQ", *data[at : at + 3]) for at in range(0, len(data), 3)]
+        frames.append(head + b"".join(taken))
+    points = [struct.pack("<Q3d3BdQ", 1, 1.0, 0.0, 0.0, 90, 90, 90, 0.5, 0)]
+    files = {"cameras": cameras, "images": images, "rigs": rigs, "frames": frames}
+    for name, rows in {**files, "points3D": points}.items():
+        (model / f"{name}.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
+        (model / f"{name}.txt").unlink()
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+@pytest.mark.parametrize("folders", [("front/", "left/"), ("a", "b")], ids=["folders", "prefixes"])
+def test_images_of_a_frame_of_a_rig_have_one_time(
+    tmp_path: Path, folders: tuple[str, str], binary: bool
+) -> None:
+    rig(tmp_path / "sparse/0", folders, [0, 1, 4, 12], binary)
+    drive = read_source(tmp_path, photographs=False)
+    names = ["front", "left"] if folders[0] == "front/" else ["camera-7", "camera-9"]
+    assert drive.cameras == names
+    assert along(drive) == STRAIGHT
+    assert [one.t_us for one in drive.of(names[1])] == [0, 100_000, 400_000, 1_200_000]
+    mount = (
+        np.linalg.inv(drive.of(names[0])[4].T_world_camera) @ drive.of(names[1])[2].T_world_camera
+    )
+    assert np.allclose(mount, np.linalg.inv(SIDE), atol=1e-9)
+
+
+def test_a_rig_that_its_images_do_not_fit_is_refused(tmp_path: Path) -> None:
+    rig(tmp_path / "sparse/0", ("front/", "left/"), [0, 4], turn=0.9)
+    with pytest.raises(InputError, match="left/"):
+        read_source(tmp_path, photographs=False)
+
+
+def test_rigs_of_one_camera_change_nothing(tmp_path: Path) -> None:
+    model = tmp_path / "sparse/0"
+    colmap(model, [f"{i}.png" for i in range(13)])
+    (model / "rigs.txt").write_text("1 1 CAMERA 7\n")
+    (model / "frames.txt").write_text("4 1 1 0 0 0 0 0 0 1 CAMERA 7 1\n")
+    assert along(read_source(tmp_path, photographs=False)) == STRAIGHT
 
 
 def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
