@@ -13,8 +13,16 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
 from alpasim_plugin.gaussians.constants import BLOCK_REACH, RADIUS_X, RADIUS_Y, RECORD
 from alpasim_plugin.gaussians.raster import rasterize_cpu as cpu
-from alpasim_plugin.gaussians.raster.binning import depth_order
-from alpasim_plugin.gaussians.raster.raster_kernels import CUT, P0, P1, P2, P3, P4, P5, raster_tiles
+from alpasim_plugin.gaussians.raster.raster_kernels import (
+    CUT,
+    P0,
+    P1,
+    P2,
+    P3,
+    P4,
+    P5,
+    composite_tiles,
+)
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import (
@@ -235,7 +243,7 @@ def test_read_only_and_strided_inputs_meet_the_kernels_that_are_already_compiled
     image = np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (64, 96, 3))
     cloud = random_cloud(50)
     rasterize(cloud, camera())
-    compiled = len(raster_tiles.signatures)
+    compiled = len(composite_tiles.signatures)
     locked = GaussianCloud(
         cloud.means[::2], cloud.quats[::2], cloud.scales[::2], cloud.opacities[::2], cloud.sh[::2]
     )
@@ -246,7 +254,7 @@ def test_read_only_and_strided_inputs_meet_the_kernels_that_are_already_compiled
         rasterize(locked, camera(), np.asfortranarray(image)),
         rasterize_reference(locked, camera(), image),
     )
-    assert len(raster_tiles.signatures) == compiled
+    assert len(composite_tiles.signatures) == compiled
 
 
 def test_exponential_of_the_kernels_is_exact_to_two_millionths():
@@ -271,33 +279,25 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
     tiled = rasterize_prepared([(scene, None)], cam, threads=1)
     seen = {}
 
-    def everywhere(cursor, tiles_x, starts, lists, records, background, rgb, alpha, depth):
-        count = seen["count"]
+    def everywhere(cursor, tiles_x, starts, lists, records, *images):
+        count = len(seen["order"])
         table = records[: count * RECORD].reshape(count, RECORD).copy()
         table[:, [RADIUS_X, RADIUS_Y, BLOCK_REACH]] = 1e30
         n_tiles = len(starts) - 1
-        full = np.tile((seen["order"][:count] & 0xFFFFFFFF).astype(np.int32), n_tiles)
-        raster_tiles(
-            cursor,
-            tiles_x,
-            np.arange(n_tiles + 1) * count,
-            full,
-            table.reshape(-1),
-            background,
-            rgb,
-            alpha,
-            depth,
+        full = np.tile(seen["order"].astype(np.int32), n_tiles)
+        composite_tiles(
+            cursor, tiles_x, np.arange(n_tiles + 1) * count, full, table.reshape(-1), *images
         )
 
-    def counted(count, *args):
-        seen["count"] = count
-        seen["order"] = depth_order(count, *args)
+    def ordered(*args):
+        seen["order"] = depth_order(*args)
         return seen["order"]
 
-    monkeypatch.setattr(cpu, "depth_order", counted)
-    monkeypatch.setattr(cpu, "raster_tiles", everywhere)
+    depth_order = cpu.depth_order
+    monkeypatch.setattr(cpu, "depth_order", ordered)
+    monkeypatch.setattr(cpu, "composite_tiles", everywhere)
     brute = rasterize_prepared([(scene, None)], cam, threads=1)
-    assert seen["count"] > 1000
+    assert len(seen["order"]) > 1000
     assert np.array_equal(tiled.rgb, brute.rgb)
     assert np.array_equal(tiled.depth, brute.depth)
 

@@ -21,8 +21,10 @@ def _floats(x, out):
     v.store(out, 112, v.negative(a))
     v.store(out, 128, v.minimum(a, b))
     v.store(out, 144, v.maximum(a, b))
-    v.store(out, 160, v.select((a < b) & (a > v.splat(np.float32(-0.5))), a, b))
+    v.store(out, 160, v.select((a < b) & (a > -0.5), a, b))
     v.store(out, 176, v.lane_pattern(np.float32(1), np.float32(10)))
+    v.store(out, 192, v.fma(2, a, 1.0) - 3 * v.maximum(a, 0.25))
+    v.store(out, 208, v.select(a > 0.5, a, 0) / 4)
 
 
 @njit
@@ -33,14 +35,14 @@ def _masks(x):
         v.bits(a <= b),
         v.bits(a > b),
         v.bits(a >= b),
-        v.bits((a < b) | (a > b)),
+        v.bits((a <= b) & (a >= b)),
         v.lowest_bit(np.int64(40)),
     )
 
 
 @njit
 def _doubles(x, out):
-    v.store(out, 0, v.to_f32(v.load(x, 0) * v.load(x, 0) - v.splat(np.float64(0.25))))
+    v.store(out, 0, v.to_f32(v.load(x, 0) * v.load(x, 0) - 0.25))
 
 
 @njit
@@ -56,7 +58,7 @@ def _counter(cells):
 def test_float_operations_equal_numpy_lane_by_lane():
     x = np.random.default_rng(0).normal(size=32).astype(np.float32)
     a, b = x[:16], x[16:]
-    out = np.zeros(192, np.float32)
+    out = np.zeros(224, np.float32)
     _floats(x, out)
     exact = [
         a + b,
@@ -77,8 +79,10 @@ def test_float_operations_equal_numpy_lane_by_lane():
     assert np.allclose(out[80:96], a - a * b, rtol=1e-5, atol=1e-6)
     assert np.array_equal(out[160:176], np.where((a < b) & (a > -0.5), a, b))
     assert np.array_equal(
-        out[176:], (np.arange(16) % 4 + 10 * (np.arange(16) // 4)).astype(np.float32)
+        out[176:192], (np.arange(16) % 4 + 10 * (np.arange(16) // 4)).astype(np.float32)
     )
+    assert np.allclose(out[192:208], 2 * a + 1 - 3 * np.maximum(a, 0.25), rtol=1e-5, atol=1e-5)
+    assert np.array_equal(out[208:], np.where(a > 0.5, a, 0) / 4)
 
 
 def test_comparisons_with_nan_are_false_and_bits_follow_the_lanes():
@@ -86,13 +90,13 @@ def test_comparisons_with_nan_are_false_and_bits_follow_the_lanes():
     x[16:] = 7.0
     x[3] = np.nan
     a = x[:16]
-    less, less_equal, greater, greater_equal, either, lowest = _masks(x)
+    less, less_equal, greater, greater_equal, equal, lowest = _masks(x)
     weights = 1 << np.arange(16)
     assert less == weights[a < 7].sum()
     assert less_equal == weights[a <= 7].sum()
     assert greater == weights[a > 7].sum()
     assert greater_equal == weights[a >= 7].sum()
-    assert either == weights[(a < 7) | (a > 7)].sum()
+    assert equal == weights[a == 7].sum()
     assert lowest == 3
 
 

@@ -1,6 +1,6 @@
-"""Sort splats by depth and list them per tile, nearest first.
+"""List splats per tile, nearest first.
 
-One stable sort of all visible splats, then a counting sort into tiles that keeps its order: on a
+One sort of all visible splats by depth, then a counting sort into tiles that keeps its order: on a
 CPU this beats the sort of all (tile, depth) pairs that GPU rasterisers use.
 """
 
@@ -22,110 +22,8 @@ from alpasim_plugin.gaussians.constants import (
     TOP_Y,
     U,
     V,
-    Z,
 )
 from alpasim_plugin.gaussians.raster import simd as v
-
-_RADIX_BITS = 11
-_LOW = np.int64(0xFFFFFFFF)
-
-
-@njit(cache=True, nogil=True)
-def depth_order(count, records, ids, depth_bits, pairs, spare):
-    """Return the array (``pairs`` or ``spare``) whose low 32 bits list the records nearest first,
-    equal depths by identity.
-
-    The key is the bit pattern of the float32 depth: non-negative floats sort as integers.
-    Identities are given in input order, so the result does not depend on the order in which threads
-    wrote the records.
-    """
-    if count == 0:
-        return pairs
-    nearest, farthest = np.int64(depth_bits[Z]), np.int64(depth_bits[Z])
-    for i in range(count):
-        key = np.int64(depth_bits[i * RECORD + Z])
-        nearest, farthest = min(nearest, key), max(farthest, key)
-    width = 0
-    while (farthest - nearest) >> width:
-        width += 1
-    passes = max(1, (width + _RADIX_BITS - 1) // _RADIX_BITS)
-    bits = (width + passes - 1) // passes
-    size = 1 << bits
-    mask = size - 1
-    histogram = np.zeros((passes, size), np.int64)
-    for i in range(count):
-        key = np.int64(depth_bits[i * RECORD + Z]) - nearest
-        pairs[i] = (key << 32) | i
-        for p in range(passes):
-            histogram[p, (key >> (p * bits)) & mask] += 1
-    source, target = pairs, spare
-    for p in range(passes):
-        total = 0
-        for b in range(size):
-            here = histogram[p, b]
-            histogram[p, b] = total
-            total += here
-        shift = 32 + p * bits
-        for i in range(count):
-            item = source[i]
-            b = (item >> shift) & mask
-            target[histogram[p, b]] = item
-            histogram[p, b] += 1
-        source, target = target, source
-    _order_ties(count, source, ids)
-    return source
-
-
-@njit(cache=True, nogil=True)
-def _sort_by_identity(pairs, start, end, ids):
-    """Sort a run of pairs by identity, in place.
-
-    A heap: n log n steps for any run, and compiled in an eighth of argsort's time.
-    """
-    size = end - start
-    for step in range(size // 2 + size - 1):
-        if step < size // 2:  # first every parent sinks, from the last to the root
-            root, last = size // 2 - 1 - step, size
-        else:  # then the largest goes to the end, again and again
-            last = size - 1 - (step - size // 2)
-            pairs[start], pairs[start + last] = pairs[start + last], pairs[start]
-            root = 0
-        item = pairs[start + root]
-        identity = ids[item & _LOW]
-        child = 2 * root + 1
-        while child < last:
-            if (
-                child + 1 < last
-                and ids[pairs[start + child + 1] & _LOW] > ids[pairs[start + child] & _LOW]
-            ):
-                child += 1
-            if ids[pairs[start + child] & _LOW] <= identity:
-                break
-            pairs[start + root] = pairs[start + child]
-            root, child = child, 2 * child + 1
-        pairs[start + root] = item
-
-
-@njit(cache=True, nogil=True)
-def _order_ties(count, pairs, ids):
-    """Sort runs of equal depth by identity."""
-    start = np.int64(0)  # typed, or numba compiles what it calls once more for the literal
-    while start < count:
-        end = start + 1
-        while end < count and (pairs[end] >> 32) == (pairs[start] >> 32):
-            end += 1
-        if end - start > 32:
-            _sort_by_identity(pairs, start, end, ids)
-        else:
-            for i in range(start + 1, end):
-                item = pairs[i]
-                identity = ids[item & _LOW]
-                j = i - 1
-                while j >= start and ids[pairs[j] & _LOW] > identity:
-                    pairs[j + 1] = pairs[j]
-                    j -= 1
-                pairs[j + 1] = item
-        start = end
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -218,15 +116,13 @@ def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, box
         changes = histogram[chunk]
         changes[:] = 0
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
-            v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
-            at = (order[rank] & _LOW) * RECORD
+            v.prefetch(records, order[min(rank + 12, count - 1)] * RECORD)
+            at = order[rank] * RECORD
             left, right, top, bottom = _tile_box(records, at, tiles_x, tiles_y)
-            boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3] = (
-                left,
-                right,
-                top,
-                bottom,
-            )
+            boxes[4 * rank] = left
+            boxes[4 * rank + 1] = right
+            boxes[4 * rank + 2] = top
+            boxes[4 * rank + 3] = bottom
             if _is_large(left, right, top, bottom):
                 for row in range(top, bottom):
                     first, end = _ellipse_columns(records, at, row, tiles_x)
@@ -264,21 +160,10 @@ def tile_offsets(histogram, tiles_x, starts):
     return total
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _append(lists, position, tile, record, present, nowhere):
-    """Append a record's number to a tile's list, or write it to ``nowhere``: no branch, since
-    nobody could foresee it.
-    """
-    lists[position[tile] if present else nowhere] = record
-    position[tile] += 1 if present else 0
-
-
 @njit(cache=True, nogil=True)
-def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, pairs, lists):
+def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, lists):
     """Write each tile's list of records; chunks ascend and so do the ranks in a chunk, hence every
     list is in depth order.
-
-    ``lists`` has room for one more than there are ``pairs``.
     """
     n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
@@ -287,20 +172,11 @@ def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histog
             return
         position = histogram[chunk]
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
-            record = np.int32(order[rank] & _LOW)
+            record = np.int32(order[rank])
             left = boxes[4 * rank]
             right = boxes[4 * rank + 1]
             top = boxes[4 * rank + 2]
             bottom = boxes[4 * rank + 3]
-            rows, columns = bottom - top, right - left
-            if rows <= 2 and columns <= 2:
-                tile = top * stride + left
-                some, wide = rows > 0, columns > 1
-                _append(lists, position, tile, record, some & (columns > 0), pairs)
-                _append(lists, position, tile + 1, record, some & wide, pairs)
-                _append(lists, position, tile + stride, record, (rows > 1) & (columns > 0), pairs)
-                _append(lists, position, tile + stride + 1, record, (rows > 1) & wide, pairs)
-                continue
             large = _is_large(left, right, top, bottom)
             for row in range(top, bottom):
                 if large:

@@ -1,7 +1,6 @@
-"""Composite tiles for training and take the image's gradient back to the splats, sixteen pixels at
-a time.
+"""Take the image's gradient back to the splats, sixteen pixels at a time.
 
-The forward pass is that of `raster_kernels`; it keeps each pixel's transmittance and the last splat
+The forward pass is that of `raster_kernels`, which keeps each pixel's transmittance and the last splat
 drawn there. The backward pass walks a tile's list from the back: with ``T`` the transmittance
 behind a splat and ``S`` what all splats behind it add to the loss,
 
@@ -26,20 +25,13 @@ from numba import njit
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, Z
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.raster_kernels import (
-    CHUNK,
     CUT,
-    STATE,
-    STATE_B,
-    STATE_D,
-    STATE_G,
-    STATE_R,
-    STATE_T,
+    KEPT,
+    KEPT_LAST,
+    KEPT_T,
     block_centres,
-    composite_tile,
     falloff,
     pixel_of,
-    place_of,
-    start_tile,
     touched_blocks,
     whitened,
 )
@@ -47,12 +39,7 @@ from alpasim_plugin.gaussians.sh import C0, C1, C2, C3, sh_terms
 
 _f = np.float32
 _sh_terms = njit(cache=True, nogil=True, error_model="numpy")(sh_terms)
-_ALPHA_MAX = _f(ALPHA_MAX)
 
-# What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen
-# pixels each.
-KEPT_T, KEPT_LAST = 0, 16
-KEPT = 32
 # Columns of a block in the backward pass: the above, then the sum S and the gradients of colour,
 # depth sum and alpha.
 _S = 32
@@ -66,55 +53,6 @@ _BACK = 128
 # s, s t, t t.
 PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_TT = range(10)
 PAIR = 10
-
-
-@njit(cache=True, nogil=True)
-def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha, depth_sum):
-    """Render tiles until none is left, without background; called by each thread.
-
-    Args:
-        cursor: int64 ``(1,)``, the next tile; shared by all threads.
-        tiles_x: Tiles in a row of tiles.
-        starts: See `binning.tile_offsets`.
-        lists: Ranks per tile.
-        records: Splats in the order of depth.
-        kept: float32 output, 16 x KEPT per tile, for `tile_gradients`.
-        colour: float32 output ``(H, W, 3)``, sum of weighted colours.
-        alpha: float32 output ``(H, W)``.
-        depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres.
-    """
-    state = np.empty(16 * STATE, np.float32)
-    last = np.empty(256, np.float32)
-    near = np.empty(CHUNK * RECORD, np.float32)
-    masks = np.empty(CHUNK, np.int32)
-    height, width = alpha.shape
-    while True:
-        tile = v.fetch_add(cursor, 0, 1)
-        if tile >= starts.shape[0] - 1:
-            return
-        tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
-        live = start_tile(state, x0, y0, width, height)
-        last[:] = _f(-1.0)
-        composite_tile(
-            lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last, near, masks
-        )
-        for block in range(16):
-            at = (tile * 16 + block) * KEPT
-            v.store(kept, at + KEPT_T, v.absolute(v.load(state, block * STATE + STATE_T)))
-            v.store(kept, at + KEPT_LAST, v.load(last, block * 16))
-        for row in range(min(TILE, height - tile_y * TILE)):
-            y = tile_y * TILE + row
-            for column in range(min(TILE, width - tile_x * TILE)):
-                x = tile_x * TILE + column
-                at = place_of(row, column)
-                alpha[y, x] = _f(1.0) - abs(state[at + STATE_T])
-                depth_sum[y, x] = state[at + STATE_D]
-                colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = (
-                    state[at + STATE_R],
-                    state[at + STATE_G],
-                    state[at + STATE_B],
-                )
 
 
 @njit(cache=True, nogil=True)
@@ -147,18 +85,14 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
 @njit(cache=True, nogil=True)
 def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
     """Walk a tile's splats from the back and write a row of ``pairs`` for each that was drawn."""
-    zero, one = v.splat(_f(0.0)), v.splat(_f(1.0))
+    zero = v.splat(_f(0.0))
     for i in range(end - 1, -1, -1):
         v.prefetch(records, np.int64(lists[first + max(i - 8, 0)]) * RECORD)
         at = np.int64(lists[first + i]) * RECORD
         todo = touched_blocks(records, at, x0, y0) & live
         if todo == 0:
             continue
-        place, peak = v.splat(_f(i)), v.splat(records[at + PEAK])
-        red = v.splat(records[at + R])
-        green = v.splat(records[at + G])
-        blue = v.splat(records[at + B])
-        depth = v.splat(records[at + Z])
+        red, green, blue = records[at + R], records[at + G], records[at + B]
         to_red = zero
         to_green = zero
         to_blue = zero
@@ -175,19 +109,19 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             base = block * _BACK
             x, y = block_centres(x0, y0, block)
             s, t = whitened(records, at, x, y)
-            exponent = v.fnma(s, s, v.fnma(t, t, peak))
-            drawn = (exponent >= v.splat(CUT)) & (place <= v.load(pixels, base + KEPT_LAST))
+            exponent = v.fnma(s, s, v.fnma(t, t, records[at + PEAK]))
+            drawn = (exponent >= CUT) & (v.load(pixels, base + KEPT_LAST) >= i)
             if v.bits(drawn) == 0:
                 continue
-            full = v.select(drawn, falloff(exponent), zero)
-            alpha = v.minimum(full, v.splat(_ALPHA_MAX))
-            inverse = one / (one - alpha)
+            full = v.select(drawn, falloff(exponent), 0.0)
+            alpha = v.minimum(full, ALPHA_MAX)
+            inverse = 1.0 / (1.0 - alpha)
             before = v.load(pixels, base + KEPT_T) * inverse
             g_red = v.load(pixels, base + _GR)
             g_green = v.load(pixels, base + _GG)
             g_blue = v.load(pixels, base + _GB)
             g_depth = v.load(pixels, base + _GD)
-            q = v.fma(depth, g_depth, v.load(pixels, base + _GA))
+            q = v.fma(records[at + Z], g_depth, v.load(pixels, base + _GA))
             q = v.fma(red, g_red, v.fma(green, g_green, v.fma(blue, g_blue, q)))
             behind = v.load(pixels, base + _S)
             weight = before * alpha
@@ -198,9 +132,7 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             to_blue = v.fma(weight, g_blue, to_blue)
             to_depth = v.fma(weight, g_depth, to_depth)
             # The clamp of alpha ends the gradient; colour and depth above still receive theirs.
-            h = v.select(
-                full <= v.splat(_ALPHA_MAX), alpha * v.fnma(behind, inverse, before * q), zero
-            )
+            h = v.select(full <= ALPHA_MAX, alpha * v.fnma(behind, inverse, before * q), 0.0)
             h_s, h_t = h * s, h * t
             m = m + h
             m_s = m_s + h_s
@@ -209,22 +141,16 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             m_st = v.fma(h_s, t, m_st)
             m_tt = v.fma(h_t, t, m_tt)
         row = (first + i) * PAIR
-        pairs[row + PAIR_R], pairs[row + PAIR_G], pairs[row + PAIR_B] = (
-            v.total(to_red),
-            v.total(to_green),
-            v.total(to_blue),
-        )
+        pairs[row + PAIR_R] = v.total(to_red)
+        pairs[row + PAIR_G] = v.total(to_green)
+        pairs[row + PAIR_B] = v.total(to_blue)
         pairs[row + PAIR_Z] = v.total(to_depth)
-        pairs[row + PAIR_H], pairs[row + PAIR_S], pairs[row + PAIR_T] = (
-            v.total(m),
-            v.total(m_s),
-            v.total(m_t),
-        )
-        pairs[row + PAIR_SS], pairs[row + PAIR_ST], pairs[row + PAIR_TT] = (
-            v.total(m_ss),
-            v.total(m_st),
-            v.total(m_tt),
-        )
+        pairs[row + PAIR_H] = v.total(m)
+        pairs[row + PAIR_S] = v.total(m_s)
+        pairs[row + PAIR_T] = v.total(m_t)
+        pairs[row + PAIR_SS] = v.total(m_ss)
+        pairs[row + PAIR_ST] = v.total(m_st)
+        pairs[row + PAIR_TT] = v.total(m_tt)
 
 
 @njit(cache=True, nogil=True)
@@ -240,7 +166,7 @@ def tile_gradients(
         starts: See `binning.tile_offsets`.
         lists: Ranks per tile.
         records: Splats in the order of depth.
-        kept: As `composite_tiles` wrote it.
+        kept: As `raster_kernels.composite_tiles` wrote it.
         g_colour: float32 ``(H, W, 3)``, gradient of the sum of weighted colours.
         g_alpha: float32 ``(H, W)``.
         g_depth: float32 ``(H, W)``, gradient of the sum of weighted depths.

@@ -61,16 +61,14 @@ from alpasim_plugin.gaussians.constants import (
     Z,
 )
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
+from alpasim_plugin.gaussians.sh import C0, sh_terms
 
-_f = np.float32
-_EPS = _f(EPS2D_PX2)
-_MARGIN_PX = _f(
-    0.01
-)  # boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw
+_sh_terms = njit(cache=True, nogil=True)(sh_terms)
+# Boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw.
+_MARGIN_PX = 0.01
 _LOWPASS_REACH_PX = EXTENT_MAX_SIGMA * EPS2D_PX2**0.5 + 0.5
 _CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0
-_BLOCK_HALF = _f(1.5)
+_BLOCK_HALF = 1.5
 
 
 @njit(cache=True, nogil=True, inline="never")
@@ -143,37 +141,6 @@ def spheres_in_view(spheres, poses, camera):
     return seen
 
 
-@njit(cache=True, nogil=True)
-def _write_basis(basis, x, y, z, size):
-    """Write ``size`` spherical harmonics of sixteen unit directions."""
-    v.store(basis, 0, v.splat(_f(C0)))
-    if size > 1:
-        v.store(basis, 16, v.splat(_f(-C1)) * y)
-        v.store(basis, 32, v.splat(_f(C1)) * z)
-        v.store(basis, 48, v.splat(_f(-C1)) * x)
-    if size > 4:
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        two_zz = zz + zz
-        difference = xx - yy
-        v.store(basis, 64, v.splat(_f(C2[0])) * x * y)
-        v.store(basis, 80, v.splat(_f(-C2[0])) * y * z)
-        v.store(basis, 96, v.splat(_f(C2[1])) * (two_zz - xx - yy))
-        v.store(basis, 112, v.splat(_f(-C2[0])) * x * z)
-        v.store(basis, 128, v.splat(_f(C2[2])) * difference)
-        if size > 9:
-            three = v.splat(_f(3.0))
-            four_zz = two_zz + two_zz - xx - yy
-            v.store(basis, 144, v.splat(_f(-C3[0])) * y * (three * xx - yy))
-            v.store(basis, 160, v.splat(_f(C3[1])) * x * y * z)
-            v.store(basis, 176, v.splat(_f(-C3[2])) * y * four_zz)
-            v.store(basis, 192, v.splat(_f(C3[3])) * z * (two_zz - three * (xx + yy)))
-            v.store(basis, 208, v.splat(_f(-C3[2])) * x * four_zz)
-            v.store(basis, 224, v.splat(_f(C3[4])) * z * difference)
-            v.store(basis, 240, v.splat(_f(-C3[0])) * x * (xx - three * yy))
-
-
 # Three vectors of sixteen lanes, one per axis, are a tuple.
 
 
@@ -184,8 +151,8 @@ def _load3(array, at):
 
 @njit(cache=True, nogil=True)
 def _row(pose, at):
-    """Return three numbers of a pose, each in all lanes."""
-    return v.splat(_f(pose[at])), v.splat(_f(pose[at + 1])), v.splat(_f(pose[at + 2]))
+    """Return three numbers of a pose."""
+    return pose[at], pose[at + 1], pose[at + 2]
 
 
 @njit(cache=True, nogil=True)
@@ -215,25 +182,25 @@ def _times(row, rows):
 
 
 @njit(cache=True, nogil=True)
-def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes):
+def _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes):
     """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask
     of those that reach the image.
     """
     x, y, z = _load3(means, group * 48)
-    dx = x - v.splat(pose[POSE_CENTRE])
-    dy = y - v.splat(pose[POSE_CENTRE + 1])
-    dz = z - v.splat(pose[POSE_CENTRE + 2])
+    dx = x - pose[POSE_CENTRE]
+    dy = y - pose[POSE_CENTRE + 1]
+    dz = z - pose[POSE_CENTRE + 2]
     r = POSE_ROTATION
     # Depth decides the order and is kept in float64 up to here; everything else tolerates float32
     # relative to the camera.
-    z64 = v.splat(pose[r + 6]) * dx + v.splat(pose[r + 7]) * dy + v.splat(pose[r + 8]) * dz
-    mask = (z64 >= v.splat(pose[POSE_NEAR])) & (z64 <= v.splat(pose[POSE_FAR]))
+    z64 = pose[r + 6] * dx + pose[r + 7] * dy + pose[r + 8] * dz
+    mask = (z64 >= pose[POSE_NEAR]) & (z64 <= pose[POSE_FAR])
     if v.bits(mask) == 0:
         return 0
     d = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
     chosen = _project_shape(group, mask, d, v.to_f32(z64), geometry, pose, camera, lanes)
     if chosen != 0:
-        _colour_group(group, d, sh, sh_size, basis, lanes)
+        _colour_group(group, d, sh, sh_size, lanes)
     return chosen
 
 
@@ -253,23 +220,22 @@ def _at_its_time(p, turn, shift, camera):
     A point moves by ``turn x p + shift`` in a shutter, to second order; its time follows from its
     pixel, and its pixel from its time.
     """
-    half = v.splat(_f(0.5))
     tx, ty, tz = _cross(turn, p)
     first = tx + shift[0], ty + shift[1], tz + shift[2]
     cx, cy, cz = _cross(turn, first)
-    second = half * cx, half * cy, half * cz
+    second = 0.5 * cx, 0.5 * cy, 0.5 * cz
     x, y, z = p
     for _ in range(3):
-        inverse_z = v.splat(_f(1.0)) / v.maximum(z, v.splat(_f(1e-3)))
-        u = v.fma(v.splat(camera[CAM_FX]), x * inverse_z, v.splat(camera[CAM_CX]))
-        w = v.fma(v.splat(camera[CAM_FY]), y * inverse_z, v.splat(camera[CAM_CY]))
-        time = v.fma(v.splat(camera[CAM_TIME_U]), u, v.splat(camera[CAM_TIME_0]))
-        time = v.fma(v.splat(camera[CAM_TIME_V]), w, time)
-        time = v.minimum(v.maximum(time, v.negative(half)), half)
+        inverse_z = 1.0 / v.maximum(z, 1e-3)
+        u = v.fma(camera[CAM_FX], x * inverse_z, camera[CAM_CX])
+        w = v.fma(camera[CAM_FY], y * inverse_z, camera[CAM_CY])
+        time = v.fma(camera[CAM_TIME_U], u, camera[CAM_TIME_0])
+        time = v.fma(camera[CAM_TIME_V], w, time)
+        time = v.minimum(v.maximum(time, -0.5), 0.5)
         x = v.fma(time, v.fma(time, second[0], first[0]), p[0])
         y = v.fma(time, v.fma(time, second[1], first[1]), p[1])
         z = v.fma(time, v.fma(time, second[2], first[2]), p[2])
-    return x, y, v.maximum(z, v.splat(_f(1e-3)))
+    return x, y, v.maximum(z, 1e-3)
 
 
 @njit(cache=True, nogil=True)
@@ -280,19 +246,15 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     right = _row(pose, POSE_ROTATION)
     down = _row(pose, POSE_ROTATION + 3)
     ahead = _row(pose, POSE_ROTATION + 6)
-    fx, fy = v.splat(camera[CAM_FX]), v.splat(camera[CAM_FY])
+    fx, fy = camera[CAM_FX], camera[CAM_FY]
     x, y = _dot(right, d), _dot(down, d)
     if camera[CAM_REACH] > 0:
         x, y, z = _at_its_time((x, y, z), _row(pose, POSE_TURN), _row(pose, POSE_SHIFT), camera)
-    inverse_z = v.splat(_f(1.0)) / z
+    inverse_z = 1.0 / z
     slope_x, slope_y = x * inverse_z, y * inverse_z
-    u, w = v.fma(fx, slope_x, v.splat(camera[CAM_CX])), v.fma(fy, slope_y, v.splat(camera[CAM_CY]))
-    a = v.minimum(
-        v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X])
-    )
-    b = v.minimum(
-        v.maximum(slope_y, v.splat(camera[CAM_SLOPE_LOW_Y])), v.splat(camera[CAM_SLOPE_HIGH_Y])
-    )
+    u, w = v.fma(fx, slope_x, camera[CAM_CX]), v.fma(fy, slope_y, camera[CAM_CY])
+    a = v.minimum(v.maximum(slope_x, camera[CAM_SLOPE_LOW_X]), camera[CAM_SLOPE_HIGH_X])
+    b = v.minimum(v.maximum(slope_y, camera[CAM_SLOPE_LOW_Y]), camera[CAM_SLOPE_HIGH_Y])
 
     # Rows m, n of M = J R R_q diag(s).
     geo = group * (GEO_SIZE * 16)
@@ -303,23 +265,21 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     mm = _dot(m, m)
     nn = _dot(n, n)
     mn = _dot(m, n)
-    antialias = _f(pose[POSE_ANTIALIAS])
-    eps = v.splat(antialias if antialias > 0 else _EPS)
+    antialias = pose[POSE_ANTIALIAS]
+    eps = antialias if antialias > 0 else EPS2D_PX2
     c11, c22 = mm + eps, nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
     radius_x, radius_y = extent * v.sqrt(c11), extent * v.sqrt(c22)
-    margin = v.splat(_MARGIN_PX)
-    half = v.splat(_f(0.5))
-    mask = mask & (u + radius_x + margin >= half) & (w + radius_y + margin >= half)
-    mask = mask & (u - radius_x - margin <= v.splat(camera[CAM_WIDTH] - _f(0.5)))
-    mask = mask & (w - radius_y - margin <= v.splat(camera[CAM_HEIGHT] - _f(0.5)))
+    mask = mask & (u + radius_x + _MARGIN_PX >= 0.5) & (w + radius_y + _MARGIN_PX >= 0.5)
+    mask = mask & (u - radius_x - _MARGIN_PX <= camera[CAM_WIDTH] - 0.5)
+    mask = mask & (w - radius_y - _MARGIN_PX <= camera[CAM_HEIGHT] - 0.5)
     chosen = v.bits(mask)
     if chosen == 0:
         return 0
 
     # Variance of x given y, det / C22, from the Cauchy-Binet parts: scaled before squaring, so that
     # it neither cancels nor overflows.
-    inverse_c22 = v.splat(_f(1.0)) / c22
+    inverse_c22 = 1.0 / c22
     root = v.sqrt(inverse_c22)
     x01 = v.fnma(m[1], n[0], m[0] * n[1])
     x02 = v.fnma(m[2], n[0], m[0] * n[2])
@@ -328,25 +288,21 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     raw_variance = _dot(minors, minors)
     variance = raw_variance + eps * ((c11 + nn) * inverse_c22)
     deviation = v.sqrt(variance)
-    scale = v.splat(_f(EXPONENT_SCALE))
-    l11 = scale / deviation
+    l11 = EXPONENT_SCALE / deviation
     slope = mn * inverse_c22
     l12 = v.negative(l11 * slope)
-    l22 = scale * root
+    l22 = EXPONENT_SCALE * root
     peak = v.load(geometry, geo + GEO_PEAK * 16)
     if antialias > 0:
         # The share of the determinants: an opacity times its root, and so many octaves less.
         v.store(lanes, PEAK * 16, raw_variance / variance)
         for lane in range(PEAK * 16, PEAK * 16 + 16):
-            lanes[lane] = np.log2(lanes[lane]) / _f(16.0)
+            lanes[lane] = np.log2(lanes[lane]) / 16
         peak = peak + v.load(lanes, PEAK * 16)
-        chosen &= v.bits(peak >= v.splat(_f(_CUT)))
-    block_half = v.splat(_BLOCK_HALF)
-    corner_s, corner_t = block_half * (l11 + v.absolute(l12)), block_half * l22
+        chosen &= v.bits(peak >= _CUT)
+    corner_s, corner_t = _BLOCK_HALF * (l11 + v.absolute(l12)), _BLOCK_HALF * l22
     block_radius = (
-        v.sqrt(peak - v.splat(_f(_CUT)))
-        + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t))
-        + v.splat(_f(1e-3))
+        v.sqrt(peak - _CUT) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + 1e-3
     )
 
     v.store(lanes, U * 16, u)
@@ -356,36 +312,36 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     v.store(lanes, L22 * 16, l22)
     v.store(lanes, PEAK * 16, peak)
     v.store(lanes, Z * 16, z)
-    v.store(lanes, RADIUS_X * 16, radius_x + margin)
-    v.store(lanes, RADIUS_Y * 16, radius_y + margin)
+    v.store(lanes, RADIUS_X * 16, radius_x + _MARGIN_PX)
+    v.store(lanes, RADIUS_Y * 16, radius_y + _MARGIN_PX)
     v.store(lanes, TOP_Y * 16, radius_x * mn / c11)
     v.store(lanes, SLOPE * 16, slope)
-    v.store(lanes, HALF_WIDTH * 16, extent * deviation + margin)
+    v.store(lanes, HALF_WIDTH * 16, extent * deviation + _MARGIN_PX)
     v.store(lanes, BLOCK_REACH * 16, block_radius * block_radius)
     return chosen
 
 
 @njit(cache=True, nogil=True)
-def _colour_group(group, d, sh, sh_size, basis, lanes):
+def _colour_group(group, d, sh, sh_size, lanes):
     """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0
     below.
     """
-    length = v.splat(_f(1.0)) / v.sqrt(_dot(d, d))
-    _write_basis(basis, d[0] * length, d[1] * length, d[2] * length, sh_size)
-    half, zero = v.splat(_f(0.5)), v.splat(_f(0.0))
-    red = half
-    green = half
-    blue = half
     colour = group * sh_size * 48
-    for k in range(sh_size):
-        value = v.load(basis, k * 16)
-        r, g, b = _load3(sh, colour + k * 48)
-        red = v.fma(value, r, red)
-        green = v.fma(value, g, green)
-        blue = v.fma(value, b, blue)
-    v.store(lanes, R * 16, v.maximum(red, zero))
-    v.store(lanes, G * 16, v.maximum(green, zero))
-    v.store(lanes, B * 16, v.maximum(blue, zero))
+    red, green, blue = _load3(sh, colour)
+    red = v.fma(red, C0, 0.5)
+    green = v.fma(green, C0, 0.5)
+    blue = v.fma(blue, C0, 0.5)
+    if sh_size > 1:
+        length = 1.0 / v.sqrt(_dot(d, d))
+        terms = _sh_terms(d[0] * length, d[1] * length, d[2] * length)
+        for k in range(1, sh_size):
+            r, g, b = _load3(sh, colour + k * 48)
+            red = v.fma(terms[k - 1], r, red)
+            green = v.fma(terms[k - 1], g, green)
+            blue = v.fma(terms[k - 1], b, blue)
+    v.store(lanes, R * 16, v.maximum(red, 0.0))
+    v.store(lanes, G * 16, v.maximum(green, 0.0))
+    v.store(lanes, B * 16, v.maximum(blue, 0.0))
 
 
 @njit(cache=True, nogil=True)
@@ -425,7 +381,6 @@ def project_part(
         ids: int64 output, one per splat.
     """
     lanes = np.empty(RECORD * 16, np.float32)
-    basis = np.empty(16 * 16, np.float32)
     kept = np.empty(BUNDLE * RECORD, np.float32)
     kept_ids = np.empty(BUNDLE, np.int64)
     groups = index.shape[0] // 16
@@ -438,7 +393,7 @@ def project_part(
         count = 0
         first = bundle * (BUNDLE // 16)
         for group in range(first, min(first + BUNDLE // 16, groups)):
-            chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes)
+            chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes)
             while chosen != 0:
                 lane = v.lowest_bit(chosen)
                 chosen &= chosen - 1
@@ -447,9 +402,8 @@ def project_part(
                 kept_ids[count] = index[group * 16 + lane] + first_id
                 count += 1
         out = v.fetch_add(cursor, 0, count)
-        for j in range(
-            count * RECORD
-        ):  # no slices: numba would compile the text of an error about their shapes for seconds
+        # No slices: numba would compile the text of an error about their shapes for seconds.
+        for j in range(count * RECORD):
             records[out * RECORD + j] = kept[j]
         for j in range(count):
             ids[out + j] = kept_ids[j]

@@ -1,17 +1,14 @@
 """Render on the CPU: project, sort, list per tile, composite; each stage on all threads.
 
 Kernels release the interpreter lock and share work through an atomic counter, so the same compiled
-code serves any number of threads, no threading layer spins between frames, nothing is lost by a
-fork, and one thread costs nothing extra.
+code serves any number of threads, nothing is lost by a fork, and one thread costs nothing extra.
 """
 
 from __future__ import annotations
 
-import os
-import threading
 import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +17,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.places import require_kernels
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F32, F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
 from alpasim_plugin.gaussians.constants import (
@@ -37,39 +34,17 @@ from alpasim_plugin.gaussians.constants import (
     RECORD,
     SPHERE_SIZE,
     TILE,
+    Z,
 )
-from alpasim_plugin.gaussians.raster.binning import (
-    count_tiles,
-    depth_order,
-    fill_tiles,
-    tile_offsets,
-)
-from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, tile_offsets
+from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import project_part, spheres_in_view
-from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
-
-
-class Buffers(threading.local):
-    """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page
-    by page in every frame.
-    """
-
-    def __init__(self) -> None:
-        self._arrays: dict[str, npt.NDArray[np.generic]] = {}
-
-    def get(self, name: str, size: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
-        """Return an uninitialised array of at least ``size``."""
-        array = self._arrays.get(name)
-        if array is None or array.size < size:
-            array = self._arrays[name] = np.empty(size + size // 4, dtype)
-        return array
-
+from alpasim_plugin.gaussians.raster.raster_kernels import composite_tiles
 
 Part = tuple[Any, ...]
 _IDENTITY = np.eye(4)
 WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
-_buffers = Buffers()
 _prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
 
 
@@ -119,37 +94,20 @@ def rasterize_prepared(
         room += len(prepared.spheres) // SPHERE_SIZE * BUNDLE
         first_id = ends[i] - prepared.n_input
         parts.append((*prepared.arrays(), first_id, poses[i]))
-    records = _buffers.get("records", room * RECORD, np.float32)
-    ids = _buffers.get("ids", room, np.int64)
+    records = np.empty(room * RECORD, np.float32)
+    ids = np.empty(room, np.int64)
     workers = threads if room > WORTH_THREADS else 1
     count = project_parts(workers, parts, view, records, ids)
 
-    keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
-    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
-    tiles = list_per_tile(count, order, records, camera, threads, _buffers)
-    shape = (camera.height, camera.width)
-    rgb = np.empty((*shape, 3), np.float32)
-    alpha = np.empty(shape, np.float32)
-    depth = np.empty(shape, np.float32)
-    cursor = np.zeros(2, np.int64)
-    run_on_threads(
-        threads,
-        raster_tiles,
-        cursor,
-        tiles.columns,
-        tiles.starts,
-        tiles.lists,
-        records,
-        behind,
-        rgb,
-        alpha,
-        depth,
-    )
+    order = depth_order(records[: count * RECORD], ids[:count])
+    tiles = list_per_tile(order, records, camera, threads)
+    colour, alpha, depth_sum = composite(tiles, records, None, camera, threads)
+    rgb = np.clip(colour + (1 - alpha[..., None]) * behind, 0, 1)
+    depth = np.divide(depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 0)
     stats = {
         "gaussians": sum(prepared.n_input for prepared, _ in nodes),
         "visible": count,
         "pairs": tiles.pairs,
-        "pairs_looked_at": int(cursor[1]),
     }
     return RasterOutput(rgb, alpha, depth, stats)
 
@@ -158,8 +116,8 @@ def project_parts(
     workers: int,
     parts: Sequence[Part],
     view: F32,
-    records: npt.NDArray[np.generic],
-    ids: npt.NDArray[np.generic],
+    records: F32,
+    ids: I64,
 ) -> int:
     """Project prepared parts on several threads, and return how many records were written.
 
@@ -178,6 +136,16 @@ def project_parts(
 
     run_on_threads(workers, project)
     return int(cursor[0])
+
+
+def depth_order(records: F32, ids: I64) -> I64:
+    """Return the numbers ``(N,)`` of records nearest first, equal depths by identity ``(N,)``.
+
+    Bits of depths sort as the depths do, which are not negative. The result does not depend on the
+    order in which threads wrote the records.
+    """
+    depth_bits = records.view(np.int32)[Z::RECORD].astype(np.int64)
+    return np.argsort(depth_bits << 32 | ids)
 
 
 def camera_numbers(camera: PinholeCamera) -> F32:
@@ -207,65 +175,44 @@ class TileLists:
     """
 
     columns: int
-    starts: npt.NDArray[np.int64]
-    lists: npt.NDArray[np.generic]
+    starts: I64
+    lists: npt.NDArray[np.int32]
     pairs: int
 
 
-def list_per_tile(
-    count: int,
-    order: npt.NDArray[np.generic],
-    records: npt.NDArray[np.generic],
-    camera: PinholeCamera,
-    threads: int,
-    buffers: Buffers,
-) -> TileLists:
-    """List ``count`` projected records per tile; ``order`` is that of `depth_order`. The lists
-    belong to ``buffers``.
-    """
+def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int) -> TileLists:
+    """List projected records per tile; ``order`` is that of `depth_order`."""
+    count = len(order)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(2048, -(-count // 64))
-    n_chunks, room = -(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1
-    histogram = buffers.get("histogram", n_chunks * room, np.int64)[: n_chunks * room].reshape(
-        n_chunks, room
-    )
-    boxes = buffers.get("boxes", 4 * count, np.int32)
+    histogram = np.empty((-(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1), np.int64)
+    boxes = np.empty(4 * count, np.int32)
     starts = np.empty(tiles_x * tiles_y + 1, np.int64)
-    cursor = np.zeros(2, np.int64)
     workers = threads if count > WORTH_THREADS else 1
-    run_on_threads(
-        workers,
-        count_tiles,
-        cursor,
-        count,
-        chunk_size,
-        order,
-        records,
-        tiles_x,
-        tiles_y,
-        boxes,
-        histogram,
-    )
+    chunks = (np.zeros(1, np.int64), count, chunk_size, order, records)
+    run_on_threads(workers, count_tiles, *chunks, tiles_x, tiles_y, boxes, histogram)
     pairs = int(tile_offsets(histogram, tiles_x, starts))
-    lists = buffers.get("lists", pairs + 1, np.int32)
-    cursor[:] = 0
-    run_on_threads(
-        workers,
-        fill_tiles,
-        cursor,
-        count,
-        chunk_size,
-        order,
-        records,
-        boxes,
-        tiles_x,
-        histogram,
-        pairs,
-        lists,
-    )
+    lists = np.empty(pairs, np.int32)
+    chunks[0][:] = 0
+    run_on_threads(workers, fill_tiles, *chunks, boxes, tiles_x, histogram, lists)
     return TileLists(tiles_x, starts, lists, pairs)
+
+
+def composite(
+    tiles: TileLists, records: F32, kept: F32 | None, camera: PinholeCamera, threads: int
+) -> tuple[F32, F32, F32]:
+    """Return the sums of weighted colours ``(H, W, 3)``, alpha ``(H, W)`` and the sums of weighted
+    depths ``(H, W)``, metres, all without background; ``kept`` is that of `composite_tiles`.
+    """
+    shape = (camera.height, camera.width)
+    colour = np.empty((*shape, 3), np.float32)
+    alpha = np.empty(shape, np.float32)
+    depth_sum = np.empty(shape, np.float32)
+    lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, records)
+    run_on_threads(threads, composite_tiles, *lists, kept, colour, alpha, depth_sum)
+    return colour, alpha, depth_sum
 
 
 def node_poses(
@@ -327,21 +274,6 @@ def rasterize_cpu(
     )
 
 
-_pools: dict[int, ThreadPoolExecutor] = {}
-_lock = threading.Lock()
-
-
-def _forget_pools() -> None:
-    """Drop pools after a fork: their threads live only in the parent."""
-    global _lock
-    _lock = threading.Lock()
-    _pools.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pools)
-
-
 def thread_count(threads: int | None) -> int:
     """Return how many threads to use: the argument, or numba's current setting.
 
@@ -369,14 +301,8 @@ def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> N
     if threads == 1:
         function(*args)
         return
-    with _lock:
-        pool = _pools.get(threads)
-        if pool is None:
-            pool = _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="raster")
-    others = [pool.submit(function, *args) for _ in range(threads - 1)]
-    try:
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(function, *args) for _ in range(threads - 1)]
         function(*args)
-    finally:
-        wait(others)
     for other in others:
         other.result()

@@ -27,22 +27,17 @@ from alpasim_plugin.gaussians.constants import (
     RADIUS_Y,
     RECORD,
 )
-from alpasim_plugin.gaussians.raster.binning import depth_order
-from alpasim_plugin.gaussians.raster.gradient_kernels import (
-    KEPT,
-    PAIR,
-    colour_splats,
-    composite_tiles,
-    tile_gradients,
-)
+from alpasim_plugin.gaussians.raster.gradient_kernels import PAIR, colour_splats, tile_gradients
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.raster_kernels import KEPT
 from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     WORTH_THREADS,
-    Buffers,
     TileLists,
     camera_numbers,
+    composite,
+    depth_order,
     list_per_tile,
     node_poses,
     project_parts,
@@ -109,8 +104,7 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     bad = pack(p.means, p.log_scales, p.quaternions, p.logits, lane_means, geometry)
     if bad >= 0:
         _refuse(p, bad)
-    buffers = Buffers()
-    records, ids = buffers.get("records", n * RECORD, np.float32), buffers.get("ids", n, np.int64)
+    records, ids = np.empty(n * RECORD, np.float32), np.empty(n, np.int64)
     # Colours follow for the visible ones alone, and bundles in the optimiser's order have no
     # bounding spheres worth a test.
     plain = np.zeros(groups * 3 * _LANES, np.float32)
@@ -126,15 +120,12 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     )
     if cursor[1]:
         _refuse(p, -1)
-    keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
-    order = (
-        depth_order(count, records, ids, records.view(np.int32), keys, spare)[:count] & 0xFFFFFFFF
-    )
+    order = depth_order(records[: count * RECORD], ids[:count])
     # In the order of depth, so that numbers ascend within a tile and the pairs of a range of splats
     # are found by bisection.
-    ordered = records[: n * RECORD].reshape(n, RECORD)[order].reshape(-1)
-    tiles = list_per_tile(count, np.arange(count), ordered, view.camera, view.threads, buffers)
-    return tiles, np.asarray(ordered, np.float32), np.asarray(ids[order], np.int64)
+    ordered = records.reshape(n, RECORD)[order].reshape(-1)
+    tiles = list_per_tile(np.arange(count), ordered, view.camera, view.threads)
+    return tiles, ordered, ids[order]
 
 
 def _refuse(p: _Parameters, bad: int) -> None:
@@ -171,32 +162,16 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         p = _Parameters.of(means, log_scales, quaternions, logits, sh)
         tiles, records, gaussian = _project(p, view)
-        shape = (view.camera.height, view.camera.width)
-        colour = np.empty((*shape, 3), np.float32)
-        alpha = np.empty(shape, np.float32)
-        depth_sum = np.empty(shape, np.float32)
         pixels = np.empty((len(tiles.starts) - 1) * _LANES * KEPT, np.float32)
-        cursor = np.zeros(1, np.int64)
-        run_on_threads(
-            view.threads,
-            composite_tiles,
-            cursor,
-            tiles.columns,
-            tiles.starts,
-            tiles.lists,
-            records,
-            pixels,
-            colour,
-            alpha,
-            depth_sum,
-        )
+        images = composite(tiles, records, pixels, view.camera, view.threads)
         boxes = records.reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
         screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(
             np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32)
         )
         ctx.save_for_backward(means, log_scales, quaternions, logits, sh)
         ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, records, gaussian, pixels)
-        return torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth_sum)
+        colour, alpha, depth_sum = (torch.from_numpy(image) for image in images)
+        return colour, alpha, depth_sum
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -208,59 +183,20 @@ class _Rasterize(torch.autograd.Function):
         tiles = kept.tiles
         g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
         pairs = np.zeros(tiles.pairs * PAIR, np.float32)
-        cursor = np.zeros(1, np.int64)
-        run_on_threads(
-            view.threads,
-            tile_gradients,
-            cursor,
-            tiles.columns,
-            tiles.starts,
-            tiles.lists,
-            kept.records,
-            kept.pixels,
-            g_colour,
-            g_alpha,
-            g_depth,
-            pairs,
-        )
-        out = [
-            np.zeros(a.shape, a.dtype)
-            for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)
-        ]
-        norm = np.zeros(len(p.means), np.float32)
+        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, kept.records)
+        images = (kept.pixels, g_colour, g_alpha, g_depth)
+        run_on_threads(view.threads, tile_gradients, *lists, *images, pairs)
         sums = np.empty(len(p.means) * PAIR, np.float32)
         workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
-        cursor[:] = 0
-        run_on_threads(
-            workers,
-            sum_pairs,
-            cursor,
-            _chunk(len(kept.gaussian)),
-            kept.gaussian,
-            tiles.starts,
-            tiles.lists,
-            pairs,
-            kept.records,
-            sums,
-        )
-        cursor[:] = 0
-        run_on_threads(
-            workers,
-            splat_gradients,
-            cursor,
-            _chunk(len(p.means)),
-            ctx.screen.radii.numpy(),
-            sums,
-            view.pose,
-            view.numbers,
-            p.means,
-            p.log_scales,
-            p.quaternions,
-            p.logits,
-            p.sh,
-            *out,
-            norm,
-        )
+        chunks = (np.zeros(1, np.int64), _chunk(len(kept.gaussian)), kept.gaussian)
+        splats = (tiles.starts, tiles.lists, pairs, kept.records, sums)
+        run_on_threads(workers, sum_pairs, *chunks, *splats)
+        parameters = (p.means, p.log_scales, p.quaternions, p.logits, p.sh)
+        out = [np.zeros(a.shape, a.dtype) for a in parameters]
+        norm = np.zeros(len(p.means), np.float32)
+        chunks = (np.zeros(1, np.int64), _chunk(len(p.means)), ctx.screen.radii.numpy())
+        seen = (sums, view.pose, view.numbers)
+        run_on_threads(workers, splat_gradients, *chunks, *seen, *parameters, *out, norm)
         ctx.screen.gradient_norm = torch.from_numpy(norm)
         return (
             *(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)),

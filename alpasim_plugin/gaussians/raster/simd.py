@@ -7,8 +7,8 @@ two AVX2 registers or four NEON registers. Arithmetic follows IEEE rules (no fas
 `fma` may round once or twice depending on the machine.
 
 Inside a kernel: ``load``/``store`` at a flat index of a one-dimensional contiguous array, ``splat``
-a scalar, the operators ``+ - * /`` on two vectors, comparisons that give masks, ``select``,
-``bits`` of a mask.
+a scalar, the operators ``+ - * /``, comparisons that give masks, ``select``, ``bits`` of a mask.
+Every operation takes a number in place of one of its vectors, which then stands in all lanes.
 """
 
 # Numba's extension interface is untyped.
@@ -31,46 +31,25 @@ _ELEMENTS = {"f32": ir.FloatType(), "f64": ir.DoubleType(), "bool": ir.IntType(1
 _VECTORS = {name: ir.VectorType(element, LANES) for name, element in _ELEMENTS.items()}
 
 
-class VectorTypeF32(types.Type):
-    """Sixteen float32 values."""
+class Vector(types.Type):
+    """Sixteen values of one kind."""
 
-    element = "f32"
-
-
-class VectorTypeF64(types.Type):
-    """Sixteen float64 values."""
-
-    element = "f64"
+    def __init__(self, name: str, kind: str) -> None:
+        self.kind = kind
+        super().__init__(name)
 
 
-class VectorTypeBool(types.Type):
-    """Sixteen truth values."""
-
-    element = "bool"
-
-
-class VectorTypeI32(types.Type):
-    """Sixteen int32 values."""
-
-    element = "i32"
-
-
-F32X16 = VectorTypeF32("f32x16")
-F64X16 = VectorTypeF64("f64x16")
-MASK16 = VectorTypeBool("mask16")
-I32X16 = VectorTypeI32("i32x16")
+F32X16 = Vector("f32x16", "f32")
+F64X16 = Vector("f64x16", "f64")
+MASK16 = Vector("mask16", "bool")
+I32X16 = Vector("i32x16", "i32")
 _FLOAT_VECTORS = (F32X16, F64X16)
 
 
-def _register(numba_type: type) -> None:
-    @register_model(numba_type)
-    class Model(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
-        def __init__(self, manager, front_end_type):
-            super().__init__(manager, front_end_type, _VECTORS[numba_type.element])  # type: ignore[attr-defined]
-
-
-for _type in (VectorTypeF32, VectorTypeF64, VectorTypeBool, VectorTypeI32):
-    _register(_type)
+@register_model(Vector)
+class _Model(models.PrimitiveModel):  # type: ignore[misc,unused-ignore]
+    def __init__(self, manager, front_end_type):
+        super().__init__(manager, front_end_type, _VECTORS[front_end_type.kind])
 
 
 def _vector_of(scalar: Any) -> Any:
@@ -84,6 +63,22 @@ def _broadcast(builder, value):
     return builder.shuffle_vector(
         first, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES)
     )
+
+
+def _common(args) -> Any:
+    """Return the type of the float vectors among arguments whose others are numbers, or None."""
+    vectors = [a for a in args if a in _FLOAT_VECTORS]
+    fits = vectors and all(a == vectors[0] or isinstance(a, types.Number) for a in args)
+    return vectors[0] if fits else None
+
+
+def _in_all_lanes(context, builder, vector, kinds, args):
+    """Return arguments as vectors: numbers are converted and stand in all lanes."""
+    scalar = types.float32 if vector == F32X16 else types.float64
+    return [
+        arg if kind == vector else _broadcast(builder, context.cast(builder, arg, kind, scalar))
+        for kind, arg in zip(kinds, args, strict=True)
+    ]
 
 
 @intrinsic
@@ -129,7 +124,7 @@ def load(typingctx, array, index):
 
     def codegen(context, builder, sig, args):
         pointer = _element_pointer(
-            context, builder, sig.args[0], args[0], args[1], _VECTORS[vector.element]
+            context, builder, sig.args[0], args[0], args[1], _VECTORS[vector.kind]
         )
         return builder.load(pointer, align=array.dtype.bitwidth // 8)
 
@@ -150,89 +145,88 @@ def store(typingctx, array, index, value):
     return types.void(array, types.intp, value), codegen
 
 
-def _operator(symbol, kinds, result, emit) -> None:
-    """Give a Python operator on two vectors of one kind its result type and its instruction."""
+def _operator(symbol, result, emit) -> None:
+    """Give a Python operator on float vectors its result type and its instruction."""
 
     @infer_global(symbol)
     class Typing(AbstractTemplate):  # type: ignore[misc,unused-ignore]
         def generic(self, args, kws):
-            if len(args) == 2 and args[0] == args[1] and args[0] in kinds:
-                return signature(result or args[0], *args)
-            return None
+            vector = _common(args) if len(args) == 2 else None
+            return vector and signature(result or vector, *args)
 
-    for kind in kinds:
-        lower_builtin(symbol, kind, kind)(lambda context, builder, sig, args: emit(builder, *args))
+    def lower(context, builder, sig, args):
+        vectors = _in_all_lanes(context, builder, _common(sig.args), sig.args, args)
+        return emit(builder, *vectors)
+
+    for pair in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
+        lower_builtin(symbol, *pair)(lower)
 
 
-_operator(operator.add, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fadd(a, b))
-_operator(operator.sub, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fsub(a, b))
-_operator(operator.mul, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fmul(a, b))
-_operator(operator.truediv, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fdiv(a, b))
-_operator(
-    operator.lt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<", a, b)
+_operator(operator.add, None, lambda builder, a, b: builder.fadd(a, b))
+_operator(operator.sub, None, lambda builder, a, b: builder.fsub(a, b))
+_operator(operator.mul, None, lambda builder, a, b: builder.fmul(a, b))
+_operator(operator.truediv, None, lambda builder, a, b: builder.fdiv(a, b))
+_operator(operator.lt, MASK16, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
+_operator(operator.le, MASK16, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+_operator(operator.gt, MASK16, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
+_operator(operator.ge, MASK16, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
+
+
+@infer_global(operator.and_)
+class _BothMasks(AbstractTemplate):  # type: ignore[misc,unused-ignore]
+    def generic(self, args, kws):
+        return signature(MASK16, *args) if args == (MASK16, MASK16) else None
+
+
+lower_builtin(operator.and_, MASK16, MASK16)(
+    lambda context, builder, sig, args: builder.and_(*args)
 )
-_operator(
-    operator.le, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<=", a, b)
-)
-_operator(
-    operator.gt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">", a, b)
-)
-_operator(
-    operator.ge, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">=", a, b)
-)
-_operator(operator.and_, (MASK16,), MASK16, lambda builder, a, b: builder.and_(a, b))
-_operator(operator.or_, (MASK16,), MASK16, lambda builder, a, b: builder.or_(a, b))
 
 
-def _declare(builder, name: str, vector, n_args: int):
+def _function(n_args: int, emit):
+    """Return an operation of one or three float vectors; ``emit`` writes its instruction."""
+
+    def codegen(context, builder, sig, args):
+        vectors = _in_all_lanes(context, builder, sig.return_type, sig.args, args)
+        return emit(builder, *vectors)
+
+    def unary(typingctx, a):
+        return a(a), codegen
+
+    def binary(typingctx, a, b):
+        return _common((a, b))(a, b), codegen
+
+    def ternary(typingctx, a, b, c):
+        return _common((a, b, c))(a, b, c), codegen
+
+    return intrinsic((unary, binary, ternary)[n_args - 1])
+
+
+def _call(builder, name: str, *args):
+    """Call the function of LLVM for a vector's type."""
+    vector = args[0].type
     suffix = "f32" if vector == _VECTORS["f32"] else "f64"
-    return cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(vector, [vector] * n_args), f"llvm.{name}.v{LANES}{suffix}"
+    kind = ir.FunctionType(vector, [vector] * len(args))
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{suffix}")
+    return builder.call(function, args)
+
+
+sqrt = _function(1, lambda builder, a: _call(builder, "sqrt", a))
+absolute = _function(1, lambda builder, a: _call(builder, "fabs", a))
+negative = _function(1, lambda builder, a: builder.fneg(a))
+fma = _function(3, lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c))  # a * b + c
+fnma = _function(3, lambda builder, a, b, c: _call(builder, "fmuladd", builder.fneg(a), b, c))
+
+
+def _extreme(predicate: str):
+    """Return the operation that takes b where either is NaN, as the machine instruction does."""
+    return _function(
+        2, lambda builder, a, b: builder.select(builder.fcmp_ordered(predicate, a, b), a, b)
     )
 
 
-def _llvm_function(name: str, n_args: int):
-    @intrinsic
-    def unary(typingctx, a):
-        def codegen(context, builder, sig, args):
-            return builder.call(_declare(builder, name, args[0].type, len(args)), args)
-
-        return a(a), codegen
-
-    @intrinsic
-    def ternary(typingctx, a, b, c):
-        def codegen(context, builder, sig, args):
-            return builder.call(_declare(builder, name, args[0].type, len(args)), args)
-
-        return a(a, b, c), codegen
-
-    return unary if n_args == 1 else ternary
-
-
-fma = _llvm_function("fmuladd", 3)  # a * b + c
-sqrt = _llvm_function("sqrt", 1)
-absolute = _llvm_function("fabs", 1)
-
-
-@intrinsic
-def fnma(typingctx, a, b, c):
-    """Return ``c - a * b``."""
-
-    def codegen(context, builder, sig, args):
-        function = _declare(builder, "fmuladd", args[0].type, 3)
-        return builder.call(function, [builder.fneg(args[0]), args[1], args[2]])
-
-    return a(a, b, c), codegen
-
-
-@intrinsic
-def negative(typingctx, a):
-    """Return ``-a``."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fneg(args[0])
-
-    return a(a), codegen
+minimum = _extreme("<")
+maximum = _extreme(">")
 
 
 @intrinsic
@@ -242,24 +236,11 @@ def select(typingctx, mask, yes, no):
     """
 
     def codegen(context, builder, sig, args):
-        return builder.select(*args)
+        kinds = sig.args[1:]
+        vectors = _in_all_lanes(context, builder, sig.return_type, kinds, args[1:])
+        return builder.select(args[0], *vectors)
 
-    return yes(mask, yes, no), codegen
-
-
-def _extreme(predicate: str):
-    @intrinsic
-    def operation(typingctx, a, b):
-        def codegen(context, builder, sig, args):
-            return builder.select(builder.fcmp_ordered(predicate, *args), *args)
-
-        return a(a, b), codegen
-
-    return operation
-
-
-minimum = _extreme("<")  # b where either is NaN, as the machine instruction does
-maximum = _extreme(">")
+    return (_common((yes, no)) or F32X16)(mask, yes, no), codegen
 
 
 @intrinsic
