@@ -22,14 +22,11 @@ from alpasim_plugin.core.types import (
     I64,
     Actor,
     Box,
-    HeightField,
-    LaneMap,
     Trajectory,
     Vehicle,
 )
-from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import number, point, read_lanelets
-from scenarios.map_lines import lane_edges
+from scenarios.map_lines import ground_of
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
 LABELS = {
@@ -279,7 +276,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         scene_id=f"commonroad-{root.get('benchmarkID') or file.stem}",
         source="commonroad",
         lane_map=lane_map,
-        ground=_ground(lane_map, chosen.centre),
+        ground=ground_of(lane_map, chosen.centre),
         ego_log=offset_trajectory(centre_log, T_centre_rig),
         vehicle=vehicle,
         actors=tuple(actors),
@@ -365,13 +362,3 @@ def _choose_ego(
 
 def _driven_m(obstacle: Obstacle) -> float:
     return float(np.linalg.norm(np.diff(obstacle.centre[:, :2], axis=0), axis=1).sum())
-
-
-def _ground(lane_map: LaneMap, drive: F64) -> HeightField:
-    """Return a level ground for planar files, a fitted one where points have heights."""
-    points = np.concatenate(lane_edges(lane_map.lanes))
-    return (
-        flat(0.0)
-        if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0
-        else from_points(points, drive=drive)
-    )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_yaw, yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, Actor, Bool, Box, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, I64, Actor, Bool, Box, Signal, Trajectory, Vehicle
 from alpasim_plugin.world.idm import (
     NO_BODIES,
     Bodies,
@@ -30,6 +30,7 @@ from alpasim_plugin.world.idm import (
     spans,
 )
 from alpasim_plugin.world.path import Lines, Path
+from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
 from scenarios.ego_path import track_on_path
 
 LOOKAHEAD_S = tuple(float(t) for t in np.arange(0.5, 4.01, 0.5))
@@ -217,6 +218,7 @@ def drive(
     scripts: Sequence[Actor],
     followers: Sequence[Follower],
     end_us: int,
+    signals: Sequence[Signal] | None = None,
 ) -> Drive:
     """Drive from time 0 to ``end_us``, or to the end of the path.
 
@@ -228,15 +230,17 @@ def drive(
         scripts: Tracks known in advance.
         followers: Drivers that react to the ego and to each other.
         end_us: Last time.
+        signals: Traffic lights, at which all stop.
     """
     table = ScriptedTracks(scripts, end_us, DECISION_US)
-    expert = _Expert(path, s0_m, vehicle, style, table)
+    expert = _Expert(path, s0_m, vehicle, style, table, lights_on(path, signals))
     standing = {
         id(f.path): spans(f.path, 0.0, table.standing, f.path.length_m + 100.0, window=False)
         for f in followers
     }
-    cars = [_Car(f, standing[id(f.path)]) for f in followers]
     paths = {id(f.path): f.path for f in followers}
+    lights = {key: lights_on(line, signals) for key, line in paths.items()}
+    cars = [_Car(f, standing[id(f.path)], lights[id(f.path)]) for f in followers]
     number = {key: i for i, key in enumerate(paths)}
     lines = Lines(list(paths.values())) if paths else None
     line = np.array([number[id(f.path)] for f in followers], dtype=np.int64)
@@ -257,7 +261,7 @@ def drive(
             fronts = np.array([car.front_s for car in cars])
             found = find_leaders(lines, line, fronts, half_widths, everybody, horizons, rows)
             for car, leader in zip(cars, found, strict=True):
-                car.decide(leader)
+                car.decide(leader, t)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)
@@ -290,9 +294,15 @@ class _Expert:
     """The ego while it drives."""
 
     def __init__(
-        self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptedTracks
+        self,
+        path: Path,
+        s0_m: float,
+        vehicle: Vehicle,
+        style: ExpertStyle,
+        table: ScriptedTracks,
+        lights: Sequence[LightAhead],
     ) -> None:
-        self.path, self.vehicle, self.table = path, vehicle, table
+        self.path, self.vehicle, self.table, self.lights = path, vehicle, table, lights
         self.lookup = path.coarser(
             4
         )  # projections search every station; 1 m apart is enough for them
@@ -331,6 +341,9 @@ class _Expert:
                     wanted,
                     idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params),
                 )
+        red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
+        if red_m < np.inf:
+            wanted = min(wanted, idm_acceleration(self.v, red_m, self.v, self.params))
         if t_us % LOOKAHEAD_US == 0:
             self.cap = yielding_acceleration(
                 self.lookup,
@@ -354,17 +367,19 @@ class _Expert:
 class _Car:
     """A follower while it drives."""
 
-    def __init__(self, f: Follower, standing: Spans | None) -> None:
+    def __init__(self, f: Follower, standing: Spans | None, lights: Sequence[LightAhead]) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
         self.log_s = [self.s]
         self.standing = standing  # places of the standing bodies on its line
+        self.lights = lights
 
     @property
     def front_s(self) -> float:
         return self.s + self.f.box.length_m / 2
 
-    def decide(self, moving: Leader) -> None:
-        a = idm_acceleration(self.v, np.inf, 0.0, self.f.params)
+    def decide(self, moving: Leader, t_us: int) -> None:
+        red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
+        a = idm_acceleration(self.v, red_m, self.v, self.f.params)
         for leader in (moving, nearest_ahead(self.standing, self.front_s, self.f.box.width_m / 2)):
             if leader.index >= 0:
                 a = min(

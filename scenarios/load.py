@@ -37,6 +37,7 @@ from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_scenario
 from scenarios.build import built_drive
 from scenarios.cameras import camera_spec, check_mounts, given_cameras
+from scenarios.map_drive import map_drive
 from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
 from scenarios.schema import VehicleSpec
@@ -54,11 +55,11 @@ def load_scenario(
     overrides: Sequence[str] = (),
     source: str | None = None,
 ) -> Scenario:
-    """Load a scenario file, a recorded log, or a shipped scenario by name.
+    """Load a scenario file, a recorded log, a map, or a shipped scenario by name.
 
     Args:
-        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams
-            folder, or a name such as ``smoke/straight``.
+        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, OpenDRIVE map,
+            or a name such as ``smoke/straight``.
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene,
             with the seed in its id. Seed 0 is the file as written, but for its ``variations`` and
             ``samples``.
@@ -76,11 +77,12 @@ def load_scenario(
     drawn = draw(document, seed, overrides)
     cameras = given_cameras(drawn)
     default = drawn.spec.vehicle or VehicleSpec()
-    drive = (
-        built_drive(drawn, _vehicle(default))
-        if drawn.spec.log is None
-        else recorded_drive(drawn, source)
-    )
+    if drawn.spec.road is not None:
+        drive = built_drive(drawn, _vehicle(default))
+    elif drawn.spec.map is not None:
+        drive = map_drive(drawn, _vehicle(default))
+    else:
+        drive = recorded_drive(drawn, source)
     scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))
     if cameras is not None:
         check_mounts(drawn, cameras, scenario.vehicle)
@@ -157,7 +159,7 @@ def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
     first = int(drive.ego_log.t_us[0])
     last = int(drive.ego_log.t_us[-1])
     start = first + timing.start_us
-    if drawn.spec.log is None:
+    if drawn.spec.road is not None:
         return start + timing.start_time_offset_us, drawn.spec.built_until_us
     if timing.timeline == "alpasim" and drive.first_frame_us is not None:
         start = drive.first_frame_us
@@ -265,6 +267,10 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
         content["cameras"].sort(key=lambda camera: camera["name"])
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"
+    if spec.map is None:
+        del content["map"]
+    else:
+        content["map"]["opendrive"] = "given by its content"
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())

@@ -21,7 +21,8 @@ import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, densify
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M
-from alpasim_plugin.core.types import F64, Lane, LaneMap
+from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap
+from alpasim_plugin.world.ground import flat, from_points
 
 MAX_STEP_M = 2.0
 
@@ -36,6 +37,16 @@ STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far ap
 def lane_edges(lanes: Mapping[str, Lane]) -> list[F64]:
     """Return the edges ``(N, 3)`` that lanes have, left before right, lane by lane."""
     return [edge for lane in lanes.values() for edge in (lane.left, lane.right) if edge is not None]
+
+
+def ground_of(lane_map: LaneMap, drive: F64) -> HeightField:
+    """Return the ground under a map: level where its lanes are at height 0, else fitted to their
+    edges around a drive ``(T, 3)``.
+    """
+    points = np.concatenate(lane_edges(lane_map.lanes))
+    if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0:
+        return flat(0.0)
+    return from_points(points, drive=drive)
 
 
 def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import densify, transform_points
+from alpasim_plugin.core.geometry import densify
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import some_of
@@ -30,14 +30,17 @@ from scenarios.opendrive_road import (
     Road,
     RoadLink,
     Section,
-    beside,
     cubics_at,
     curved,
+    driven_along,
     gap_m,
+    lane_borders,
     lane_key,
     reference_line,
+    road_points,
     sided,
 )
+from scenarios.opendrive_signals import roadside
 from scenarios.recorded import SourceFiles
 
 # WGS 84 ellipsoid (NIMA TR8350.2).
@@ -91,7 +94,7 @@ def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> tuple[dict[str, Lane], 
                 ahead = _ahead(road, index, lane, roads, turns)
                 found = tuple(dict.fromkeys(k for k in ahead if k in lanes))
                 out[key] = replace(out[key], successors=found)
-                link = road.successor if _along(road, lane) else road.predecessor
+                link = road.successor if driven_along(road, lane) else road.predecessor
                 if not found and link is not None and out[key].kind == "vehicle":
                     ends.append(key)
     if ends:
@@ -137,15 +140,10 @@ def _starts_at(road: Road, junction: str) -> bool:
     return after is None or (after.kind, after.target) != ("junction", junction)
 
 
-def _along(road: Road, lane: OdrLane) -> bool:
-    """Return whether a lane is driven in the direction of its road's arc length."""
-    return ((lane.lane_id < 0) != road.left_hand) != lane.reversed
-
-
 def _ahead(
     road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Turns
 ) -> list[str]:
-    along = _along(road, lane)
+    along = driven_along(road, lane)
     linked = lane.successors if along else lane.predecessors
     next_section = index + (1 if along else -1)
     if 0 <= next_section < len(road.sections):
@@ -168,7 +166,7 @@ def _ahead(
             one.lane_id
             for one in target.sections[entered].lanes
             if lane.lane_id in (one.predecessors if link.at_start else one.successors)
-            and _along(target, one) == link.at_start
+            and driven_along(target, one) == link.at_start
             and _joins(target, link.at_start, road)
         )
     return [lane_key(target, entered, i) for i in linked]
@@ -250,6 +248,21 @@ def lane_map_of(
 ) -> tuple[LaneMap, tuple[str, ...]]:
     """Return the lane map of a parsed file in the local frame, with notes on what was left out.
 
+    States of traffic lights are not known of a map.
+
+    Raises:
+        InputError: No road has a lane for vehicles.
+    """
+    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
+    lanes, notes = read_lanes(files, where, odr, T_local_map)
+    return bordered(odr, lanes, T_local_map), notes
+
+
+def read_lanes(
+    files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map: F64
+) -> tuple[dict[str, Lane], tuple[str, ...]]:
+    """Return the linked lanes of a parsed file in the local frame, with notes on what was left out.
+
     Lane ids are ``ROAD.SECTION.LANE``. Edges and centres are sampled every 0.5 m on bends and where
     a width changes, else every 2 m.
 
@@ -258,7 +271,6 @@ def lane_map_of(
     """
     lanes: dict[str, Lane] = {}
     left_out: Counter[str] = Counter()
-    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     for road in odr.roads:
         for index, section in enumerate(road.sections):
             if not road.records or section.end_m - section.s_m <= 1e-6:
@@ -276,19 +288,21 @@ def lane_map_of(
             where, "a map without a lane for vehicles", "use a map with lanes of type driving"
         )
     linked, link_notes = following(odr, lanes)
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
-    notes += (
-        [f"{odr.n_signals} signals and {odr.n_objects} objects of the map are not used"]
-        if odr.n_signals + odr.n_objects
-        else []
-    )
     gaps = {road.road_id: gap_m(road) for road in odr.roads}
     apart = [f"{key} ({gap:.2f} m)" for key, gap in gaps.items() if gap > JOIN_M]
     if apart:
         notes.append(f"{len(apart)} reference lines whose records do not join: {some_of(apart)}")
-    lane_map = LaneMap(linked, border_lines(surface, np.concatenate(lane_edges(lanes))))
-    return lane_map, (*notes, *link_notes, *odr.notes)
+    return linked, (*notes, *link_notes, *odr.notes)
+
+
+def bordered(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMap:
+    """Return the map of lanes with the border of their surface, and what the roads of these lanes
+    have on and beside them.
+    """
+    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
+    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
+    return replace(roadside(odr, lanes, T_local_map), lanes=lanes, road_edges=edges)
 
 
 def _section(
@@ -297,85 +311,60 @@ def _section(
     """Return the lanes of a section; None where its numbers give no road."""
     s = _stations(road, section)
     line = reference_line(road.records, s)
-    tilt = np.tan(cubics_at(road.superelevation, s))
-    height = cubics_at(road.elevation, s)
-    middle = cubics_at(road.lane_offset, s)
     if not (
         np.abs(line[:, :2] - line[0, :2]).max() <= MAX_ROAD_M
-        and np.abs(height).max() <= MAX_ROAD_M
-        and np.isfinite(tilt).all()
+        and np.abs(cubics_at(road.elevation, s)).max() <= MAX_ROAD_M
+        and np.isfinite(np.tan(cubics_at(road.superelevation, s))).all()
     ):
         return None
-
-    def points(t: F64) -> F64:
-        return transform_points(T_local_map, np.column_stack([beside(line, t), height + t * tilt]))
-
     out: list[Lane] = []
-    for sign in (1, -1):
-        inner_t, inner_mark = (
-            middle,
-            next((one.mark for one in section.lanes if one.lane_id == 0), None),
-        )
+    marks = {lane.lane_id: lane.mark for lane in section.lanes}
+    for lane, inner_t, outer_t in lane_borders(road, section, s):
+        sign = 1 if lane.lane_id > 0 else -1
+        if not np.abs(outer_t).max() <= MAX_OFFSET_M:
+            return None
+        kind = KINDS.get(lane.kind)
+        wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
+        if kind is None or not wide:
+            left_out[
+                lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"
+            ] += 1
+            continue
+        near, far = (road_points(road, line, s, t, T_local_map) for t in (inner_t, outer_t))
+        turn = 1 if driven_along(road, lane) else -1
         side = section.side(sign)
-        for k, lane in enumerate(side):
-            outer_t = _outer(lane, sign, s, inner_t, middle)
-            if not np.abs(outer_t).max() <= MAX_OFFSET_M:
-                return None
-            kind = KINDS.get(lane.kind)
-            wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
-            if kind is None or not wide:
-                left_out[
-                    lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"
-                ] += 1
-            else:
-                near = points(inner_t)
-                far = points(outer_t)
-                turn = 1 if _along(road, lane) else -1
-                beside_ids = [
-                    lane_key(road, index, n.lane_id)
-                    if n is not None and n.kind in KINDS and n.reversed == lane.reversed
-                    else None
-                    for n in _neighbours(side, k)
-                ]
-                # Seen in driving direction the middle of the road is on the left, with left-hand
-                # traffic on the right.
-                order = -1 if road.left_hand != lane.reversed else 1
-                edges = (near, far)[::order]
-                paints = (_paint(inner_mark), _paint(lane.mark))[::order]
-                beside_ids = beside_ids[::order]
-                left, right = (edge[::turn] for edge in edges)
-                out.append(
-                    Lane(
-                        lane_key(road, index, lane.lane_id),
-                        densify((left + right) / 2),
-                        left,
-                        right,
-                        kind,
-                        left_neighbour=beside_ids[0],
-                        right_neighbour=beside_ids[1],
-                        left_paint=paints[0],
-                        right_paint=paints[1],
-                        is_intersection=road.junction != "-1",
-                    )
-                )
-            inner_t, inner_mark = outer_t, lane.mark
+        k = side.index(lane)
+        inside = side[k - 1] if k > 0 else None
+        outside = side[k + 1] if k + 1 < len(side) else None
+        inner_mark = marks.get(inside.lane_id if inside is not None else 0)
+        beside_ids = [
+            lane_key(road, index, n.lane_id)
+            if n is not None and n.kind in KINDS and n.reversed == lane.reversed
+            else None
+            for n in (inside, outside)
+        ]
+        # Seen in driving direction the middle of the road is on the left, with left-hand
+        # traffic on the right.
+        order = -1 if road.left_hand != lane.reversed else 1
+        edges = (near, far)[::order]
+        paints = (_paint(inner_mark), _paint(lane.mark))[::order]
+        beside_ids = beside_ids[::order]
+        left, right = (edge[::turn] for edge in edges)
+        out.append(
+            Lane(
+                lane_key(road, index, lane.lane_id),
+                densify((left + right) / 2),
+                left,
+                right,
+                kind,
+                left_neighbour=beside_ids[0],
+                right_neighbour=beside_ids[1],
+                left_paint=paints[0],
+                right_paint=paints[1],
+                is_intersection=road.junction != "-1",
+            )
+        )
     return out
-
-
-def _neighbours(side: tuple[OdrLane, ...], k: int) -> tuple[OdrLane | None, OdrLane | None]:
-    """Return the next lane towards the road's middle and the next one outwards, on the same
-    side.
-    """
-    return (side[k - 1] if k > 0 else None), (side[k + 1] if k + 1 < len(side) else None)
-
-
-def _outer(lane: OdrLane, sign: int, s: F64, inner_t: F64, middle: F64) -> F64:
-    """Return ``(N,)`` the signed distance of a lane's outer border: by widths, or by borders where
-    it has those instead.
-    """
-    if lane.borders and not lane.widths:
-        return middle + cubics_at(lane.borders, s)
-    return inner_t + sign * np.maximum(cubics_at(lane.widths, s), 0.0)
 
 
 def _stations(road: Road, section: Section) -> F64:

@@ -9,7 +9,8 @@ the left.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.types import F64
 from scenarios.recorded import SourceFiles
@@ -31,6 +33,8 @@ MAX_ROAD_M = MAP_ROAD_M.high
 # Elements of a map that are read, or that change no road; types of junctions that are read.
 KNOWN = {"header", "road", "junction", "controller", "junctionGroup", "station", "userData"}
 JUNCTIONS = ("default", "direct", "")
+STOP_LINE, CROSSWALK = "294", "1000003"  # catalogue numbers of marks on the road
+CROSSWALK_M = 4.0
 JOIN_M = 0.01  # records of a reference line that lie farther apart do not join
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
@@ -259,6 +263,26 @@ class RoadLink:
 
 
 @dataclass(frozen=True)
+class RoadSignal:
+    """A light, a sign or a mark on a road, as written or by reference."""
+
+    signal_id: str
+    kind: str  # the country's catalogue number; 294: stop line
+    dynamic: bool  # it changes its state: a light
+    s_m: float
+    t_m: float
+    above_m: float
+    orientation: str  # "+": for traffic along the road, "-": against it, else for both
+    width_m: float
+    height_m: float
+    lanes: tuple[tuple[int, int], ...] = ()  # ranges of lanes that it is for; none: all
+
+    def holds(self, lane_id: int) -> bool:
+        """Return whether it is for a lane, its direction apart."""
+        return not self.lanes or any(low <= lane_id <= high for low, high in self.lanes)
+
+
+@dataclass(frozen=True)
 class Road:
     """One road."""
 
@@ -273,6 +297,8 @@ class Road:
     sections: tuple[Section, ...]
     successor: RoadLink | None
     predecessor: RoadLink | None
+    signals: tuple[RoadSignal, ...] = ()
+    crosswalks: tuple[F64, ...] = ()  # rings (N, 2) of s and t
 
 
 @dataclass(frozen=True)
@@ -296,8 +322,7 @@ class OdrMap:
     roads: tuple[Road, ...]
     connections: tuple[Connection, ...]
     geo_reference: str
-    n_signals: int
-    n_objects: int
+    controllers: Mapping[str, str]  # signal to the controller that switches it
     notes: tuple[str, ...] = ()
 
 
@@ -332,11 +357,12 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
         for c in j.findall("connection")
     )
     reference = root.find(".//geoReference")
-    n_signals, n_objects = (len(root.findall(f".//{name}")) for name in ("signal", "object"))
+    roads, signal_notes = _with_signals(files, where, roads, root)
     notes = [
         f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
         for tag in sorted({child.tag for child in root} - KNOWN)
     ]
+    notes += signal_notes
     if root.find("header/offset") is not None:
         notes.append(
             "the offset in the map's header is not applied: its coordinates are as written"
@@ -346,23 +372,123 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     shapes = len(root.findall(".//lateralProfile/shape"))
     notes += [f"{shapes} cross section shapes of the map are not used"] if shapes else []
     geo = "" if reference is None else (reference.text or "").strip()
-    return OdrMap(roads, connections, geo, n_signals, n_objects, tuple(notes))
+    controllers = {
+        control.get("signalId", ""): controller.get("id", "")
+        for controller in root.findall("controller")
+        for control in controller.findall("control")
+    }
+    return OdrMap(roads, connections, geo, controllers, tuple(notes))
+
+
+def _with_signals(
+    files: SourceFiles, where: Path | str, roads: tuple[Road, ...], root: Element
+) -> tuple[tuple[Road, ...], list[str]]:
+    """Return the roads with what stands on them, and notes on what is not used.
+
+    Crosswalks are objects of that type, or marks of type 1000003, which have no length along the
+    road: 4 m is assumed. Stop lines are marks of type 294, or objects with such a name.
+    """
+    written: dict[str, RoadSignal] = {}
+    unused: Counter[str] = Counter()
+    placed: list[tuple[list[RoadSignal], list[F64]]] = []
+    for road, element in zip(roads, root.findall("road"), strict=True):
+        here = f"{where}, road {road.road_id}"
+        signals = [_signal(files, here, one) for one in element.findall("signals/signal")]
+        rings = [_rectangle(one, CROSSWALK_M) for one in signals if one.kind == CROSSWALK]
+        for one in element.findall("objects/object"):
+            if one.get("type") == "crosswalk":
+                rings.append(_crosswalk(files, here, one))
+            elif "stopline" in f"{one.get('name')}{one.get('subtype')}".lower().replace(" ", ""):
+                signals.append(replace(_signal(files, here, one), kind=STOP_LINE))
+            else:
+                unused[f"objects of type {one.get('type')} are not used"] += 1
+        written |= {one.signal_id: one for one in signals}
+        placed.append((signals, rings))
+    for road, element, (signals, _) in zip(roads, root.findall("road"), placed, strict=True):
+        for one in element.findall("signals/signalReference"):
+            original = written.get(one.get("id", ""))
+            if original is None:
+                unused["references to signals that the map does not have are left out"] += 1
+                continue
+            here = _signal(files, f"{where}, road {road.road_id}", one)
+            signals.append(
+                replace(
+                    original,
+                    s_m=here.s_m,
+                    t_m=here.t_m,
+                    orientation=here.orientation,
+                    lanes=here.lanes,
+                )
+            )
+    roads = tuple(
+        replace(road, signals=tuple(signals), crosswalks=tuple(rings))
+        for road, (signals, rings) in zip(roads, placed, strict=True)
+    )
+    return roads, [f"{n} {what}" for what, n in sorted(unused.items())]
+
+
+def _signal(files: SourceFiles, here: str, one: Element) -> RoadSignal:
+    s, t, above, width, height = (
+        _number(files, here, one, name, default)
+        for name, default in (
+            ("s", None),
+            ("t", None),
+            ("zOffset", 0.0),
+            ("width", 0.0),
+            ("height", 0.0),
+        )
+    )
+    lanes = tuple(
+        tuple(_integer(files, here, range_, name) for name in ("fromLane", "toLane"))
+        for range_ in one.findall("validity")
+    )
+    return RoadSignal(
+        one.get("id", ""),
+        one.get("type", ""),
+        one.get("dynamic") == "yes",
+        s,
+        t,
+        above,
+        one.get("orientation", "none"),
+        width,
+        height,
+        tuple((min(ends), max(ends)) for ends in lanes),
+    )
+
+
+def _rectangle(one: RoadSignal, along_m: float) -> F64:
+    """Return the ring ``(5, 2)`` of s and t of a mark across a road."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    return np.array([one.s_m, one.t_m]) + corners * [along_m / 2, one.width_m / 2]
+
+
+def _crosswalk(files: SourceFiles, here: str, one: Element) -> F64:
+    """Return the ring ``(N, 2)`` of s and t of a crosswalk: its outline, or the rectangle of its
+    length and width.
+    """
+    s, t = (_number(files, here, one, name) for name in "st")
+    local = one.findall(".//cornerLocal")
+    if not local and one.find(".//cornerRoad") is not None:
+        corners = np.array(
+            [[_number(files, here, c, k) for k in "st"] for c in one.findall(".//cornerRoad")]
+        )
+    else:
+        turn = _number(files, here, one, "hdg", 0.0)
+        c, s_ = np.cos(turn), np.sin(turn)
+        if local:
+            shape = np.array([[_number(files, here, corner, k) for k in "uv"] for corner in local])
+        else:
+            half = [_number(files, here, one, k) / 2 for k in ("length", "width")]
+            shape = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+        corners = shape @ np.array([[c, s_], [-s_, c]]) + [s, t]
+    return np.concatenate([corners, corners[:1]])
 
 
 def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
     here = f"{where}, road {element.get('id')}"
 
     def number(owner: Element, name: str, default: float | None = None) -> float:
-        text = owner.get(name)
-        if text is None and default is not None:
-            return default
-        try:
-            value = float(str(text))
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            raise files.fail(here, f"<{owner.tag}> with {name} = {text!r}", "give a finite number")
-        return value
+        return _number(files, here, owner, name, default)
 
     def cubics(
         owner: Element | None, tag: str, at: str = "s", start_m: float = 0.0
@@ -469,6 +595,21 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
     )
 
 
+def _number(
+    files: SourceFiles, here: str, owner: Element, name: str, default: float | None = None
+) -> float:
+    text = owner.get(name)
+    if text is None and default is not None:
+        return default
+    try:
+        value = float(str(text))
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise files.fail(here, f"<{owner.tag}> with {name} = {text!r}", "give a finite number")
+    return value
+
+
 def _integer(files: SourceFiles, where: Path | str, element: Element, name: str) -> int:
     try:
         return int(str(element.get(name)))
@@ -487,6 +628,35 @@ def _link(road: Element, tag: str) -> RoadLink | None:
         str(found.get("elementId")),
         found.get("contactPoint", "start") == "start",
     )
+
+
+def driven_along(road: Road, lane: OdrLane) -> bool:
+    """Return whether a lane is driven in the direction of its road's arc length."""
+    return ((lane.lane_id < 0) != road.left_hand) != lane.reversed
+
+
+def lane_borders(road: Road, section: Section, s_m: F64) -> Iterator[tuple[OdrLane, F64, F64]]:
+    """Give each lane of both sides with the signed distances ``(N,)`` of its inner and its outer
+    border at arc lengths ``(N,)``: by widths, or by borders where it has those instead.
+    """
+    middle = cubics_at(road.lane_offset, s_m)
+    for sign in (1, -1):
+        inner_t = middle
+        for lane in section.side(sign):
+            if lane.borders and not lane.widths:
+                outer_t = middle + cubics_at(lane.borders, s_m)
+            else:
+                outer_t = inner_t + sign * np.maximum(cubics_at(lane.widths, s_m), 0.0)
+            yield lane, inner_t, outer_t
+            inner_t = outer_t
+
+
+def road_points(road: Road, line: F64, s_m: F64, t_m: F64, T_local_map: F64) -> F64:
+    """Return points ``(N, 3)`` in the local frame, at signed distances ``(N,)`` from the reference
+    line ``(N, 3)`` at arc lengths ``(N,)``.
+    """
+    height = cubics_at(road.elevation, s_m) + t_m * np.tan(cubics_at(road.superelevation, s_m))
+    return transform_points(T_local_map, np.column_stack([beside(line, t_m), height]))
 
 
 def lane_key(road: Road, section: int, lane_id: int) -> str:

@@ -13,7 +13,16 @@ from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.printing import say
-from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, RoadSpec, within
+from scenarios.schema_parts import (
+    ActorSpec,
+    BuildingHeight,
+    LogSpec,
+    MapRoute,
+    MapSpec,
+    Part,
+    RoadSpec,
+    within,
+)
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
 WIDEST_PINHOLE_DEG = 120  # a wider one is smeared towards its sides
@@ -214,7 +223,7 @@ class TimingSpec(Part):
         default=None,
         gt=0,
         le=b.TIME_US.high,
-        description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log.",
+        description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log or of a map's route.",
     )
     warmup_us: int = within(
         b.TIME_US, "The log is forced for so long after the first frame.", 500_000
@@ -406,11 +415,14 @@ class ScenarioSpec(Part):
         le=int(b.SEED.high),
         description="Scene seed; 0: the numbers are used as written, others jitter them.",
     )
-    road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
-    log: LogSpec | None = Field(
-        default=None, description="A recorded drive to use; give this or road."
+    road: RoadSpec | None = Field(
+        default=None, description="A road to build; give this, log or map."
     )
-    ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
+    log: LogSpec | None = Field(default=None, description="A recorded drive to use.")
+    map: MapSpec | None = Field(default=None, description="A map to drive on.")
+    ego: EgoSpec = Field(
+        default=EgoSpec(), description="The expert that drives a built road or a map."
+    )
     actors: tuple[ActorSpec, ...] = Field(
         default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users."
     )
@@ -459,10 +471,15 @@ class ScenarioSpec(Part):
 
     @model_validator(mode="after")
     def _one_source(self) -> ScenarioSpec:
-        if (self.road is None) == (self.log is None):
+        if sum(given is not None for given in (self.road, self.log, self.map)) != 1:
             raise ValueError(
-                "give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}"
+                "give exactly one of 'road', 'log' and 'map' | add road: {segments: [...]}, log: {commonroad: FILE} or map: {opendrive: FILE}"
             )
+        if self.map is not None:
+            plain = EgoSpec()
+            for name in ("lane", "start_m", "lane_changes"):
+                if getattr(self.ego, name) != getattr(plain, name):
+                    raise ValueError(f"ego.{name} with map | give map.route, and remove ego.{name}")
         if self.log is not None and self.log.drive is not None:
             built = {
                 "degradation": self.degradation,
@@ -496,6 +513,8 @@ def models() -> dict[str, type[BaseModel]]:
         "": ScenarioSpec,
         "road": RoadSpec,
         "log": LogSpec,
+        "map": MapSpec,
+        "map.route": MapRoute,
         "ego": EgoSpec,
     }
     out["ego.lane_changes[]"] = LaneChangeSpec

@@ -236,6 +236,32 @@ class LogSpec(Part):
         return kind, str(getattr(self, kind)), kind
 
 
+Place = Annotated[str, Field(pattern=r"^.+:\d+(\.\d+)?$")]
+
+
+class MapRoute(Part):
+    """A way along the lanes of a map. An end that is not given is drawn by the scene seed."""
+
+    from_: Place | None = Field(
+        default=None,
+        alias="from",
+        description="Start of the rear axle, ROAD:S: metres along the road.",
+    )
+    to: Place | None = Field(default=None, description="End, ROAD:S.")
+
+
+class MapSpec(Part):
+    """A map without a drive: an expert drives a route on it, and the street is built around."""
+
+    opendrive: str = Field(min_length=1, description="OpenDRIVE file, relative to this file.")
+    route: Literal["random"] | MapRoute = Field(
+        default="random", description="Where to drive; random: drawn by the scene seed."
+    )
+    vehicles: int = Field(
+        default=6, ge=0, le=100, description="Vehicles near the route, which react (IDM)."
+    )
+
+
 class _Actor(Part):
     id: ActorId
     label: Label = Field(default="car", description="Class of road user.")

@@ -96,11 +96,11 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
                 "give it another id",
             )
         seen[actor.id] = i
-    if spec.log is not None and spec.actors:
+    if spec.road is None and spec.actors:
         raise document.error(
             ("actors",),
-            "actors beside a recorded log",
-            "remove actors; log.actors chooses the recorded traffic",
+            "actors beside a recorded log or a map",
+            "remove actors; log.actors and map.vehicles choose the traffic",
         )
 
 

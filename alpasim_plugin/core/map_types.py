@@ -65,6 +65,9 @@ class Signal:
     heading_rad: float  # of the traffic that it holds back
     phases: tuple[tuple[str, int], ...]  # colour and microseconds, one after the other
     offset_us: int = 0  # when a first phase begins
+    name: str = ""
+    lanes: tuple[str, ...] = ()  # that it holds back, or that people cross
+    pedestrians: bool = False  # it holds back people who cross, and no vehicle
 
     def colour_at(self, t_us: int) -> str:
         """Return the colour at a time.

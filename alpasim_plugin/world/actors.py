@@ -32,6 +32,7 @@ from alpasim_plugin.core.types import (
     HeightField,
     LaneMap,
     Scenario,
+    Signal,
     Vehicle,
 )
 from alpasim_plugin.world.ground import ground_pose, ground_poses
@@ -52,6 +53,7 @@ from alpasim_plugin.world.idm import (
 )
 from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep
 from alpasim_plugin.world.route import LaneIndex
+from alpasim_plugin.world.signals import lights_on, red_gap_m
 
 MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
 MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows it to its end
@@ -88,7 +90,9 @@ class Actors:
             if lane_map is not None and any(a.behaviour.kind == "idm" for a in actors)
             else None
         )
-        self.drivers = [_Driver(a, index, ground) for a in actors if a.behaviour.kind == "idm"]
+        signals = lane_map.signals if lane_map is not None else None
+        reactive = [a for a in actors if a.behaviour.kind == "idm"]
+        self.drivers = [_Driver(a, index, ground, signals) for a in reactive]
         paths = [driver.path for driver in self.drivers if driver.path is not None]
         self._lines = Lines(paths) if paths else None
         numbered = (driver for driver in self.drivers if driver.path is not None)
@@ -181,7 +185,7 @@ class Actors:
                 np.arange(len(fixed.xy), len(everybody.xy)),
             )
             for driver, leader in zip(driving, found, strict=True):
-                driver.decide(leader, self.standing, present)
+                driver.decide(leader, self.standing, present, to_us)
             for driver in driving:
                 driver.advance(dt_s)
 
@@ -349,10 +353,17 @@ class _Motion:
 class _Driver:
     """A reactive driver: its line, its state, its model."""
 
-    def __init__(self, actor: Actor, index: LaneIndex | None, ground: HeightField | None) -> None:
+    def __init__(
+        self,
+        actor: Actor,
+        index: LaneIndex | None,
+        ground: HeightField | None,
+        signals: Sequence[Signal] | None,
+    ) -> None:
         self.actor, self.ground = actor, ground
         self.params = IdmParams.from_mapping(actor.behaviour.params)
         self.path = _driving_line(actor, index)
+        self.lights = () if self.path is None else lights_on(self.path, signals)
         self.motion: _Motion | None = None
         self.present = True
         self.standing: Spans | None = None
@@ -389,14 +400,17 @@ class _Driver:
         speed_mps = self.driving()[1].speed_mps
         return 20.0 + 2.0 * wanted_gap_m(speed_mps, speed_mps, self.params)
 
-    def decide(self, leader: Leader, standing: _Standing, present: Bool) -> None:
-        """Choose the acceleration for the next step, behind a moving leader."""
+    def decide(self, leader: Leader, standing: _Standing, present: Bool, t_us: int) -> None:
+        """Choose the acceleration for the next step, behind a moving leader and before a red
+        light.
+        """
         path, m = self.driving()
         if not self.knows_standing:
             self.standing, self.knows_standing = standing.on(path), True
-        leaders = [leader]
+        front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
+        red = Leader(red_gap_m(self.lights, front, m.speed_mps, t_us), 0.0, -1)
+        leaders = [leader, red]
         if self.standing is not None:
-            front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
             there = self.standing.only(present[self.standing.index])
             leaders.append(nearest_ahead(there, front, half, self.horizon_m()))
         m.accel_mps2 = min(

@@ -153,7 +153,7 @@ class Judged:
             return None
         front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
         out = np.zeros(len(t_us), dtype=np.bool_)
-        for signal in self._signals:
+        for signal in (one for one in self._signals if not one.pedestrians):
             start, along = signal.stop[0] - self._origin, signal.stop[1, :2] - signal.stop[0, :2]
             normal = np.array([-along[1], along[0]])
             normal *= np.sign(normal @ (np.cos(signal.heading_rad), np.sin(signal.heading_rad)))

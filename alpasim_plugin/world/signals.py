@@ -1,0 +1,59 @@
+"""Where a line passes traffic lights, and how far a driver may go before one that is red."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.core.types import Signal
+from alpasim_plugin.world.path import Path
+
+STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
+LEVEL_M = 3.0  # a line farther above or below the path belongs to another road
+
+
+@dataclass(frozen=True)
+class LightAhead:
+    """A traffic light and the arc length at which a path passes its line."""
+
+    s_m: float
+    signal: Signal
+
+
+def lights_on(path: Path, signals: Sequence[Signal] | None) -> tuple[LightAhead, ...]:
+    """Return the lights for vehicles whose lines a path passes in their direction, in its order."""
+    found = []
+    for signal in signals or ():
+        if signal.pedestrians:
+            continue
+        start, along = signal.stop[0], signal.stop[1, :2] - signal.stop[0, :2]
+        normal = np.array([-along[1], along[0]])
+        normal *= np.sign(normal @ (np.cos(signal.heading_rad), np.sin(signal.heading_rad)))
+        beyond = (path.xyz[:, :2] - start[:2]) @ normal
+        for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
+            share = beyond[k] / (beyond[k] - beyond[k + 1])
+            point = path.xyz[k] + share * (path.xyz[k + 1] - path.xyz[k])
+            aside = (point[:2] - start[:2]) @ along
+            if 0.0 <= aside <= along @ along and abs(point[2] - start[2]) <= LEVEL_M:
+                s_m = path.s[k] + share * (path.s[k + 1] - path.s[k])
+                found.append(LightAhead(float(s_m), signal))
+    return tuple(sorted(found, key=lambda light: light.s_m))
+
+
+def red_gap_m(lights: Sequence[LightAhead], front_s_m: float, speed_mps: float, t_us: int) -> float:
+    """Return the distance from the front bumper to the nearest line at which a driver has to stop;
+    infinite without one.
+
+    A yellow light is one to stop at where `STOP_BRAKE_MPS2` is enough for it.
+    """
+    for light in lights:
+        gap_m = light.s_m - front_s_m
+        if gap_m < 0.0:
+            continue
+        colour = light.signal.colour_at(t_us)
+        stoppable = speed_mps**2 <= 2.0 * STOP_BRAKE_MPS2 * gap_m
+        if colour in ("red", "red_yellow") or (colour == "yellow" and stoppable):
+            return gap_m
+    return float("inf")

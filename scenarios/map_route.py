@@ -1,0 +1,141 @@
+"""Ways along the lanes of a map: the shortest one between two places, or one that is drawn."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.core.geometry import arc_lengths, resample, wrap_angle
+from alpasim_plugin.core.types import F64, Lane
+from alpasim_plugin.world.path import Path, smooth_path, smoothstep
+
+STATION_M = 2.0  # of the driven line, which is smooth in between
+CHANGE_M = 40.0  # length of a lane change, where the lanes are as long
+SHORTEST_CHANGE_M = 20.0
+CHANGE_COST_M = 50.0  # a way is so much longer before a lane change is worth it
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A place on a lane."""
+
+    lane_id: str
+    at_m: float  # along its centre
+
+
+@dataclass(frozen=True)
+class Way:
+    """Lanes in driving order. From a lane to its neighbour one changes, else one follows the
+    other.
+    """
+
+    lane_ids: tuple[str, ...]
+    start_m: float  # on the first lane
+    beyond_m: float  # of the last lane, behind the goal
+
+
+class LaneGraph:
+    """Lanes for vehicles and how they follow one another."""
+
+    def __init__(self, lanes: Mapping[str, Lane]) -> None:
+        self.lanes = {key: lane for key, lane in lanes.items() if lane.kind in ("vehicle", "bus")}
+        self.length_m = {k: float(arc_lengths(v.centre)[-1]) for k, v in self.lanes.items()}
+
+    def following(self, lane_id: str) -> tuple[str, ...]:
+        """Return the lanes that follow a lane."""
+        return tuple(key for key in self.lanes[lane_id].successors if key in self.lanes)
+
+    def beside(self, lane_id: str) -> tuple[str, ...]:
+        """Return the neighbours of a lane into which one may change."""
+        lane = self.lanes[lane_id]
+        both = (lane.left_neighbour, lane.right_neighbour)
+        return tuple(key for key in both if key is not None and key in self.lanes)
+
+    def between(self, starts: Sequence[Spot], goals: Sequence[Spot]) -> Way | None:
+        """Return the shortest way from one of ``starts`` to one of ``goals``; None without one."""
+        aims = {goal.lane_id: goal.at_m for goal in goals}
+        # cost, number, lanes, from where on the last lane, whether one has changed into it
+        queue = [(0.0, n, (spot.lane_id,), spot.at_m, False) for n, spot in enumerate(starts)]
+        begins = {spot.lane_id: spot.at_m for spot in starts}
+        settled: set[tuple[str, bool, bool]] = set()
+        pushed = len(queue)
+        while queue:
+            cost_m, _, chain, on_m, changed = heapq.heappop(queue)
+            last = chain[-1]
+            least_m = on_m + (SHORTEST_CHANGE_M if changed else 0.0)
+            if last in aims and aims[last] > least_m:
+                return Way(chain, begins[chain[0]], self.length_m[last] - aims[last])
+            state = last, changed, len(chain) == 1
+            if state in settled:
+                continue
+            settled.add(state)
+            rest_m = self.length_m[last] - on_m
+            steps = [(key, rest_m, 0.0, False) for key in self.following(last)]
+            if rest_m >= SHORTEST_CHANGE_M and not changed:
+                steps += [
+                    (key, CHANGE_COST_M, self._abreast(last, key, on_m), True)
+                    for key in self.beside(last)
+                ]
+            for key, more_m, begin_m, change in steps:
+                pushed += 1
+                step = (cost_m + more_m, pushed, (*chain, key), begin_m, change)
+                heapq.heappush(queue, step)
+        return None
+
+    def drawn(self, start: Spot, length_m: float, rng: np.random.Generator) -> Way:
+        """Return a way from a place, at each fork into a lane drawn; it is shorter than
+        ``length_m`` where the lanes end.
+        """
+        chain = [start.lane_id]
+        driven_m = self.length_m[start.lane_id] - start.at_m
+        while driven_m < length_m and (after := self.following(chain[-1])):
+            chain.append(after[int(rng.integers(len(after)))])
+            driven_m += self.length_m[chain[-1]]
+        return Way(tuple(chain), start.at_m, max(driven_m - length_m, 0.0))
+
+    def carried_on(self, way: Way, length_m: float) -> Way:
+        """Return a way with the lanes after its end that turn least, for a length."""
+        chain = list(way.lane_ids)
+        beyond_m = way.beyond_m
+        while beyond_m < length_m and (after := self.following(chain[-1])):
+            chain.append(min(after, key=self._turn_rad))
+            beyond_m += self.length_m[chain[-1]]
+        return Way(tuple(chain), way.start_m, beyond_m)
+
+    def line(self, way: Way) -> Path:
+        """Return the smooth line of a way, from its start to the end of its last lane."""
+        parts: list[F64] = []
+        begin_m, ids = way.start_m, list(way.lane_ids)
+        while ids:
+            key = ids.pop(0)
+            stations = np.arange(begin_m, max(self.length_m[key], begin_m + 0.1), STATION_M)
+            points = resample(self.lanes[key].centre, stations)
+            if ids and ids[0] in self.beside(key):
+                other = ids.pop(0)
+                there = resample(
+                    self.lanes[other].centre, [self._abreast(key, other, s) for s in stations]
+                )
+                length_m = min(CHANGE_M, self.length_m[key] - begin_m)
+                share = smoothstep((stations - begin_m) / length_m)[:, None]
+                points = (1 - share) * points + share * there
+            if parts and np.linalg.norm(points[0] - parts[-1][-1]) < STATION_M / 2:
+                points = points[1:]
+            if len(points):
+                parts.append(points)
+            begin_m = 0.0
+        end = self.lanes[way.lane_ids[-1]].centre[-1:]
+        if np.linalg.norm(end - parts[-1][-1]) > STATION_M / 4:
+            parts.append(end)
+        return smooth_path(np.concatenate(parts))
+
+    def _abreast(self, lane_id: str, other: str, at_m: float) -> float:
+        """Return the arc length on a neighbour beside a place on a lane."""
+        return at_m / self.length_m[lane_id] * self.length_m[other]
+
+    def _turn_rad(self, lane_id: str) -> float:
+        steps = np.diff(self.lanes[lane_id].centre[:, :2], axis=0)
+        first, last = (np.arctan2(step[1], step[0]) for step in (steps[0], steps[-1]))
+        return abs(float(wrap_angle(last - first)))

@@ -1,0 +1,260 @@
+"""What stands on and beside the roads of an OpenDRIVE map: crosswalks, stop lines, signs, and traffic
+lights with a stated cycle.
+
+OpenDRIVE says which light is switched by which controller, and no times. The cycle here is assumed:
+the lights of one controller (without one: of one road) are green together, the groups of a
+junction one after the other, and people cross a road while its own traffic has red.
+
+Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Signal
+from scenarios.opendrive_road import (
+    CROSSWALK,
+    CROSSWALK_M,
+    STOP_LINE,
+    OdrMap,
+    Road,
+    RoadSignal,
+    driven_along,
+    lane_borders,
+    lane_key,
+    reference_line,
+    road_points,
+)
+
+PEDESTRIAN_LIGHT = "1000002"
+GREEN_S, YELLOW_S, CLEAR_S = 10.0, 3.0, 2.0  # of each group; all are red between two groups
+WALK_END_S = 5.0  # people have red so long before the traffic may drive
+TURN_S = GREEN_S + YELLOW_S + CLEAR_S
+STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
+PLATE_M = 0.1  # what is lower than this is painted on the road
+
+
+@dataclass(frozen=True)
+class Head:
+    """A traffic light, where one waits for it, and the group that it belongs to."""
+
+    signal: Signal  # without its cycle
+    junction: str
+    group: str
+    road_id: str
+
+
+def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMap:
+    """Return a map without lanes: the crosswalks, stop lines, signs and posts of the roads of
+    ``lanes``.
+    """
+    crosswalks: list[F64] = []
+    stop_lines: list[F64] = []
+    poles: list[F64] = []
+    signs: list[tuple[F64, Box]] = []
+    for road in _roads(odr, lanes):
+        crosswalks += [_placed(road, ring, T_local_map) for ring in road.crosswalks]
+        for one in road.signals:
+            if one.kind == STOP_LINE:
+                stop_lines += _across(road, one, lanes, T_local_map)
+            elif one.dynamic:
+                foot = _placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)
+                top = foot + np.array([0.0, 0.0, max(one.above_m + one.height_m, 2.0)])
+                poles.append(np.concatenate([foot, top]))
+            elif one.kind != CROSSWALK and one.height_m > PLATE_M:
+                signs.append(_plate(road, one, T_local_map))
+    return LaneMap(
+        {},
+        crosswalks=tuple(crosswalks),
+        stop_lines=tuple(stop_lines),
+        poles=tuple(poles),
+        signs=tuple(signs),
+    )
+
+
+def traffic_lights(
+    odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64
+) -> tuple[tuple[Head, ...], tuple[str, ...]]:
+    """Return the traffic lights of the roads of ``lanes``, one for each place and direction, and
+    notes on lights that hold back no lane.
+
+    A light is waited for at the nearest stop line of its direction, without one beside itself; one
+    that stands on a road inside of a junction, where that road's lanes begin.
+    """
+    heads: list[Head] = []
+    loose: list[str] = []
+    for road in _roads(odr, lanes):
+        for one in (signal for signal in road.signals if signal.dynamic):
+            found = _heads(road, one, odr.controllers, lanes, T_local_map)
+            heads += found
+            loose += [] if found else [one.signal_id]
+    notes = [f"{len(loose)} traffic lights hold back no lane: {', '.join(loose)}"] if loose else []
+    return tuple(heads), tuple(notes)
+
+
+def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Signal, ...]:
+    """Return the lights with their cycles.
+
+    Args:
+        heads: All lights.
+        begins_us: Junction to the time at which its first group turns green; others begin at 0.
+    """
+    groups: dict[str, list[str]] = {}
+    of_road: dict[str, str] = {}
+    for head in heads:
+        known = groups.setdefault(head.junction, [])
+        if not head.signal.pedestrians:
+            known.append(head.group)
+            of_road[head.road_id] = head.group
+    out = []
+    for head in heads:
+        known = sorted(set(groups[head.junction]), key=lambda name: (len(name), name))
+        group = of_road.get(head.road_id, head.group)
+        turn = known.index(group) if group in known else 0
+        cycle_s = TURN_S * max(len(known), 2)
+        if head.signal.pedestrians:
+            walk_s = cycle_s - TURN_S - WALK_END_S
+            phases, first_s = [("green", walk_s), ("red", cycle_s - walk_s)], TURN_S
+        else:
+            rest_s = cycle_s - GREEN_S - YELLOW_S
+            phases, first_s = [("green", GREEN_S), ("yellow", YELLOW_S), ("red", rest_s)], 0.0
+        offset_us = begins_us.get(head.junction, 0) + round((turn * TURN_S + first_s) * 1e6)
+        timed = tuple((colour, round(lasts_s * 1e6)) for colour, lasts_s in phases)
+        out.append(replace(head.signal, phases=timed, offset_us=offset_us))
+    return tuple(out)
+
+
+def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:
+    kept = {key.rpartition(".")[0].rpartition(".")[0] for key in lanes}
+    return [road for road in odr.roads if road.road_id in kept]
+
+
+def _placed(road: Road, st: F64, T_local_map: F64) -> F64:
+    """Return points ``(N, 3)`` of a road's s and t ``(N, 2)``."""
+    line = reference_line(road.records, st[:, 0])
+    return road_points(road, line, st[:, 0], st[:, 1], T_local_map)
+
+
+def _heads(
+    road: Road,
+    one: RoadSignal,
+    controllers: Mapping[str, str],
+    lanes: Mapping[str, Lane],
+    T_local_map: F64,
+) -> list[Head]:
+    heads = []
+    for along in _senses(one):
+        link = road.successor if along else road.predecessor
+        junction, s_m = f"on road {road.road_id}", _waiting_m(road, one, along)
+        if road.junction != "-1":
+            junction, s_m = road.junction, 0.0 if along else road.length_m
+        elif link is not None and link.kind == "junction":
+            junction = link.target
+        if one.kind == PEDESTRIAN_LIGHT:
+            signal = _for_people(road, one, lanes, T_local_map)
+        else:
+            held = _lanes_at(road, s_m, along, one, lanes)
+            if not held:
+                continue
+            ends = _placed(road, _line(s_m, held), T_local_map)
+            signal = Signal(
+                ends, _heading_rad(road, s_m, along, T_local_map), (), 0, one.signal_id,
+                tuple(lane.lane_id for lane, _, _ in held),
+            )  # fmt: skip
+        group = controllers.get(one.signal_id, f"road {road.road_id}")
+        heads.append(Head(signal, junction, group, road.road_id))
+    return heads
+
+
+def _for_people(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64) -> Signal:
+    """Return the light of those who cross a road: they wait at the side of the nearest crosswalk
+    that the light stands on.
+    """
+    rings = [ring for ring in road.crosswalks if abs(ring[:, 0].mean() - one.s_m) <= STOP_REACH_M]
+    low_m, high_m = one.s_m - CROSSWALK_M / 2, one.s_m + CROSSWALK_M / 2
+    if rings:
+        ring = min(rings, key=lambda ring: abs(float(ring[:, 0].mean()) - one.s_m))
+        low_m, high_m = float(ring[:, 0].min()), float(ring[:, 0].max())
+    ends = _placed(road, np.array([[low_m, one.t_m], [high_m, one.t_m]]), T_local_map)
+    towards = -np.pi / 2 if one.t_m > 0 else np.pi / 2
+    heading = _heading_rad(road, one.s_m, True, T_local_map) + towards
+    crossed = [
+        lane.lane_id
+        for along in (True, False)
+        for lane, _, _ in _lanes_at(road, one.s_m, along, None, lanes)
+    ]
+    return Signal(ends, heading, (), 0, one.signal_id, tuple(crossed), pedestrians=True)
+
+
+def _senses(one: RoadSignal) -> tuple[bool, ...]:
+    """Return whether a signal is for traffic along its road, against it, or both."""
+    return {"+": (True,), "-": (False,)}.get(one.orientation, (True, False))
+
+
+def _waiting_m(road: Road, one: RoadSignal, along: bool) -> float:
+    """Return the arc length at which one waits for a light."""
+    lines = [
+        line.s_m
+        for line in road.signals
+        if line.kind == STOP_LINE
+        and along in _senses(line)
+        and abs(line.s_m - one.s_m) <= STOP_REACH_M
+    ]
+    return min(lines, key=lambda s_m: abs(s_m - one.s_m), default=one.s_m)
+
+
+Held = tuple[Lane, float, float]  # a lane and the signed distances of its borders
+
+
+def _lanes_at(
+    road: Road, s_m: float, along: bool, one: RoadSignal | None, lanes: Mapping[str, Lane]
+) -> list[Held]:
+    """Return the lanes of one direction for vehicles, where a signal names some of them, only
+    those.
+    """
+    s_m = min(s_m, float(np.nextafter(road.length_m, 0.0)))
+    index = max((i for i, section in enumerate(road.sections) if section.s_m <= s_m), default=0)
+    found: list[tuple[int, Held]] = []
+    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], np.array([s_m])):
+        made = lanes.get(lane_key(road, index, lane.lane_id))
+        if (
+            made is not None
+            and made.kind in ("vehicle", "bus")
+            and driven_along(road, lane) == along
+        ):
+            found.append((lane.lane_id, (made, float(inner_t[0]), float(outer_t[0]))))
+    named = [held for lane_id, held in found if one is not None and one.holds(lane_id)]
+    return named or [held for _, held in found]
+
+
+def _line(s_m: float, held: Sequence[Held]) -> F64:
+    """Return the ends ``(2, 2)``, s and t, of a line across lanes."""
+    borders = [border for _, inner_t, outer_t in held for border in (inner_t, outer_t)]
+    return np.array([[s_m, min(borders)], [s_m, max(borders)]])
+
+
+def _across(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64) -> list[F64]:
+    """Return a stop line's ends, a line for each direction that it is for."""
+    held = [_lanes_at(road, one.s_m, along, one, lanes) for along in _senses(one)]
+    return [_placed(road, _line(one.s_m, some), T_local_map) for some in held if some]
+
+
+def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float:
+    heading = float(reference_line(road.records, np.array([s_m]))[0, 2])
+    direction = T_local_map[:2, :2] @ np.array([np.cos(heading), np.sin(heading)])
+    return float(np.arctan2(direction[1], direction[0])) + (0.0 if along else np.pi)
+
+
+def _plate(road: Road, one: RoadSignal, T_local_map: F64) -> tuple[F64, Box]:
+    """Return the middle of a sign, which faces its traffic, and its size."""
+    pose = np.eye(4)
+    heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
+    c, s = np.cos(heading), np.sin(heading)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = _placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
+    pose[2, 3] += one.above_m + one.height_m / 2
+    return pose, Box(0.05, one.width_m, one.height_m)
