@@ -25,7 +25,7 @@ from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunE
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.log.run_folder.check import inspect_run
+from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
@@ -34,6 +34,7 @@ from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.tables import again
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
+from evaluators.numbers import plural
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
 from scenarios.suite import expand
@@ -73,18 +74,18 @@ Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
 
 
 def check_run(run: Run = None, as_json: Json = False) -> None:
-    """Read every file of every rollout, compare it with its digest, and list what is damaged.
+    """Read every file of a run, compare it with its digest, and list what is damaged.
 
     Nothing is written. The command of the run drives damaged and unfinished rollouts again.
     """
     root = run_or_newest(run)
     inspection = inspect_run(root, full=True)
-    problems = [str(damage) for damage in inspection.damage]
+    problems = [str(damage) for damage in (*inspect_files(root, full=True), *inspection.damage)]
     problems += [f"{cell}: the rollout is unfinished" for cell in inspection.unfinished]
-    code = 0 if inspection.whole else BROKEN
+    code = BROKEN if problems else 0
     facts = {
         "run": str(root),
-        "whole": inspection.whole,
+        "whole": not problems,
         "exit_code": code,
         "rollouts": len(inspection.cells),
         "unfinished": len(inspection.unfinished),
@@ -94,8 +95,9 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
     lines = problems
     if inspection.tables_only:
         lines = [*lines, "the folder has no rollouts, only tables"]
-    state = "whole" if inspection.whole else "damaged or unfinished"
-    lines = [*lines, f"{len(inspection.cells)} rollouts, {len(problems)} problems: {state}"]
+    state = "damaged or unfinished" if problems else "whole"
+    counts = f"{plural(len(inspection.cells), 'rollout')}, {plural(len(problems), 'problem')}"
+    lines = [*lines, f"{counts}: {state}"]
     if problems:
         lines.append(again(read_run_json(root)))
     show(as_json, facts, *lines)

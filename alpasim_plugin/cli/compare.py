@@ -12,9 +12,9 @@ from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
+from evaluators.numbers import plural
 from evaluators.opening import read_run
 from evaluators.report import metric_lines
-from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
@@ -130,7 +130,7 @@ def _table(
     texts = []
     for line in lines:
         cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
-        texts.append("  " + "  ".join(cells).replace("\u00a0", " ").rstrip())
+        texts.append("  " + "  ".join(cells).rstrip())
     return texts
 
 

@@ -91,6 +91,8 @@ def gate(
     stored = None
     repeatable = is_repeatable(stored_run)
     if baseline_file is not None:
+        if os.path.isdir(baseline_file):
+            ensure_tables(baseline_file, warn)
         baseline = read_baseline(baseline_file)
         check_matches(baseline, stored_run, baseline_file)
         stored = baseline.table

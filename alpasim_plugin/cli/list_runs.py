@@ -10,7 +10,7 @@ from typing import Any
 from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
-from evaluators.report.numbers import plural
+from evaluators.numbers import plural
 from evaluators.report.runs import Choice, RunEntry, as_day, find_runs, runs_table, variants_of
 
 VALUES = ("mean", "ci95_clustered", "n_rollouts")

@@ -19,7 +19,7 @@ from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
 from alpasim_plugin.core.stage import stages_in
 from alpasim_plugin.log.run_folder.schema import STAGES
-from evaluators.report.numbers import plural
+from evaluators.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
     from alpasim_plugin.runs.execute import Threads
@@ -146,7 +146,7 @@ class Progress(progress.Progress):
 
     def looked(self, state: State, rollouts: int, ceiling: int) -> None:
         """Print an interim analysis: scenes, and each metric's interval and verdict."""
-        scenes = plural(state.n_scenes, "scene").replace("\u00a0", " ")
+        scenes = plural(state.n_scenes, "scene")
         parts = []
         for one in state.metrics:
             low, high = ("unbounded" if end is None else f"{end:+.4g}" for end in one.interval)
@@ -176,7 +176,7 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> list[str]:
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     size = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}"
     notes = [*fixer_labels(plan), *varied_lines(plan), *background_lines(plan)]
-    return [f"{size} -> {root}".replace("\u00a0", " "), *notes]
+    return [f"{size} -> {root}", *notes]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

@@ -40,9 +40,9 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators import preset as find_preset
+from evaluators.numbers import plural
 from evaluators.opening import read_run
 from evaluators.report.decision import decision_lines
-from evaluators.report.numbers import plural
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
 from evaluators.statistics.variants import base_named, variants_of

@@ -12,7 +12,7 @@ MAX_PART = 600  # characters of the message of an error, and of its hint
 
 # What a terminal acts upon: C0 and C1 controls, and the marks that turn the direction of text.
 _CONTROLS = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]"
+    "[\x00-\x1f\x7f-\xa0\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]"
 )
 # What XML 1.0 has no way to write (section 2.2, production Char).
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -37,15 +37,15 @@ def shorten(text: str, most: int = MAX_PART) -> str:
 
 
 def terminal(text: str) -> str:
-    r"""Return text on one line in which nothing makes a terminal act: line ends become spaces,
-    other control characters escapes.
+    r"""Return text on one line in which nothing makes a terminal act: line ends and no-break spaces
+    become spaces, other control characters escapes.
 
     Example:
         >>> terminal("red\x1b[31m")
         'red\\x1b[31m'
     """
     return _CONTROLS.sub(
-        lambda found: " " if found[0] in "\t\n\v\f\r\u2028\u2029" else _written(found[0]), text
+        lambda found: " " if found[0] in "\t\n\v\f\r\xa0\u2028\u2029" else _written(found[0]), text
     )
 
 

@@ -11,8 +11,9 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.images import smaller
+from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, REPORTS
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
@@ -49,11 +50,14 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
         write_causes(run)
     write_summary_md(run)
     write_junit(run)
+    report = None
     if page:
-        return write_report(run, replays)
-    for name in PAGES:
-        (root / name).unlink(missing_ok=True)
-    return None
+        report = write_report(run, replays)
+    else:
+        for name in PAGES:
+            (root / name).unlink(missing_ok=True)
+    state_files(root, REPORTS)
+    return report
 
 
 MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other

@@ -18,11 +18,18 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.log.run_folder.check import cells_of_run
+from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
+from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
-from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
-from alpasim_plugin.log.run_folder.writer import write_scene, writing
+from alpasim_plugin.log.run_folder.schema import (
+    DECISION,
+    RUN_INFO,
+    SCENES,
+    TABLES,
+    slug,
+)
+from alpasim_plugin.log.run_folder.writer import unfinish, write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
@@ -192,6 +199,8 @@ def finish_run(
     write_run_json(root, info)
     REMADE.pop(real(root), None)
     summary = summary_of_run(root, info, manifests)
+    scenes = [f"{SCENES}/{slug(scene)}.json" for scene in info["scenes"]]
+    state_files(root, [RUN_INFO, DECISION, *TABLES, *scenes])
     from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
 
     write_reports(root, flips=info.get("kind") != "score", page=report)
@@ -243,7 +252,10 @@ def claim(
             "Choose another --out, or pass --resume to reuse its matching rollouts and replace "
             "its tables.",
         )
-    (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished
+    if held and any(damage.file == RUN_INFO for damage in inspect_files(root)):
+        noticed(f"damaged: {root / RUN_INFO}: not the content that was written; writing it again")
+        held = {}
+    unfinish(root)
     if held.get("content") != plan.content:
         write_run_info(root, plan, command, threads)
     else:

@@ -14,8 +14,8 @@ from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import file_sha256, real
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
-from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
-from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
+from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
+from alpasim_plugin.log.run_folder.writer import unfinish, write_parquet, write_scene, writing
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import hardware, versions
 from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of
@@ -86,7 +86,7 @@ def execute_score(
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
         _check_key(root, key)
-        (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished
+        unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
         more: dict[str, Any] = {}
         error: EvaluatorError | None = None

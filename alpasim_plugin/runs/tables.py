@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,22 +10,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import parsing, read_json_as, real
-from alpasim_plugin.log.run_folder.check import inspect_run
+from alpasim_plugin.core.reading import parsing, real
+from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
-from alpasim_plugin.log.run_folder.schema import (
-    ROLLOUTS,
-    ROLLOUTS_TABLE,
-    STEPS,
-    STEPS_TABLE,
-    SUMMARY,
-)
-from alpasim_plugin.log.run_folder.shapes import Summary
+from alpasim_plugin.log.run_folder.schema import FILES, REPORTS, TABLES
 
 
 def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
-    """Make tables that are missing or damaged again from the rollouts, for this process.
+    """Refuse a run folder with a file that is not the one that was written, and make tables that
+    are missing or damaged again from the rollouts, for this process.
 
     Nothing is driven, and nothing is written into the run folder: it may be read-only. The tables
     lie in a temporary folder until the process ends (`reader.table_path`).
@@ -34,28 +29,28 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
         say: Called with one line where tables are made again.
 
     Raises:
-        InputError: A table is missing or damaged, and so is a rollout.
+        InputError: A file is not the one that was written, or a table is missing or damaged, and so
+            is a rollout.
     """
     REMADE.pop(real(root), None)
-    try:
-        read_json_as(Summary, root / SUMMARY)
-        ROLLOUTS_TABLE.check(root / ROLLOUTS)
-        STEPS_TABLE.check(root / STEPS)
-        return
-    except InputError as error:
-        problem = error.message
     info = read_run_json(root)
     run = inspect_run(root)
-    if run.tables_only:
-        return  # whoever reads the damaged table says so
-    if run.damage:
-        raise InputError(f"{root}: {run.damage[0]}", again(info))
+    damage = [*inspect_files(root), *run.damage]
+    tables = [one for one in damage if not one.cell and one.file in TABLES]
+    for one in damage:
+        is_made_again = one in tables or one.file in (FILES, *REPORTS)
+        if not is_made_again and os.path.exists(root / one.path):
+            raise InputError(f"{root}: {one}", again(info))
+    if not tables:
+        return
+    if run.damage or run.tables_only:
+        raise InputError(f"{root}: {[*run.damage, *tables][0]}", again(info))
     if run.unfinished or not run.cells:
         done = f"{len(run.manifests)} of {len(run.cells)} rollouts are finished."
         raise InputError(f"{root}: {done}", again(info))
     from alpasim_plugin.runs.run import summary_of_run  # a run that is whole loads no loop
 
-    say(f"note: {problem}; the tables are made from the rollouts")
+    say(f"note: {root}: {tables[0]}; the tables are made from the rollouts")
     folder = TemporaryDirectory(prefix="simrun-tables-")
     with parsing(root, AGAIN, "manifests from which no table can be made"):
         summary_of_run(root, info, run.manifests, Path(folder.name))

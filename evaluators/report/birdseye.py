@@ -18,7 +18,7 @@ import shapely
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.rows import Rollout, Series
-from evaluators.report.numbers import fixed
+from evaluators.numbers import fixed
 from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
 # (renderer, policy) -> (colour index, dash index)

@@ -16,10 +16,10 @@ from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import in_words, outcomes_of, told
 from evaluators.metrics.presets import contact_note
+from evaluators.numbers import Cell, plural, short
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.gate import worst_of, write_gate
-from evaluators.report.numbers import Cell, plural, short
 from evaluators.report.overview import Overview, overview_of
 from evaluators.report.provenance import provenance
 from evaluators.report.terminal import forest_lines

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.numbers import decimals, fixed, labelled, scale_and_unit
 from evaluators.opening import Run
 from evaluators.report.charts import INK, MUTED, VARIANT, Axes, Chart
 from evaluators.report.gate import tone_of_cause
-from evaluators.report.numbers import decimals, fixed, labelled, scale_and_unit
 from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.verdicts import WORDS
 

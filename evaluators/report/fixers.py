@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from evaluators.numbers import Cell, duration, finite, fixed, missing, plural, short
 from evaluators.opening import Run
-from evaluators.report.numbers import Cell, duration, finite, fixed, missing, plural, short
 
 GUARD = "fixer-"
 COLUMNS = (  # head, what it means

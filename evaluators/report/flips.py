@@ -19,8 +19,8 @@ from alpasim_plugin.core.reading.images import decode_image
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
+from evaluators.numbers import Cell, fixed, missing, short
 from evaluators.opening import Run
-from evaluators.report.numbers import Cell, fixed, missing, short
 from evaluators.statistics.variants import Base, Variant, axis_bases
 
 MAX_WIDTH = 1600  # pixels of an inlined strip

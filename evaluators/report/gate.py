@@ -13,8 +13,8 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
+from evaluators.numbers import DASH, short
 from evaluators.opening import Run
-from evaluators.report.numbers import DASH, short
 from evaluators.statistics.gate import GateVerdict
 from evaluators.statistics.verdicts import WORDS
 

@@ -25,6 +25,7 @@ from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Series
 from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
+from evaluators.numbers import DASH, plural
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
@@ -32,7 +33,6 @@ from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, flip_bases, flip_rows
 from evaluators.report.gate import gate_section
-from evaluators.report.numbers import DASH, plural
 from evaluators.report.overview import TONES, overview_of
 from evaluators.report.provenance import (
     LEDGER_COLUMNS,

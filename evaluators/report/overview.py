@@ -14,10 +14,7 @@ from typing import Any, Literal
 
 from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
-from evaluators.opening import Run
-from evaluators.report.decision import verdict_text
-from evaluators.report.fixers import fixer_cautions
-from evaluators.report.numbers import (
+from evaluators.numbers import (
     DASH,
     count_of,
     decimals,
@@ -28,6 +25,9 @@ from evaluators.report.numbers import (
     scale_and_unit,
     short,
 )
+from evaluators.opening import Run
+from evaluators.report.decision import verdict_text
+from evaluators.report.fixers import fixer_cautions
 from evaluators.statistics.decision import read_decision
 from evaluators.statistics.outcomes import DISTANCE, outcome_table
 from evaluators.statistics.sentences import MANY_SCENES

@@ -9,8 +9,8 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from evaluators.numbers import Cell, finite, fixed, interval, missing
 from evaluators.opening import Run
-from evaluators.report.numbers import Cell, finite, fixed, interval, missing
 
 MAX_SCENES = 1000
 MAX_FAILURE_ROWS = 200

@@ -33,7 +33,7 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.shapes import Summary
 from evaluators.metrics import MetricTable
-from evaluators.report.numbers import DASH, decimals, finite, fixed, interval
+from evaluators.numbers import DASH, decimals, finite, fixed, interval
 
 CHECK = "simrun check run RUN says what is damaged"
 

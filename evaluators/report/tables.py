@@ -8,8 +8,7 @@ from typing import Any
 
 from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.opening import Run
-from evaluators.report.numbers import (
+from evaluators.numbers import (
     ARROW_WORDS,
     ARROWS,
     DASH,
@@ -25,6 +24,7 @@ from evaluators.report.numbers import (
     scale_and_unit,
     short,
 )
+from evaluators.opening import Run
 from evaluators.report.overview import tone_of
 
 # verdict on other scenes against the margin, and the difference on these scenes -> words

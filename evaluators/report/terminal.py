@@ -18,9 +18,9 @@ from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.presets import contact_note
+from evaluators.numbers import labelled
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips
-from evaluators.report.numbers import labelled
 from evaluators.report.overview import TONES, Overview
 from evaluators.report.tables import metric_rows
 from evaluators.scores.table import SCORES
@@ -108,7 +108,7 @@ def metric_lines(
         lines.append(MARGIN_NOTE)
         if any(row.name.startswith("collision") for row in rows):
             lines.append(contact_note(str(summary.get("preset"))))
-    return [line.replace("\u00a0", " ").rstrip() for line in lines if line]
+    return [line.rstrip() for line in lines if line]
 
 
 def overview_lines(shown: Overview, width: int) -> list[Text]:
@@ -139,7 +139,7 @@ def overview_lines(shown: Overview, width: int) -> list[Text]:
 
 def _wrapped(text: str, width: int) -> list[str]:
     """Break between words only, further lines indented."""
-    plain = escape(text.replace("\u00a0", " "))
+    plain = escape(text)
     return wrap(
         plain, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
@@ -147,9 +147,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 def _grid(shown: Overview, width: int) -> list[Text]:
     heads = [wrap(head, HEAD_WIDTH, break_long_words=False) for head in shown.heads]
-    body = [
-        [escape(cell.replace("\u00a0", " ")) for cell in shown.cells(row)] for row in shown.rows
-    ]
+    body = [[escape(cell) for cell in shown.cells(row)] for row in shown.rows]
     columns = list(zip(*body, strict=True)) or [()] * len(heads)
     widths = [max(map(len, [*head, *column])) for head, column in zip(heads, columns, strict=True)]
     room = width - sum(widths[1:]) - len(widths[1:])

@@ -17,6 +17,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
+from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Row
@@ -147,18 +148,21 @@ def write_baseline(run: Run, path: Path) -> None:
             f"{run.folder}: {n_failed} of {len(run.rollouts)} rollouts failed",
             "store a run with rollouts that all ran to their end",
         )
-    write_json(path, asdict(baseline_of(run)))
+    write_json(path, sealed(asdict(baseline_of(run))))
 
 
 def read_baseline(path: Path) -> Baseline:
     """Read a baseline file, or take the results of a run folder as they are.
 
     Raises:
-        InputError: Missing, not JSON, or not a baseline of this version.
+        InputError: Missing, not JSON, changed since it was written, or not a baseline of this
+            version.
     """
     if os.path.isdir(path):
         return baseline_of(read_run(path))
     content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
+    check_seal(content, path, APPROVE)
+    content.pop(DIGEST, None)
     names = set(Baseline.__dataclass_fields__)
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
         raise InputError(

@@ -29,6 +29,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
+from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.metrics import METRICS
 from evaluators.statistics.betting import (
@@ -43,7 +44,6 @@ from evaluators.statistics.verdicts import Cause, Outcome
 
 Answer = Literal["good", "bad", "open"]
 
-DECISION = "decision.json"
 SCHEMA_VERSION = 3
 MOST_SCENES = 4000  # that are asked for
 AGAIN = "give the command of the run again: finished rollouts are kept"

@@ -22,7 +22,7 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
-from evaluators.report.numbers import plural, short
+from evaluators.numbers import plural, short
 from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from alpasim_plugin.core.types import MetricInfo
-from evaluators.report.numbers import (
+from evaluators.numbers import (
     decimals,
     finite,
     fixed,

@@ -20,10 +20,10 @@ from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.reader import reporting
+from evaluators.numbers import plural
 from evaluators.opening import Run, read_run
 from evaluators.report.flips import FlipKey
 from evaluators.report.html import asset, environment_of
-from evaluators.report.numbers import plural
 from evaluators.viewer.cells import (
     Wanted,
     WatchedCell,

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log.run_folder.checksums import sealed
 from tests.core.checksum_files import vouch_for
 from tests.report.make_run import Plan, make_run
 
@@ -189,14 +190,14 @@ def test_a_baseline_made_with_something_else_is_refused(
 ):
     stored = tmp_path / "baseline.json"
     run_command(["gate", str(runs["good"]), "--write-baseline", str(stored)])
-    stored.write_text(json.dumps(json.loads(stored.read_text()) | change))
-    assert (
-        run_command(
-            ["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]
-        )
-        == 2
-    )
+    changed = json.loads(stored.read_text()) | change
+    judged = ["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]
+    stored.write_text(json.dumps(sealed(changed)))
+    assert run_command(judged) == 2
     assert mention in capsys.readouterr().err
+    stored.write_text(json.dumps(changed))
+    assert run_command(judged) == 2
+    assert str(stored) in capsys.readouterr().err
 
 
 def test_a_run_with_holes_cannot_become_a_baseline(runs, tmp_path, capsys):

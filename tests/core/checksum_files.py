@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
+from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
-from alpasim_plugin.log.run_folder.schema import MANIFEST, STEPS_NAME
+from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, STEPS_NAME, TABLES
 
 KEYS = ["renderer", "policy", "scene", "seed", "status", "path"]
 
 
 def vouch_for(root: Path) -> Path:
-    """Write ``run.json`` and the manifests of a run folder again, as they stand, with the digests
-    of the rollouts' files, and return the folder.
+    """Write ``run.json``, the manifests and ``files.json`` of a run folder again, as they stand,
+    with the digests of their files, and return the folder.
     """
     rows = pq.read_table(root / "rollouts.parquet", columns=KEYS).to_pylist()
     info = {"key": "by hand"} | json.loads((root / "run.json").read_text())
@@ -26,4 +27,5 @@ def vouch_for(root: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / STEPS_NAME).touch()
         write_manifest(folder, row | held)
+    state_files(root, [RUN_INFO, *TABLES])
     return root

@@ -21,7 +21,7 @@ NO_COMMAND = (
 )
 NOT_RUN: tuple[tuple[str, str], ...] = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
-    (r"gate --self-test", "eight minutes; tests/runs/test_self_test.py runs it"),
+    (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda", "needs weights of 4 GB, or a GPU"),
     (
         r"^train |^bench |FILE|fixer\.weights\.bundle",

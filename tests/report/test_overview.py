@@ -20,10 +20,10 @@ from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
+from evaluators.numbers import DASH
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report
 from evaluators.report.ci import overview_md
-from evaluators.report.numbers import DASH
 from evaluators.report.overview import Overview, decided, overview_of, tone_of
 from evaluators.report.terminal import overview_lines
 from evaluators.statistics.paired import paired

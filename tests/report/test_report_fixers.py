@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from evaluators.numbers import DASH
 from evaluators.report.fixers import COLUMNS, fixer_cautions, fixer_rows
-from evaluators.report.numbers import DASH
 
 DRAFTED = {
     "label": "onefixer-tiny, untrained (identity)",

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluators.report.numbers import (
+from evaluators.numbers import (
     DASH,
     count_of,
     decimals,

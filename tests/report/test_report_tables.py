@@ -5,10 +5,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+from evaluators.numbers import DASH
 from evaluators.opening import read_run
 from evaluators.report import metric_lines
 from evaluators.report.fixers import speed
-from evaluators.report.numbers import DASH
 from evaluators.report.provenance import failure_rows, ledger
 from evaluators.report.tables import columns, metric_rows, pair_rows
 

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import (
     read_run_json,
     write_run_json,
@@ -96,6 +97,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(root / "first", root / name)
         table = table_of(resolve_evaluators([f"{plugin}:Height"]))
         write_run_json(root / name, read_run_json(root / "first") | {"metrics": table.as_dict()})
+        state_files(root / name, ["run.json"])
     return root
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
@@ -126,6 +127,39 @@ def test_the_same_command_makes_only_the_damaged_rollout_again(
     assert run(root).notices == []
 
 
+def lengthen(path: Path) -> None:
+    """Change a file so that a JSON document still says the same."""
+    path.write_bytes(path.read_bytes() + b"\n")
+
+
+SCENE = "scenes/smoke-straight.json"
+OF_THE_RUN = ("run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", SCENE)
+
+
+def test_every_file_of_the_run_is_verified_and_written_again(
+    made: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for file in (*OF_THE_RUN, "junit.xml", "files.json"):
+        (lengthen if file != "files.json" else remove)(root / file)
+        capsys.readouterr()
+        assert run_command(["check", "run", str(root), "--json"]) == 1
+        assert file in json.loads(capsys.readouterr().out)["damage"][0]
+        run(root)
+        assert run_command(["check", "run", str(root)]) == 0
+        assert comparable(root) == comparable(made)
+
+
+@pytest.mark.parametrize("verb", ["gate", "report", "compare"])
+def test_no_verdict_comes_of_a_file_that_was_changed(root: Path, verb: str) -> None:
+    for file in ("run.json", SCENE, f"{CELL}/manifest.json", f"{CELL}/rollout.asl"):
+        before = (root / file).read_bytes()
+        flip(root / file)
+        assert run_command([verb, str(root)]) == 2, file
+        (root / file).write_bytes(before)
+    (root / CELL / "manifest.json").write_bytes((root / CELL / "../1/manifest.json").read_bytes())
+    assert run_command([verb, str(root)]) == 2
+
+
 @pytest.mark.parametrize("damage", [becomes("[]"), becomes('{"scenes": 5}'), cut])
 def test_a_damaged_description_is_written_again(
     made: Path, root: Path, damage: Callable[[Path], None]
@@ -153,6 +187,11 @@ def test_readers_make_missing_tables_again(
             assert capsys.readouterr().out == wanted
             assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
         shutil.copyfile(made / name, root / name)
+    table = pq.read_table(root / "rollouts.parquet")
+    pq.write_table(table.slice(1), root / "rollouts.parquet")
+    assert run_command(["compare", str(root)]) == 0
+    assert capsys.readouterr().out == wanted
+    shutil.copyfile(made / "rollouts.parquet", root / "rollouts.parquet")
     remove(root / CELL / "rollout.asl")
     assert run_command(["compare", str(root)]) == 0  # the tables are whole
     remove(root / "summary.json")
@@ -172,12 +211,15 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> 
     shutil.rmtree(root / CELL)
     assert run_command(["gate", str(root)]) == 2
     assert run(root).results.count(("ok", False)) == 1
-    assert inspect_run(root).whole
+    assert not inspect_run(root).damage
+    assert not inspect_run(root).unfinished
 
 
 def test_tables_that_were_copied_without_their_rollouts_can_be_read(root: Path) -> None:
     shutil.rmtree(root / "rollouts")
     assert run_command(["compare", str(root)]) == 0
+    lengthen(root / "summary.json")
+    assert run_command(["compare", str(root)]) == 2
 
 
 def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -> None:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading import inside
+from alpasim_plugin.log.run_folder.checksums import problem_of, stated_files
 from alpasim_plugin.log.run_folder.manifests import Damage, inspect_rollout, read_run_json
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS_FOLDER, rollout_folder
+from alpasim_plugin.log.run_folder.schema import (
+    FILES,
+    ROLLOUTS_FOLDER,
+    RUN_INFO,
+    TABLES,
+    rollout_folder,
+)
 
 
 @dataclass(frozen=True)
@@ -30,11 +39,6 @@ class Inspection:
     damage: tuple[Damage, ...]
     unfinished: tuple[str, ...]
     tables_only: bool = False
-
-    @property
-    def whole(self) -> bool:
-        """Return whether every rollout is finished and undamaged."""
-        return not self.damage and not self.unfinished
 
 
 def inspect_run(root: Path, full: bool = False) -> Inspection:
@@ -61,6 +65,31 @@ def inspect_run(root: Path, full: bool = False) -> Inspection:
         elif not state.damage:
             unfinished.append(cell)
     return Inspection(cells, tuple(manifests), tuple(damage), tuple(unfinished))
+
+
+def inspect_files(root: Path, full: bool = False) -> list[Damage]:
+    """Compare the files of a run folder outside of its rollouts' folders with ``files.json``, which
+    is written last.
+
+    Args:
+        root: The run folder.
+        full: Read every file, even where size and time are as stated.
+    """
+    try:
+        stated = stated_files(root)
+    except InputError as error:
+        return [Damage("", FILES, error.message), *_without_digest(TABLES)]
+    damage = _without_digest(name for name in (RUN_INFO, *TABLES) if name not in stated)
+    for name, facts in stated.items():
+        path = inside(root, name)
+        problem = "not in the run folder" if path is None else problem_of(path, facts, full)
+        if problem is not None:
+            damage.append(Damage("", name, problem))
+    return damage
+
+
+def _without_digest(names: Iterable[str]) -> list[Damage]:
+    return [Damage("", name, f"{FILES} holds no digest of it") for name in names]
 
 
 def cells_of_run(info: Mapping[str, Any]) -> tuple[str, ...]:

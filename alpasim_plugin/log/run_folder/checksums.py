@@ -6,14 +6,21 @@ would cost more than it finds; any other is read in full.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading import file_sha256, read_json_as
+from alpasim_plugin.log.run_folder.schema import AGAIN, FILES
+
+DIGEST = "sha256"  # member of a JSON file: the digest of the others
 
 
 class FileFacts(TypedDict):
@@ -35,6 +42,45 @@ def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
                 bytes=state.st_size, mtime_ns=state.st_mtime_ns, sha256=file_sha256(path)
             )
     return facts
+
+
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a JSON file with its SHA-256 in it."""
+    return {**content, DIGEST: _digest_of(content)}
+
+
+def check_seal(content: Mapping[str, Any], path: Path, do_this: str) -> None:
+    """Compare the content of a JSON file with the digest in it, where it holds one.
+
+    Raises:
+        InputError: They differ.
+    """
+    if content.get(DIGEST, _digest_of(content)) != _digest_of(content):
+        raise InputError(f"{path}: not the content that was written", do_this)
+
+
+def _digest_of(content: Mapping[str, Any]) -> str:
+    others = {key: value for key, value in content.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(others).encode()).hexdigest()
+
+
+def state_files(root: Path, names: Iterable[str]) -> None:
+    """Write the facts of those of the named files that are there into ``files.json``, and keep
+    those of other files.
+    """
+    names = list(names)
+    stated = stated_files(root) if os.path.exists(root / FILES) else {}
+    others = {name: facts for name, facts in stated.items() if name not in names}
+    write_json(root / FILES, others | checksums_of(root, names))
+
+
+def stated_files(root: Path) -> dict[str, FileFacts]:
+    """Read ``files.json`` of a run folder.
+
+    Raises:
+        InputError: It is missing or damaged.
+    """
+    return read_json_as(dict[str, FileFacts], root / FILES, AGAIN)
 
 
 def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:

@@ -7,8 +7,6 @@ command.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +16,13 @@ from typing import Any, Literal, cast
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
-from alpasim_plugin.log.run_folder.checksums import FileFacts, checksums_of, problem_of
+from alpasim_plugin.log.run_folder.checksums import (
+    FileFacts,
+    check_seal,
+    checksums_of,
+    problem_of,
+    sealed,
+)
 from alpasim_plugin.log.run_folder.schema import (
     DERIVED,
     DRIVEN,
@@ -30,17 +34,15 @@ from alpasim_plugin.log.run_folder.shapes import REQUIRED_OF_RUN, ManifestFile, 
 
 AGAIN = "Give the command of the run again: finished rollouts are kept."
 
-DIGEST = "sha256"  # of the rest of a manifest
-
 Action = Literal["none", "score", "drive"]
 
 
 @dataclass(frozen=True)
 class Damage:
-    """One damaged or missing file of a rollout.
+    """One damaged or missing file of a run folder.
 
     Attributes:
-        cell: Folder of the rollout below the run folder.
+        cell: Folder of the rollout below the run folder; empty for a file of the run itself.
         file: Its name.
         problem: What is wrong with it.
     """
@@ -49,8 +51,13 @@ class Damage:
     file: str
     problem: str
 
+    @property
+    def path(self) -> Path:
+        """Give the file's path below the run folder."""
+        return Path(self.cell, self.file)
+
     def __str__(self) -> str:
-        return f"{self.cell}/{self.file}: {self.problem}"
+        return f"{self.path}: {self.problem}"
 
 
 @dataclass(frozen=True)
@@ -82,14 +89,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     files: dict[str, FileFacts] = {}
     if manifest.get("status") == "ok":
         files = checksums_of(folder, [*DRIVEN, *DERIVED])
-    content = {**manifest, "files": files}
-    write_json(folder / MANIFEST, content | {DIGEST: _digest_of(content)})
-
-
-def _digest_of(manifest: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a manifest's content, but for the digest that stands in it."""
-    content = {key: value for key, value in manifest.items() if key != DIGEST}
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    write_json(folder / MANIFEST, sealed({**manifest, "files": files}))
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -100,8 +100,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     manifest = cast("dict[str, Any]", read_json_as(ManifestFile, path, do_this=AGAIN))
-    if manifest.get(DIGEST, _digest_of(manifest)) != _digest_of(manifest):
-        raise InputError(f"{path}: not the content that was written", AGAIN)
+    check_seal(manifest, path, AGAIN)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
         raise InputError(f"{path} names {others[0]!r}, which no rollout has.", AGAIN)
@@ -126,6 +125,8 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
     except InputError as error:
         return RolloutState(None, (Damage(cell, MANIFEST, error.message),))
     damage = []
+    if manifest["path"] != cell:
+        damage.append(Damage(cell, MANIFEST, f"of another rollout, {manifest['path']}"))
     for name, facts in manifest["files"].items():
         problem = problem_of(folder / name, facts, full)
         if problem is not None:

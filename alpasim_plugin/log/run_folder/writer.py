@@ -23,6 +23,7 @@ from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
+    FILES,
     KEYS,
     LOCK,
     ROLLOUTS,
@@ -31,6 +32,7 @@ from alpasim_plugin.log.run_folder.schema import (
     STEPS,
     STEPS_NAME,
     STEPS_TABLE,
+    SUMMARY,
     VALID,
     slug,
 )
@@ -57,6 +59,12 @@ def writing(root: Path) -> Iterator[None]:
     with one_writer(root / LOCK, f"folder {root}") as held:
         remove_left_overs(root, held.since_ns)
         yield
+
+
+def unfinish(root: Path) -> None:
+    """Remove what makes a run folder a finished one, before anything in it changes."""
+    for name in (SUMMARY, FILES):
+        (root / name).unlink(missing_ok=True)
 
 
 def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:

@@ -124,4 +124,4 @@ def plural(n: int, noun: str, many: str = "") -> str:
 
 def labelled(label: str, text: str) -> str:
     """Print a line of the end of a command."""
-    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")
+    return f"{label:<{LABEL}}{text}"
