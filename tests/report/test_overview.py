@@ -18,6 +18,7 @@ import pytest
 
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
 from evaluators.numbers import DASH
@@ -108,7 +109,7 @@ def test_every_line_is_printed_on_its_own(three: Path, capsys: pytest.CaptureFix
     lines = overview_lines(overview_of(read_run(three)), 80)
     show(False, {}, *lines)
     printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    assert printed == [line.plain.rstrip() for line in lines]
+    assert printed == [terminal(line.plain).rstrip() for line in lines]
 
 
 @pytest.mark.parametrize("renderers", [(), ("clean",), ("clean", "3dgs", "onefixer")])
