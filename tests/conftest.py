@@ -17,13 +17,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.durations import (
-    kept_seconds,
-)
 from tests.examples import PROFILE, examples
 from tests.laboratory import NOT_COLLECTED, laboratory_is_installed
 from tests.report.browser import Browser, find_chromium
 
+pytest_plugins = ("tests.durations",)
 settings.register_profile(
     PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100)
 )
@@ -55,27 +53,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say that the laboratory's tests were not collected."""
     if not laboratory_is_installed():
         terminalreporter.write_line(NOT_COLLECTED)
-
-
-# A kernel's first call compiles it, for half a minute, and leaves it on disk for every later
-# process. The files that compile the three groups of kernels come first, one a worker, so that no
-# two processes compile the same ones; then what took longest when it was last measured, so that no
-# worker is left alone with it at the end.
-FIRST = (
-    "tests/gaussians/test_rasterize_hard_cases.py",
-    "tests/fixers/test_draw.py",
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files in the order in which workers take them."""
-    took_s = kept_seconds()
-
-    def order_of(item: pytest.Item) -> tuple[int, float]:
-        file = item.nodeid.partition("::")[0]
-        return (FIRST.index(file) if file in FIRST else len(FIRST)), -took_s.get(file, 0.0)
-
-    items.sort(key=order_of)
 
 
 @pytest.fixture(scope="session", autouse=True)

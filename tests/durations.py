@@ -1,5 +1,6 @@
-"""How long each file of tests takes: ``pytest --durations-file FILE`` writes it and says what
-became slower than `tests/durations.json`.
+"""How long each file of tests takes, and the order that follows from it: ``pytest
+--durations-file FILE`` writes the seconds and says what became slower than
+`tests/durations.json`.
 
 Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a new standard, which
 holds for one machine and one number of workers: CI's.
@@ -34,6 +35,27 @@ def slower(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
 def kept_seconds() -> dict[str, float]:
     """Return the seconds of each file as they were kept; none where nothing is."""
     return json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+
+
+# A kernel's first call compiles it, for half a minute, and leaves it on disk for every later
+# process. The files that compile the three groups of kernels come first, one a worker, so that no
+# two processes compile the same ones; then what took longest when it was last measured, so that no
+# worker is left alone with it at the end.
+FIRST = (
+    "tests/gaussians/test_rasterize_hard_cases.py",
+    "tests/fixers/test_draw.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files in the order in which workers take them."""
+    took_s = kept_seconds()
+
+    def order_of(item: pytest.Item) -> tuple[int, float]:
+        file = item.nodeid.partition("::")[0]
+        return (FIRST.index(file) if file in FIRST else len(FIRST)), -took_s.get(file, 0.0)
+
+    items.sort(key=order_of)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -18,7 +18,6 @@ import pytest
 import yaml
 
 from alpasim_plugin.alpasim.bridge import build as building
-from alpasim_plugin.alpasim.bridge import client as check
 from alpasim_plugin.alpasim.bridge.client import RendererClient
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -172,16 +171,6 @@ def test_the_client_refuses_what_the_runtime_refuses(items: int) -> None:
         frames = drive(1)
         with pytest.raises(ValueError, match="answered"):
             client.render(frames)
-
-
-def test_the_check_prints_what_a_service_is(
-    upstream: Host, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert check.main([upstream.address, "scene"]) == 0
-    out = capsys.readouterr().out
-    assert "version stand-in" in out
-    assert f"camera  {CAMERA}: 48 x 32, opencv_pinhole_param" in out
-    assert check.main([]) == 2
 
 
 @pytest.mark.slow

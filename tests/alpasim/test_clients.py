@@ -5,10 +5,8 @@ once.
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from concurrent import futures
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -21,7 +19,7 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyError, RendererError
+from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
@@ -144,40 +142,6 @@ def test_renderer_and_driver_over_sockets_at_once(
         assert np.percentile(difference, 99.9) <= 2
 
 
-def test_a_run_behind_a_renderer_service_says_which_one(
-    scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = assemble(Settings(renderer="clean", scenes=(scene,)))
-    with Host({"SensorsimService": made.service}, "127.0.0.1:0") as host:
-        given = [
-            "--renderer",
-            f"nre://{host.address}",
-            "--policy",
-            "lane-camera",
-            "--out",
-            str(tmp_path / "a"),
-            "--workers",
-            "1",
-        ]
-        assert (
-            run_command(
-                [
-                    *given,
-                    "--no-report",
-                    "--set",
-                    "timing.duration_us=700000",
-                    scene,
-                ]
-            )
-            == 0
-        )
-    (path,) = (tmp_path / "a").rglob("manifest.json")
-    manifest = json.loads(path.read_text())
-    assert manifest["renderer_facts"]["service"].startswith("simrun-")
-    assert not manifest["fixer"]
-    assert "no digest" in capsys.readouterr().out
-
-
 class Scripted:
     """A driver that answers as told."""
 
@@ -247,16 +211,6 @@ def test_an_end_of_session_and_a_missing_service_are_said(scenario: Scenario) ->
         drive(scenario, "clean", f"alpasim://{address}?cameras=camera_left:left")
 
 
-def test_nothing_at_an_address_is_an_infrastructure_failure(
-    monkeypatch: pytest.MonkeyPatch, scenario: Scenario
-) -> None:
-    monkeypatch.setattr(
-        "alpasim_plugin.alpasim.client.channel.Service.wait_ready.__defaults__", (0.2,)
-    )
-    with pytest.raises(InfrastructureError, match="nothing answers"):
-        drive(scenario, "nre://127.0.0.1:1", "log-replay")
-
-
 class Failing:
     """A renderer that fails so many times before it answers."""
 
@@ -298,24 +252,6 @@ def test_renders_are_tried_again_as_alpasim_does(
         drive(scenario, f"nre://{address}", "lane-camera")
     server.stop(0)
     assert own.asked == asked
-
-
-def test_sessions_of_several_threads_do_not_meet(
-    scenario: Scenario, inside: RolloutLog, driver: tuple[DriverService, str, Calls]
-) -> None:
-    logs: list[RolloutLog] = []
-    address = f"alpasim://{driver[1]}?encoding=png"
-    threads = [
-        threading.Thread(target=lambda: logs.append(drive(scenario, "clean", address)[0]))
-        for _ in range(2)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(logs) == 2
-    np.testing.assert_array_equal(logs[0].ego.xyz, logs[1].ego.xyz)
-    assert np.abs(logs[0].ego.xyz - inside.ego.xyz).max() < 2e-5
 
 
 def test_our_driver_service_is_tolerant_where_alpasim_needs_it(

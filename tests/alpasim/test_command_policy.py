@@ -199,16 +199,6 @@ def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(
     )
 
 
-def test_an_exception_of_the_served_policy_is_told_and_its_traceback_printed(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(PolicyError, match="RuntimeError: no lane in sight"):
-        drive(made(python("worse.py", "raises")))
-    end_children()
-    assert 'raise RuntimeError("no lane in sight")' in capfd.readouterr().err
-    assert children._running == []
-
-
 def test_a_command_that_hangs_is_ended_and_said_so(folder: Path) -> None:
     policy = made(python("worse.py", "hangs").replace("exec:", "exec:?timeout_s=0.5 "))
     with pytest.raises(PolicyError, match="DEADLINE_EXCEEDED"):
@@ -230,13 +220,6 @@ def test_a_command_that_never_serves_is_told_apart(folder: Path, code: str, foun
         made(python("-S", "-c", code).replace("exec:", "exec:?ready_s=1 "))
     assert children._running == []
     assert set(Path(tempfile.gettempdir()).glob("simrun-policy-*")) <= before
-
-
-@pytest.mark.slow
-def test_a_port_is_asked_for_by_its_place_holder(folder: Path) -> None:
-    serving = "import os, remote_policy as r; assert os.environ['SIMRUN_POLICY_ADDRESS'] == '127.0.0.1:{port}'; "
-    plans = drive(made(python("-c", serving + "r.serve_policy(r.Cruise, '{address}')")))
-    assert plans[0][-1, 0] == pytest.approx(40.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -20,7 +20,7 @@ import pytest
 
 from alpasim_plugin.alpasim.client.channel import Service
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.errors import InfrastructureError, PolicyError, RendererError, SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.log.wire import egodriver_pb2
 from tests.alpasim.service_cases import hosted
 
@@ -144,12 +144,3 @@ def test_only_what_a_driver_does_itself_is_its_own_fault(
     assert type(caught.value) is kind
     assert f"{host.address}, at 1700000 us of simulated time" in caught.value.message
     assert not getattr(caught.value, "is_final", False) or kind is PolicyError
-
-
-def test_nobody_listening_is_the_machines_fault_and_a_renderers_error_stays_one() -> None:
-    for given, kind in ((PolicyError, InfrastructureError), (RendererError, RendererError)):
-        service = Service("EgodriverService", "127.0.0.1:1", given, retries=False)
-        with pytest.raises(SimrunError) as caught:
-            service.call("drive", egodriver_pb2.DriveRequest(), 5.0)
-        assert type(caught.value) is kind
-        service.close()

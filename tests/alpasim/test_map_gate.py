@@ -19,9 +19,7 @@ from alpasim_plugin.alpasim.server.map_gate import (
     agreement,
     beside,
     contradiction,
-    leftwards,
     line_pixels,
-    shrunk,
     top_hat,
 )
 from alpasim_plugin.alpasim.server.sources import MAP_OFF
@@ -139,22 +137,6 @@ def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
     assert beside(path, se2(4.0, -1.0, 0.0), se2(0, 0, np.pi) @ AHEAD) == pytest.approx(1.0), (
         "of a camera that looks back"
     )
-
-
-def test_a_large_picture_is_compared_at_a_small_width() -> None:
-    large = replace(SPEC, width=1920, height=1080, K=np.diag([4.0, 4, 1]) @ SPEC.K)
-    assert (shrunk(large).width, shrunk(large).height) == (480, 270)
-    np.testing.assert_allclose(shrunk(large).K, SPEC.K)
-    assert shrunk(SPEC) is SPEC
-    rgb = cv2.resize(photograph(), (1920, 1080))
-    assert contradiction(prepared(1.75), large, AHEAD, (), rgb) is not None
-    assert contradiction(prepared(), large, AHEAD, (), rgb) is None
-
-
-def test_left_of_a_camera_is_level_also_when_it_looks_down() -> None:
-    np.testing.assert_allclose(leftwards(AHEAD), [0, 1, 0])
-    down = AHEAD @ np.array([[1.0, 0, 0, 0], [0, 0.8, 0.6, 0], [0, -0.6, 0.8, 0], [0, 0, 0, 1]])
-    np.testing.assert_allclose(leftwards(down), [0, 1, 0], atol=1e-12)
 
 
 def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side() -> None:

@@ -23,7 +23,7 @@ from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import Stub
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from scenarios.load import load_scenario
-from tests.alpasim.service_cases import answers, channel_to, hosted, in_front_of, pinhole
+from tests.alpasim.service_cases import answers, channel_to, hosted, pinhole
 
 pytestmark = pytest.mark.slow
 
@@ -215,29 +215,3 @@ def changed(
     if track is not None:
         asked.dynamic_objects.add(track_id=track, pose_pair=asked.sensor_pose)
     return asked
-
-
-@pytest.mark.slow
-@pytest.mark.slow
-def test_our_own_service_behind_the_fixer_equals_both_in_one(
-    served: tuple[Any, Assembled], overrides: list[str], tmp_path: Path
-) -> None:
-    """Upstream and fixer in two servers give the pictures of one server where the upstream is fully
-    trusted and has no holes.
-    """
-    _, behind = served
-    both = assemble(
-        Settings(renderer="onefixer+clean", overrides=overrides, scenes=[SCENE], threads=1)
-    )
-    frames = [ask(1.0 + 0.1 * i) for i in range(3)]
-    with hosted({"SensorsimService": both.service}) as host, channel_to(host) as channel:
-        one = answers(Stub(channel, "SensorsimService"), frames)
-    with (
-        hosted({"SensorsimService": behind.service}) as upstream,
-        in_front_of(upstream, overrides=overrides, scenes=[SCENE], reliability=1.0) as (stub, made),
-    ):
-        two = answers(stub, frames)
-        assert stub.get_available_scenes(common_pb2.Empty()).scene_ids == [frames[0].scene_id]
-        assert made.fixers is not None
-        assert made.fixers.needs_map
-    assert one == two

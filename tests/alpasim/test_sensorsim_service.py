@@ -12,8 +12,6 @@ import pytest
 
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.alpasim.server.sources import trusted_opacity
-from alpasim_plugin.alpasim.server.status import CallTime
-from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.log.images import decode_image
@@ -98,23 +96,6 @@ def test_interleaved_drives_get_the_bytes_that_each_gets_alone(
     assert len({data for one in alone for data in one}) > 20
 
 
-def test_concurrent_calls_get_the_bytes_of_calls_one_by_one(
-    upstream: Host, overrides: list[str], renderer: StandInRenderer
-) -> None:
-    drives = [drive(6), drive(6), drive(6, parts_at=2, aside_mps=0.5)]
-    with in_front_of(upstream, overrides=overrides) as (stub, _):
-        alone = [answers(stub, one) for one in drives]
-    renderer.calls.clear()
-    with in_front_of(upstream, overrides=overrides) as (stub, _):
-        got: list[list[bytes]] = [[] for _ in drives]
-        for frames in zip(*drives, strict=True):
-            running = [stub.render_rgb.future(frame) for frame in frames]
-            for column, call in zip(got, running, strict=True):
-                column.append(call.result(timeout=60).image_bytes)
-    assert got == alone
-    assert len(renderer.calls) == 6 + 3  # equal requests were rendered once
-
-
 def test_answers_equal_the_fixer_in_this_process(
     upstream: Host, overrides: list[str], tmp_path: Path
 ) -> None:
@@ -188,18 +169,3 @@ def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
     assert len(triples) == len({v.git_hash for v in (first, *others)}) == 6
     assert first.version_id.endswith("over stand-in")
     assert (first.grpc_api_version.minor, first.git_hash[40:]) == (54, "+abc")
-
-
-def test_trust_falls_with_the_distance_from_the_path_that_the_upstream_lists(
-    upstream: Host, overrides: list[str]
-) -> None:
-    with in_front_of(upstream, overrides=overrides) as (_, made):
-        source = made.service.frames.source
-        trust = []
-        for aside_mps in (0.0, 20.0):
-            frame = drive(2, aside_mps=aside_mps)[1:]
-
-            (item,) = source.render(frame, [read_view(f) for f in frame], CallTime())
-            assert item.frame.alpha is not None
-            trust.append(float(item.frame.alpha.mean()))
-    assert trust == [1.0, pytest.approx(1 - 0.4 * (2.0 - 0.25) / 2.75)]

@@ -52,9 +52,3 @@ def test_a_view_has_the_same_references_whatever_was_asked_before(file: Path) ->
     assert len(alone) == 2
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
     assert (alone[0][..., 3] > 0).mean() > 0.5
-
-
-def test_a_fixer_that_reads_none_is_given_none(file: Path) -> None:
-    entry = served(file, "onefixer[references=0]")
-    assert entry.references is None
-    assert entry.render(request(entry, 820_000)).references == ()

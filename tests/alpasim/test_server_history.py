@@ -4,7 +4,6 @@ road.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -142,16 +141,6 @@ def test_memory_is_bounded_and_the_drives_ends_go_last() -> None:
     assert len(kept) == 10
     serve(kept, views(61)[60])
     assert kept.counts.starts == 1
-
-
-def test_a_drive_again_after_all_was_forgotten_is_as_before() -> None:
-    time_s = itertools.count()
-    kept = tree(expiry_s=20.0, clock=lambda: float(next(time_s)))
-    first = [serve(kept, view) for view in views(10)]
-    for _ in range(25):
-        kept.expire()
-    assert (len(kept), kept.bytes, kept._times) == (0, 0, {})
-    assert [serve(kept, view) for view in views(10)] == first
 
 
 def test_motion_is_continued_in_place_and_turn() -> None:

@@ -161,16 +161,6 @@ def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black() -> None:
     assert picture[picture.shape[0] // 2, 160].tolist() == [200, 200, 200]
 
 
-def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean() -> None:
-    K = read_lens(pinhole(64, 32), 32, 32).K
-    np.testing.assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
-    spec = ftheta(False)
-    whole, half = read_lens(spec, 320, 180), read_lens(spec, 160, 90)
-    np.testing.assert_allclose(
-        shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
-    )
-
-
 def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
     spec = fisheye()
     spec.opencv_fisheye_param.max_angle = 0.6

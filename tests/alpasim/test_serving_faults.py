@@ -22,9 +22,9 @@ from alpasim_plugin.alpasim.server import hosting
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import (
     StandInRenderer,
@@ -400,13 +400,6 @@ def test_tls_with_an_upstream_behind_tls_and_a_token(
         Upstream("127.0.0.1:1", token="secret").channel()
 
 
-def test_a_taken_port_is_an_infrastructure_error(upstream: Host) -> None:
-    with pytest.raises(InfrastructureError, match="choose a free port"):
-        Host({}, upstream.address)
-    with pytest.raises(InputError, match="no HOST:PORT"):
-        Host({}, "50051")
-
-
 @pytest.mark.parametrize(
     ("args", "found"),
     [
@@ -425,15 +418,3 @@ def test_options_that_do_not_fit_are_refused_before_the_port_opens(
 ) -> None:
     assert run_command(["serve", *args]) == 2
     assert found in capsys.readouterr().err
-
-
-def test_formats_that_are_not_made_are_refused(upstream: Host, overrides: list[str]) -> None:
-    with in_front_of(upstream, overrides=overrides) as (stub, _):
-        for name, quality in (
-            (sensorsim_pb2.AVC, 95.0),
-            (sensorsim_pb2.UNDEFINED, 95.0),
-            (sensorsim_pb2.JPEG, 101.0),
-        ):
-            asked = drive(1, image_format=name)[0]
-            asked.image_quality = quality
-            assert failure(lambda asked=asked: stub.render_rgb(asked))[0] == Code.INVALID_ARGUMENT

@@ -15,9 +15,8 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
-from alpasim_plugin.alpasim.server.views import camera_of, read_lens, read_view
+from alpasim_plugin.alpasim.server.views import read_lens, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
-from alpasim_plugin.core.lens import lens_shares
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import U8, Exposure, RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
@@ -104,22 +103,6 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
     seen = np.ones_like(expected, bool) if lens.seen is None else lens.seen
     assert not np.isnan(read[seen]).any()
     assert np.abs(read - expected)[seen].max() < 0.3 / 89
-
-
-def test_what_the_lens_does_not_see_is_exposed_never() -> None:
-    lens = read_lens(ftheta(False), 320, 180)
-    share = lens_shares(camera_of(ftheta(False), 320, 180), lens, "rows", backwards=False)
-    sees = ~np.isnan(share)
-    used = np.zeros(lens.cover[::-1], bool)
-    assert lens.resample is not None
-    column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T
-    for dx in (0, 1):
-        for dy in (0, 1):
-            used[
-                np.clip(row + dy, 0, lens.cover[1] - 1), np.clip(column + dx, 0, lens.cover[0] - 1)
-            ] = True
-    assert sees[used].all()
-    assert not sees.all()
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,6 @@ from alpasim_plugin.core.errors import InputError
 from tests.block_fixers.dit_cases import clip, furthest, network, stream
 
 
-def pointers(cache):
-    return cache.keys.data_ptr(), cache.values.data_ptr()
-
-
 def test_forward_that_is_not_written_leaves_no_trace():
     net, (x, t, text, hdmap) = network(), clip(8)
     quiet, tried = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
@@ -57,15 +53,6 @@ def test_window_smaller_than_a_block_sees_the_block_and_nothing_else():
         assert furthest(out[:, :, cut], alone) < 1e-5
 
 
-def test_one_frame_rollout():
-    net, (x, t, text, hdmap) = network(), clip(1)
-    with torch.no_grad():
-        assert (
-            furthest(net.step(x, t, text, hdmap, net.new_cache(1, 4, 6)), net(x, t, text, hdmap))
-            < 1e-6
-        )
-
-
 def test_block_opened_again_shorter_after_it_took_old_slots_is_refused():
     net, (x, t, text, hdmap) = network(), clip(2)
     cache = net.new_cache(1, 4, 6, window=4)
@@ -107,14 +94,6 @@ def test_cache_of_another_network_or_size_is_refused():
     for cache in (net.new_cache(2, 4, 6), net.new_cache(1, 6, 4), other):
         with pytest.raises(InputError):
             net.step(x, t, text, hdmap, cache)
-
-
-def test_steps_run_without_gradients_in_a_rolling_cache():
-    net, (x, t, text, hdmap) = network(), clip(2)
-    cache = net.new_cache(1, 4, 6)
-    v = net.step(x.requires_grad_(), t, text, hdmap, cache)
-    assert not v.requires_grad
-    assert not cache.keys.requires_grad
 
 
 def test_every_wrong_input_is_refused():

@@ -48,14 +48,6 @@ def test_weights_that_do_not_fit_are_named(sd, text):
     assert "weights.safetensors" in caught.value.message
 
 
-def test_a_transposed_tensor_is_named():
-    sd = random_weights(SMALL)
-    sd["blocks.1.mlp.layer1.weight"] = sd["blocks.1.mlp.layer1.weight"].T.contiguous()
-    with pytest.raises(InputError) as caught:
-        load(sd)
-    assert "transposed" in caught.value.message
-
-
 def dressed(sd):
     """Return the same weights as a training run would store them."""
     out = {
@@ -163,12 +155,6 @@ def test_safetensors_whose_length_begins_like_a_pickle_loads(tmp_path):
     assert torch.equal(load_weights(path)["a"], torch.ones(2))
 
 
-def test_integer_tensors_keep_their_type_when_others_are_converted(tmp_path):
-    save_file({"a": torch.ones(2), "n": torch.tensor([3])}, tmp_path / "x.safetensors")
-    back = load_weights(tmp_path / "x.safetensors", torch.float16)
-    assert (back["a"].dtype, back["n"].dtype) == (torch.float16, torch.int64)
-
-
 @pytest.mark.parametrize("keep", [0, 5, 100, -100])
 def test_truncated_safetensors_is_refused(tmp_path, keep):
     path = tmp_path / "net.safetensors"
@@ -223,14 +209,6 @@ def test_pickled_byte_buffers_of_transformer_engine_are_tolerated(tmp_path):
     sd = {**random_weights(SMALL), "blocks.0.self_attn.q_norm._extra_state": io.BytesIO(b"\x80")}
     torch.save(sd, tmp_path / "net.pt")
     assert "blocks.0.self_attn.q_norm._extra_state" not in load_weights(tmp_path / "net.pt")
-
-
-def test_truncated_torch_file_is_refused(tmp_path):
-    path = tmp_path / "net.pt"
-    torch.save(random_weights(SMALL), path)
-    path.write_bytes(path.read_bytes()[:-500])
-    with pytest.raises(InputError):
-        load_weights(path)
 
 
 @pytest.mark.parametrize("content", [[1, 2], {"a": 3}, {"model": {"epoch": 1}}])

@@ -109,19 +109,6 @@ def test_attention_without_a_mask_is_attention_with_one(frames, block, window, s
     assert furthest(fast, block_causal_reference(q, k, v, tokens, block, window, sink)) < 1e-6
 
 
-def test_later_blocks_do_not_reach_earlier_ones():
-    net = network()
-    x, t, text, hdmap = clip(6)
-    with torch.no_grad():
-        before = net(x, t, text, hdmap)
-        changed_x, changed_map = x.clone(), hdmap.clone()
-        changed_x[:, :, 4:] += 1
-        changed_map[:, :, 4:] -= 1
-        after = net(changed_x, t, text, changed_map)
-    assert torch.equal(before[:, :, :4], after[:, :, :4])
-    assert furthest(before[:, :, 4:], after[:, :, 4:]) > 0.1
-
-
 def test_past_beyond_the_window_is_forgotten_and_the_sink_is_not():
     one_layer = network(
         DiTSizes(**{**SMALL.__dict__, "blocks": 1})
@@ -158,27 +145,6 @@ def test_prepared_text_is_the_text(tokens):
         )
 
 
-def test_one_prompt_serves_a_batch_of_views():
-    net = network()
-    x, t, text, hdmap = clip(2, batch=3)
-    with torch.no_grad():
-        views = net(x, t, text[:1], hdmap)
-        assert furthest(views, net(x, t, text[:1].expand(3, -1, -1), hdmap)) < 1e-5
-        alone = torch.cat(
-            [net(x[i : i + 1], t[i : i + 1], text[:1], hdmap[i : i + 1]) for i in range(3)]
-        )
-    assert furthest(views, alone) < 1e-5
-
-
-def test_a_number_is_a_time_step_for_every_latent():
-    net = network()
-    x, _, text, hdmap = clip(4)
-    with torch.no_grad():
-        by_latent = net(x, torch.full((1, 4), 357.0), text, hdmap)
-        assert furthest(net(x, 357.0, text, hdmap), by_latent) < 1e-5
-        assert furthest(net(x, torch.full((1, 1), 357.0), text, hdmap), by_latent) < 1e-5
-
-
 def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
     net, (x, t, text, hdmap) = network(), clip(6)
     for cut_after, reached in ((None, [True, True]), (1, [False, True]), (2, [False, False])):
@@ -194,14 +160,3 @@ def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
             bool(grad[:, :, cut].abs().max() > 0) for cut in (slice(0, 2), slice(2, 4))
         ] == reached
         assert grad[:, :, 4:].abs().max() > 0
-
-
-def test_gradients_of_a_clip_are_those_of_its_blocks():
-    net, (x, t, text, hdmap) = network(), clip(4)
-    cache = net.new_cache(1, 4, 6, window=None, keeps_graph=True)
-    whole = torch.autograd.grad(net(x, t, text, hdmap).square().mean(), list(net.parameters()))
-    blocks = torch.autograd.grad(
-        stream(net, cache, x, t, text, hdmap, (2, 2)).square().mean(), list(net.parameters())
-    )
-    for a, b in zip(whole, blocks, strict=True):
-        assert furthest(a, b) < 1e-5

@@ -10,13 +10,11 @@ from safetensors.torch import load_file
 
 from alpasim_plugin.block_fixers.attention import rotate
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
-from alpasim_plugin.block_fixers.layers import embed_latents, patchify, sinusoid
 from alpasim_plugin.block_fixers.sampling import context_level, sample_block
 from alpasim_plugin.fixers.network.schedule import from_names
 from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import furthest, stream
 
-EPSILON = torch.finfo(torch.float32).eps
 TOLERANCE = (
     1e-5  # ten times tighter than asked; the original itself moves by 4e-6 with another arithmetic
 )
@@ -69,10 +67,6 @@ def test_first_latent_given(net, io):
         furthest(net(**inputs(io), condition_mask=mask), io["out.clip.first_frame_given.r3.out"])
         < TOLERANCE
     )
-
-
-def test_batch_of_two(net, io):
-    assert furthest(net(**inputs(io, "batch2")), io["out.batch2.mask0.r3.out"]) < TOLERANCE
 
 
 def test_bidirectional_teacher(net, io):
@@ -155,26 +149,6 @@ def test_every_intermediate_tensor_of_the_first_block(net, io):
         assert furthest(value, io[f"out.clip.mask0.r3.mid.{name}"]) < 3e-5, (
             name
         )  # values here reach 17
-
-
-def test_embeddings(net, io):
-    mid = "out.clip.mask0.r3.mid."
-    s = sinusoid(io["in.clip.t"], 64)
-    tokens = embed_latents(net.x_embedder.linear, io["in.clip.x"], None)
-    hdmap = net.additional_patch_embedding.linear(patchify(io["in.clip.hdmap"]))
-    found = {
-        "time_sinusoid": s,
-        "time_emb_normed": net.t_embedding_norm(s),
-        "time_adaln_lora": net.t_embedder[1](s),
-        "text_context": net.crossattn_proj(io["in.clip.text"]),
-        "tokens_after_x_embedder": tokens.view(1, 6, 4, 6, 64),
-        "tokens_hdmap": hdmap.view(1, 6, 4, 6, 64),
-    }
-    for name, value in found.items():
-        assert furthest(value, io[mid + name]) < TOLERANCE, name
-    cosines, _ = net.rope.table(0, 6, 4, 6)
-    angles = io["out.clip.rope_angles.r3"].reshape(len(cosines), -1)
-    assert furthest(cosines, angles[:, : cosines.shape[1]].cos()) < TOLERANCE
 
 
 def test_two_step_sampler_over_five_blocks(net, golden):

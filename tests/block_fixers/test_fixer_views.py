@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.core.types import Frame
@@ -20,12 +19,6 @@ def test_every_grey_level_survives_the_way_to_tensors_and_back() -> None:
     assert np.array_equal(to_images(clip.rgb, views.size)[0, 0], levels)
     assert float(clip.rgb.min()) == -1
     assert float(clip.rgb.max()) == 1
-
-
-def test_values_beyond_the_range_are_cut() -> None:
-    video = torch.tensor([-3.0, 3.0]).view(1, 1, 1, 1, 2).expand(1, 3, 1, 1, 2)
-    (views,) = group_views([Frame(0, "front", np.zeros((1, 2, 3), np.uint8))], [], 1)
-    assert to_images(video, views.size)[0, 0, 0, :, 0].tolist() == [0, 255]
 
 
 def test_filling_up_repeats_edges_and_the_last_frame() -> None:
@@ -57,14 +50,6 @@ def test_an_opacity_of_one_everywhere_is_none() -> None:
     assert views.alpha is not None
     assert views.alpha[0, 0].min() == 1
     assert views.alpha[0, 1, 0, 0] == np.float32(0.999)
-
-
-def test_rounding_beyond_one_is_cut() -> None:
-    alpha = np.full((32, 48), 1.0005, np.float32)
-    alpha[0] = -0.0005
-    (views,) = group_views([replace(moving_picture(1)[0], alpha=alpha)], [], 5)
-    assert views.alpha is not None
-    assert (views.alpha.min(), views.alpha.max()) == (0, 1)
 
 
 def test_equal_blocks_are_told_from_others() -> None:

@@ -119,13 +119,6 @@ def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone: np.
     assert len(videos) == 4, "an opacity alone makes another block"
 
 
-def test_the_past_matters_and_the_future_does_not(busy, alone: np.ndarray) -> None:
-    other_past = [*moving_picture(13, key="other"), *FRAMES[13:]]
-    assert not np.array_equal(pixels(run_blocks(fixer(busy), other_past, MAPS))[13:], alone[13:])
-    other_future = [*FRAMES[:13], *moving_picture(29, key="other")[13:]]
-    assert np.array_equal(pixels(run_blocks(fixer(busy), other_future, MAPS))[:13], alone[:13])
-
-
 def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
     left = moving_picture(21, key="left", camera="left")
     right = moving_picture(21, key="right", camera="right", holes=False)
@@ -162,21 +155,6 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
         assert np.abs(mine.astype(int) - images[name]).max() <= 1
 
 
-def test_cameras_of_two_sizes_share_a_rollout(busy) -> None:
-    wide = moving_picture(13, size=(32, 64), camera="wide")
-    session = fixer(busy)
-    out: list[Frame] = []
-    for start, end in ((0, 5), (5, 13)):
-        out += session.step(
-            [*FRAMES[start:end], *wide[start:end]], [*MAPS[start:end], *maps_of(wide[start:end])]
-        )
-    for frames in (FRAMES[:13], wide):
-        camera = frames[0].camera
-        mine = pixels([frame for frame in out if frame.camera == camera])
-        single = fixer(busy)
-        assert np.array_equal(mine, pixels(run_blocks(single, frames, maps_of(frames))))
-
-
 def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
     seen, unseen = busy_settings(weights), busy_settings(weights, "uses_map=false")
     black = [np.zeros_like(m) for m in MAPS[:5]]
@@ -201,24 +179,6 @@ def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through() -> None
     frames = moving_picture(21, holes=False)
     out = pixels(run_blocks(session, frames, MAPS))
     assert np.array_equal(out, pixels(frames))
-
-
-def test_an_untrained_fixer_is_the_autoencoders_round_trip() -> None:
-    session = fixer(small_settings("decoder.kind=latent"))
-    frames = moving_picture(21)
-    video = torch.from_numpy(pixels(frames)).float().permute(3, 0, 1, 2)[None] / 127.5 - 1
-    vae = session.networks.vae
-    expected = ((vae.decode(vae.encode(video)) + 1) * 127.5).round()[0].permute(1, 2, 3, 0)
-    out = pixels(run_blocks(session, frames, MAPS)).astype(int)
-    assert np.abs(out - expected.numpy()).max() <= 1
-    assert 1 < np.abs(out - pixels(frames)).mean() < 40  # blurred, not lost
-
-
-def test_steps_after_the_name_are_in_the_label() -> None:
-    session = make_fixer(
-        "onefixer-dit-tiny@2", small_settings("steps=[1000,500]"), scene_id="scene"
-    )
-    assert session.label == "onefixer-dit-tiny@2, untrained (identity)"
 
 
 # --- blocks that are refused
@@ -264,10 +224,3 @@ def test_an_opacity_that_is_none_is_the_renderers_fault(busy, value: float) -> N
     alpha[3, 4] = value
     with pytest.raises(RendererError):
         fixer(busy).step([replace(FRAMES[0], alpha=alpha)], MAPS[:1])
-
-
-def test_settings_of_another_fixer_are_refused() -> None:
-    from alpasim_plugin.fixers import fixer_settings
-
-    with pytest.raises(InputError):
-        make_fixer("onefixer-dit-tiny", fixer_settings("identity"), scene_id="scene")

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.sampling import (
-    context_level,
     flow_step,
     mixed_source,
     opacity_mask,
@@ -40,12 +39,6 @@ def test_mask_is_the_largest_opacity_of_each_latent(first, frames, latents):
             for column in range(3):
                 cell = opacity[:, 0, begin:end, 8 * row : 8 * row + 8, 8 * column : 8 * column + 8]
                 assert torch.equal(mask[:, 0, i, row, column], cell.amax((1, 2, 3)))
-
-
-def test_streamed_masks_are_the_whole_one():
-    opacity = torch.rand(1, 1, 13, 8, 8, generator=torch.Generator().manual_seed(2))
-    parts = [opacity_mask(opacity[:, :, :5]), opacity_mask(opacity[:, :, 5:], first=False)]
-    assert torch.equal(torch.cat(parts, 2), opacity_mask(opacity))
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -115,12 +108,6 @@ def test_released_schedules():
     assert shifted(1.0) == 1.0
 
 
-def test_cache_write_is_told_128_and_noised_like_its_nearest_neighbour():
-    level = context_level()
-    assert level.t == 128.0
-    assert level.sigma == pytest.approx(0.12992832, abs=1e-8)
-
-
 @pytest.mark.parametrize(
     "call",
     [
@@ -153,14 +140,6 @@ def test_history_decides_what_the_cache_keeps(history, forwards):
     assert [write for _, write in calls] == [False] * (forwards - 1) + [True]
     assert calls[-1][0] == (128 if history == "finalise" else 833)
     assert cache.position == 2
-
-
-def test_one_step_is_equation_two():
-    net, (z_1, _, text, hdmap) = network(), clip(2)
-    one = net.new_cache(1, 4, 6)
-    z_0 = sample_block(net, [z_1], text, hdmap, one, steps(1), "last-forward")
-    with torch.no_grad():
-        assert furthest(z_0, z_1 - net(z_1, 1000.0, text, hdmap)) < 1e-5
 
 
 @pytest.mark.parametrize("history", ["finalise", "last-forward"])

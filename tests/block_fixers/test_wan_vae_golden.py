@@ -12,7 +12,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_first, channels_last
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
-from tests.block_fixers.codec_cases import decoder_stream, golden
+from tests.block_fixers.codec_cases import golden
 
 TOLERANCE = 3e-5  # a third of what is promised; the original itself moves by 4e-6 between machines
 CLIPS = ["clip_b1_t1_32x48", "clip_b1_t9_32x48", "clip_b1_t17_40x64"]
@@ -92,31 +92,6 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(
         ]
         assert [tuple(channels_first(kept).shape) for kept in streaming.state] == slots
         state, start = streaming.state, start + count
-
-
-def test_decoder_state_has_the_original_slots(vae: WanVAE, numbers: Any) -> None:
-    _, io, config = numbers
-    name = "clip_b1_t9_32x48"
-    stream = decoder_stream(vae)
-    for index, slots in enumerate(config["cases"][name]["decoder_cache_slots_after_each_chunk"]):
-        frames = stream.push(io[f"out.{name}.latent_normalised"][:, :, index : index + 1])
-        assert frames.shape[2] == config["cases"][name]["decoder_frames_per_chunk"][index]
-        assert stream.state is not None
-        for kept, slot in zip(
-            stream.state, [slot for slot in slots if slot is not None], strict=True
-        ):
-            # "Rep" marks a temporal upsampling that has only seen the first latent: it remembers
-            # nothing. One latent later the original fills up with a zero frame, which here is not
-            # stored.
-            batch, frames_kept, height, width, channels = kept.shape
-            assert slot == "Rep" or [batch, channels, height, width] == [
-                slot[0],
-                slot[1],
-                *slot[3:],
-            ]
-            assert frames_kept in (
-                [0] if slot == "Rep" else [slot[2] - 1, slot[2]] if index == 1 else [slot[2]]
-            )
 
 
 def test_statistics_are_the_published_ones(numbers: Any) -> None:

@@ -81,14 +81,6 @@ def test_a_policy_that_prints_leaves_one_document_on_stdout(
     assert "planning" in printed.err
 
 
-def test_a_fault_is_exit_code_1_and_a_line(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["check", "policy", "talking_policies.py:Transposed"]) == 1
-    assert (
-        "FAIL values: in the situation 'straight' the plan has times_us (41,), xy (2, 41)"
-        in capsys.readouterr().out
-    )
-
-
 def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_error(
     parts: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -119,15 +119,6 @@ def test_json_errors_are_one_document_on_stdout(capsys: pytest.CaptureFixture[st
     assert document["exit_code"] == 2
 
 
-def test_debug_adds_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--renderer", "nope", "--debug", "smoke/straight"]) == 2
-    assert "Traceback" in capsys.readouterr().err
-
-
-def test_unknown_options_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--rendrer", "clean", "smoke/straight"]) == 2
-
-
 def test_a_dry_run_counts_without_running(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -228,13 +219,6 @@ def test_policy_of_the_working_directory_is_found(
     assert json.loads(capsys.readouterr().out)["policies"] == ["policy_of_this_folder:Mine"]
 
 
-def test_report_of_a_folder_that_is_no_run_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_command(["report", str(tmp_path)]) == 2
-    two_parts(capsys.readouterr().err)
-
-
 @pytest.mark.parametrize("kind", ["renderers", "policies", "scenarios", "metrics"])
 def test_lists_name_every_part_with_help(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["list", kind, "--json"]) == 0
@@ -263,12 +247,6 @@ def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:
     checks = {row["check"]: row for row in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["rasteriser (cpu)"]["ok"]
     assert checks["video"]["ok"]
-
-
-def test_help_of_every_verb_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in ("run", "report", "list", "doctor"):
-        assert run_command([verb, "--help"]) == 0
-        assert "simrun" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -255,13 +254,6 @@ def test_an_error_of_usage_says_what_helps(
     assert json.loads(capsys.readouterr().out)["exit_code"] == 2
 
 
-def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("simrun ")
-    assert run_command(["--version", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["version"]
-
-
 # --- a Tab
 
 
@@ -300,18 +292,3 @@ def test_a_tab_offers_verbs_options_and_names(
     packages: Path, words: list[str], among: list[str]
 ) -> None:
     assert set(among) <= set(offered(packages, *words))
-
-
-@pytest.mark.slow
-def test_no_name_with_a_colon_is_offered(packages: Path) -> None:
-    assert not any(":" in name for name in offered(packages, "run", "--policy", ""))
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-@pytest.mark.slow
-def test_the_program_gives_each_shell_a_script(
-    packages: Path, shell: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("_SIMRUN_COMPLETE", f"source_{shell}")
-    assert "_SIMRUN_COMPLETE" in simrun(packages).stdout

@@ -4,7 +4,6 @@ same scores from them.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -154,25 +153,6 @@ def test_scores_of_the_export_are_those_of_the_run(
             float("inf")
         }
         assert (out / "aggregate" / "results-summary.json").is_file()
-
-
-def test_what_alpasim_will_lack_is_said(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_command(["export", str(run), "--alpasim", str(tmp_path / "out"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert [(one["policy"], one["rollouts"], one["failed"]) for one in printed["runs"]] == [
-        (p, 2, 0) for p in POLICIES
-    ]
-    assert "no minADE" in " ".join(printed["runs"][1]["notes"])
-    assert printed["scenes"] == ["scenes/smoke-straight.usdz"]
-
-
-def test_scenes_alone(tmp_path: Path) -> None:
-    assert run_command(["export", "smoke/straight", "--alpasim", str(tmp_path / "out")]) == 0
-    assert [path.name for path in (tmp_path / "out" / "scenes").iterdir()] == [
-        "smoke-straight.usdz"
-    ]
 
 
 def test_refusals_say_what_to_do(

@@ -125,18 +125,6 @@ def test_junit_has_a_failure_for_each_broken_rule_and_keeps_the_rollouts(runs, g
     assert int(root.attrib["tests"]) == len(list(root.iter("testcase")))
 
 
-def test_an_undecided_rule_that_need_not_decide_is_skipped_in_junit(runs, gate_file, tmp_path):
-    command = ["gate", str(runs["noisy"]), "--gate", gate_file, "--out", str(tmp_path)]
-    assert run_command(command) == 0
-    gate = ET.parse(tmp_path / "gate.junit.xml").getroot().find("testsuite")
-    assert [
-        c.attrib["name"] for c in gate.findall("testcase") if c.find("skipped") is not None
-    ] == ["offroad margin"]
-    assert gate.attrib["skipped"] == "1"
-    Path(gate_file).write_text(EASY.replace(", must_decide: false", ""))
-    assert run_command(command) == 3
-
-
 def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(
     runs, gate_file, tmp_path, monkeypatch
 ):
@@ -229,14 +217,6 @@ def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, cap
 # --- compare
 
 
-def test_other_metrics_than_those_of_the_headline_are_printed_on_demand(runs, capsys):
-    assert run_command(["compare", str(runs["good"])]) == 0
-    few = capsys.readouterr().out
-    assert run_command(["compare", str(runs["good"]), "--all"]) == 0
-    every = capsys.readouterr().out
-    assert len(every.splitlines()) > len(few.splitlines())
-
-
 def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert run_command(["compare", str(runs["bad"]), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["lateral_distance_m"]
@@ -266,14 +246,6 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
     assert entry["baseline"] == f"{runs['good']}: onefixer"
     with_one = _compare(capsys, str(runs["good"]), str(runs["bad"]), "--baseline", "clean")
     assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
-
-
-def test_compare_prints_verdicts_and_cells_without_a_pair(runs, capsys):
-    assert run_command(["compare", str(runs["good"]), str(runs["failed"])]) == 0
-    out = capsys.readouterr().out
-    assert "onefixer minus" in out
-    assert "no pair: lane-camera, scene-03, seed 1: every metric: here: failed (renderer)" in out
-    assert "lateral_distance_m" in out
 
 
 def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
@@ -332,20 +304,6 @@ def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_p
         ("a", "b"),
         ("c", "b"),
     ]
-
-
-def test_any_arm_is_a_baseline_where_renderers_and_policies_differ(tmp_path, capsys):
-    run = arms_run(tmp_path / "run", ("clean", "3dgs"), ("a", "b"))
-    found = _compare(capsys, str(run), "--baseline", "clean/a")
-    assert set(found) == {"clean/b", "3dgs/a", "3dgs/b"}
-    assert {entry["baseline"] for entries in found.values() for entry in entries.values()} == {
-        "clean/a"
-    }
-    assert run_command(["compare", str(run), "--baseline", "omnidreams"]) == 2
-    assert (
-        "choose one of clean, 3dgs, a, b, clean/a, 3dgs/a, clean/b, 3dgs/b"
-        in capsys.readouterr().err
-    )
 
 
 def test_another_policy_of_a_stored_baseline_is_named_or_the_only_one(tmp_path, capsys):

@@ -44,16 +44,6 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(
     assert run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out)]) == 2
 
 
-def test_a_preview_is_a_png_of_the_seed_that_was_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    command = ["view", str(tmp_path / "scene.yaml"), "--seed", "4", "--out"]
-    assert run_command([*command, str(tmp_path / "scene.html")]) == 2
-    assert run_command([*command, str(tmp_path / "scene.png")]) == 0
-    assert "scene seed 4 varies" in capsys.readouterr().out
-
-
 def test_a_background_is_named_with_what_it_covers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -199,21 +199,3 @@ def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(
     assert "the fixer changed this video by much (PSNR" in capsys.readouterr().err
     last = cv2.imread(str(source / "frame_04.png"))
     np.testing.assert_array_equal(cv2.imread(str(out / "frame_04.png")), 255 - last)
-
-
-def test_opacity_says_what_may_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
-    source, alpha = (
-        pictures(tmp_path / "in", count=5),
-        pictures(tmp_path / "alpha", count=5, channels=1),
-    )
-    command = [
-        "refine",
-        str(source),
-        "-o",
-        str(tmp_path / "out"),
-        "--fixer",
-        f"{tmp_path}/fixers_of_a_user.py:Inverts",
-    ]
-    assert run_command([*command, "--opacity", str(alpha)]) == 0
-    assert "the input's own" not in capsys.readouterr().err

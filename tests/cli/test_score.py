@@ -126,22 +126,6 @@ def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp
     assert run_command([*command[:5], "strict,waymax"]) == 2
 
 
-def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
-    out = tmp_path / "scored"
-    command = [
-        "score",
-        str(our_run),
-        "--scene",
-        "smoke/straight",
-        "--out",
-        str(out),
-    ]
-    assert run_command(command) == 0
-    first = (out / "steps.parquet").read_bytes()
-    assert run_command(command) == 0
-    assert (out / "steps.parquet").read_bytes() == first
-
-
 def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
     command = [
@@ -155,17 +139,6 @@ def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_pa
     assert run_command(command) == 0
     assert run_command([*command, "--preset", "paper"]) == 2
     assert "holds other results" in capsys.readouterr().err
-
-
-def test_a_log_of_ours_without_images_has_alpasims_values_and_no_aggregation(
-    our_run, tmp_path, capsys
-):
-    out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", "alpasim"]
-    assert run_command([*command, "--out", str(out)]) == 0
-    assert "aggregation was not written" in capsys.readouterr().err
-    assert not (out / "aggregate").exists()
-    assert [row["progress_valid"] for row in rows(out)] == [True, True]
 
 
 def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):

@@ -47,13 +47,6 @@ def test_a_signal_unwinds_the_block_and_names_the_exit_code(
     assert {one: signal.getsignal(one) for one in before} == before
 
 
-def test_no_handler_of_exceptions_takes_it_for_an_error() -> None:
-    assert not issubclass(Stopped, Exception)
-    assert not issubclass(
-        Stopped, KeyboardInterrupt
-    )  # the command line's library would turn that into its own exit code
-
-
 def test_a_signal_that_was_ignored_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
     try:

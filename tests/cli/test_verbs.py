@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
-from alpasim_plugin.cli.main import PANELS, app, load_verb, verbs
+from alpasim_plugin.cli.main import PANELS, load_verb
 
 REPO = Path(__file__).resolve().parents[2]
 OWN = [verb for panel in PANELS.values() for verb in panel]
@@ -97,11 +96,3 @@ def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels() -> No
         ).stdout.strip()
         == "set()"
     )
-
-
-def test_the_listing_shows_every_verb_with_the_first_line_of_its_own_help() -> None:
-    listed: Any = typer.main.get_command(app)
-    assert listed.list_commands(None) == list(verbs())
-    for verb in OWN:
-        first = (load_verb(verb).help or "").split("\n\n")[0].replace("\n", " ")
-        assert listed.get_command(None, verb).help == first, verb

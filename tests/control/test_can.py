@@ -102,14 +102,6 @@ def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path
         load_map("example", str(tmp_path / "absent.dbc"))
 
 
-@pytest.mark.parametrize(
-    "text", ["", "?map=example", "vcan0?maps=x", "vcan0?timeout_ms=0", "vcan0?timeout_ms=ten"]
-)
-def test_bad_addresses(text: str) -> None:
-    with pytest.raises(InputError, match="can://"):
-        Address.parse(text)
-
-
 # --- commands
 
 

@@ -19,7 +19,6 @@ from alpasim_plugin.core import atomic
 from alpasim_plugin.core.atomic import (
     atomic_file,
     atomic_folder,
-    temporary_path,
     write_array,
     write_bytes,
     write_json,
@@ -136,25 +135,6 @@ def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_temporary_names_are_hidden_and_unique() -> None:
-    names = {temporary_path(Path("/a/b.json")) for _ in range(1000)}
-    assert len(names) == 1000
-    assert all(
-        p.parent == Path("/a")
-        and p.name.startswith(f".b.json.{os.getpid()}.")
-        and p.suffix == ".tmp"
-        for p in names
-    )
-
-
-def test_two_writers_in_one_process_do_not_meet(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    with atomic_file(path) as first, atomic_file(path) as second:
-        first.write_text("first")
-        second.write_text("second")
-    assert path.read_text() == "first"
-
-
 @pytest.mark.parametrize("name", ["array", "safetensors"])
 def test_a_missing_folder_is_named_with_advice(name: str, tmp_path: Path) -> None:
     with pytest.raises(InfrastructureError, match="No such file or directory") as caught:
@@ -180,8 +160,3 @@ def test_a_read_only_folder_is_an_error_with_four_parts(
     with pytest.raises(InfrastructureError, match="Read-only file system") as caught:
         write(tmp_path / "out", 1)
     assert "writable, or name another" in caught.value.hint
-
-
-def test_nan_is_refused_in_json(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="JSON"):
-        write_json(tmp_path / "a.json", {"x": float("nan")})

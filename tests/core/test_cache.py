@@ -57,19 +57,6 @@ def test_damaged_folder_is_made_again_with_a_warning(
     assert "making it again" in said
 
 
-def test_again_replaces_what_is_there() -> None:
-    for text in ("good old", "good new"):
-        got = cached(
-            "texts",
-            "k",
-            lambda folder, text=text: (folder / "text").write_text(text) and None,
-            read,
-            "a text",
-            again=True,
-        )  # type: ignore[misc]
-        assert got == text
-
-
 def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_cache: Path) -> None:
     def fails(folder: Path) -> None:
         (folder / "text").write_text("good but unfinished")

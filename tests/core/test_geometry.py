@@ -13,15 +13,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     interpolate,
-    inverse,
     matrix_from_quat,
     offset_trajectory,
     project,
     quat_from_matrix,
     quat_from_yaw,
-    resample,
     se2,
-    se3,
     slerp,
     trajectory_from_poses,
     wrap_angle,
@@ -91,16 +88,6 @@ def test_interpolation_outside_the_trajectory_is_refused() -> None:
         interpolate(line, 11)
 
 
-def test_one_pose_trajectory_can_be_asked_at_its_own_time() -> None:
-    one = Trajectory(np.array([5]), np.array([[1.0, 2, 3]]), quat_from_yaw(np.zeros(1)))
-    np.testing.assert_allclose(interpolate(one, np.array([5, 5]))[:, :3, 3], [[1, 2, 3]] * 2)
-
-
-def test_inverse_far_from_the_origin_is_exact_to_rounding() -> None:
-    far = se3([5e5, 4.2e6, 100.0], quat_from_yaw(0.7))
-    np.testing.assert_allclose(inverse(far) @ far, np.eye(4), atol=1e-9)
-
-
 def test_offset_trajectory_turns_the_offset_with_the_body() -> None:
     left_turn = trajectory_from_poses([0, 1], [se2(0, 0, 0), se2(0, 0, np.pi / 2)])
     moved = offset_trajectory(left_turn, se2(2.0, 0.0, 0.0))
@@ -112,11 +99,6 @@ def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends() -> None:
     assert project(line, np.array([4.0, 1.5])) == (4.0, 1.5)
     assert project(line, np.array([4.0, -1.5])) == (4.0, -1.5)
     assert project(line, np.array([13.0, 4.0])) == (10.0, 5.0)
-
-
-def test_resampling_skips_repeated_points() -> None:
-    line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
-    np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])
 
 
 def test_one_quaternion_is_that_of_many_to_the_last_bit() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, resized, sides_of
+from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, sides_of
 from alpasim_plugin.core.types import F64, CameraSpec, Frame, LensModel
 
 W, H = 320, 240
@@ -89,15 +89,6 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens: LensModel
     assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()
     assert len(sides) == (1 if lens.kind == "opencv" else 5)
     assert rays.widest_rad > np.deg2rad(40 if lens.kind == "opencv" else 99)
-
-
-def test_a_camera_of_another_size_sees_the_same_at_its_corners() -> None:
-    for lens in (OPENCV, FISHEYE, FTHETA, BACKWARD):
-        spec = camera(lens)
-        ray = np.array([[0.3, -0.2, 1.0], [-0.5, 0.1, 1.0]])
-        whole, _ = pixels_of(spec, ray)
-        half, _ = pixels_of(resized(spec, W // 2, H // 2), ray)
-        np.testing.assert_allclose(half, whole / 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -47,19 +47,3 @@ def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path: Path, re
         assert held.since_ns == path.stat().st_mtime_ns
         assert is_locked(path)
     assert not is_locked(path)
-
-
-def test_a_writer_that_waits_says_so_once(tmp_path: Path, repo: Path) -> None:
-    first = holder(tmp_path / ".lock", 1.0, repo)
-    lines: list[str] = []
-    with one_writer(tmp_path / ".lock", "folder x", wait=True, waiting=lines.append):
-        assert first.wait(10) == 0
-    first.communicate()
-    assert len(lines) == 1
-    assert "folder x" in lines[0]
-
-
-def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(InfrastructureError), one_writer(tmp_path / "file" / ".lock", "a folder"):
-        pass

@@ -71,13 +71,6 @@ def test_without_a_writable_home_a_private_folder_is_made_and_goes_with_the_proc
 
 
 @as_root
-def test_the_home_of_another_user_is_not_chosen(home: Path) -> None:
-    with shared_folder() as others:  # root's, and writable by all: a kernel there is anybody's code
-        kept, _, _ = chosen_by_nobody(others)
-        assert Path(kept).parent != others / ".cache"
-
-
-@as_root
 def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache() -> None:
     with shared_folder() as own:
         os.chown(own, NOBODY, NOBODY)

@@ -9,21 +9,8 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.parts import complete, names, resolve, resolve_renderer, spec
-from alpasim_plugin.core.parts.resolve import PLAIN_KINDS
-from alpasim_plugin.core.parts.source import code_digest, load, reached
-from alpasim_plugin.core.parts.spec import BUILTIN, KINDS
-
-DECLARED = (
-    "settings_model",
-    "describe",
-    "files",
-    "trained",
-    "note",
-    "is_remote",
-    "missing",
-    "metrics",
-    "controller",
-)
+from alpasim_plugin.core.parts.source import code_digest, reached
+from alpasim_plugin.core.parts.spec import KINDS
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -36,20 +23,6 @@ def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> Non
         )  # what is behind an address or a command is not known here
         assert text
         assert "\n" not in text
-
-
-@pytest.mark.parametrize("kind", PLAIN_KINDS)
-def test_shipped_parts_of_plain_kinds_declare_nothing(kind: str) -> None:
-    for target in (
-        target for name, (target, _) in BUILTIN[kind].items() if not name.endswith("://")
-    ):
-        factory = load(target, kind)
-        own = {name for name in DECLARED if getattr(factory, name, None)}
-        assert own == set(), target
-
-
-def test_a_step_count_at_the_end_belongs_to_the_fixer() -> None:
-    assert str(resolve_renderer("onefixer+clean@2")) == "onefixer@2+clean"
 
 
 def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Path) -> None:
@@ -171,11 +144,6 @@ def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
     assert plain.fixer is not None
     assert without.fixer.settings.tolerance_m == 0.5  # type: ignore[union-attr]
     assert without.fixer.digest != plain.fixer.digest
-
-
-def test_a_bracket_counts_for_its_own_arm_and_over_what_is_set_for_all() -> None:
-    own = resolve_renderer("identity[tolerance_m=0.5]", ["tolerance_m=0.25", "tolerance_deg=0.75"])
-    assert (own.fixer.settings.tolerance_m, own.fixer.settings.tolerance_deg) == (0.5, 0.75)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

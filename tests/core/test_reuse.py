@@ -82,10 +82,6 @@ def test_a_remote_part_is_never_reused_unasked(
     assert plan["never_reused"] == ["renderer parts_of_a_user.py:Remote"]
 
 
-def test_a_part_with_a_digest_is_reused(folder: Path) -> None:
-    assert made(folder, "Grey") == made(folder, "Grey")
-
-
 def test_a_factory_that_asks_for_something_else_is_told_what_there_is(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -70,13 +70,6 @@ def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(
     assert np.abs(times - request.exposure.share).max() <= 0.5 / count + 1e-6
 
 
-def test_as_many_bands_as_rows_are_the_rows_and_the_ends_are_the_poses_given() -> None:
-    rows = list(bands_of(FAST, HEIGHT))
-    assert [band.rows for band in rows] == [slice(i, i + 1) for i in range(HEIGHT)]
-    np.testing.assert_array_equal(rows[0].T_world_camera, FAST.T_world_camera[0])
-    np.testing.assert_array_equal(rows[-1].T_world_camera, FAST.T_world_camera[1])
-
-
 def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     share = np.clip(v / HEIGHT + 0.2 * np.abs(u - 32) / 32, 0, 1).astype(np.float32)
@@ -127,7 +120,3 @@ def test_road_users_are_where_they_are_at_the_time_of_the_band() -> None:
     )
     T, actors = at_share(request, 0.5)
     assert (T[0, 3], actors["a"][0, 3], actors["b"][0, 3]) == pytest.approx((0.5, 5.5, 9.0))
-
-
-def test_a_picture_of_one_row_is_exposed_at_the_end() -> None:
-    assert rolling(4, 1, "rows", False).tolist() == [[1.0]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from alpasim_plugin.core.stage import Stage, announce, shown_in, stages_in
+from alpasim_plugin.core.stage import announce, shown_in, stages_in
 
 
 def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path: Path) -> None:
@@ -20,8 +20,3 @@ def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path: Path) -> None:
         assert len(stages_in(tmp_path / "stages")) == 1
     (tmp_path / "stages" / "1").unlink()
     assert stages_in(tmp_path / "stages") == []
-
-
-def test_an_estimate_needs_something_done() -> None:
-    assert "30 s left" in Stage("fitting", 100.0, 1, 4).text(110.0)
-    assert "left" not in Stage("loading", 100.0).text(110.0)

@@ -272,7 +272,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 ALL_AT_ONCE = [
     ["compare", "run"],
-    ["list", "policies"],
     ["run", "--dry-run", *DRIVE[1:], "smoke/straight"],
     ["run", "--dry-run", *DRIVE[1:], "scene.yaml"],
 ]

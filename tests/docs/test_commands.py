@@ -71,11 +71,6 @@ def test_every_command_of_the_pages_is_understood() -> None:
     assert len(RUN) > 20
 
 
-def test_a_command_with_a_word_too_many_is_not_understood() -> None:
-    with pytest.raises(Exception, match="No such option"):
-        parse(["--rendrer", "clean", "smoke/curve"])
-
-
 def test_every_verb_is_on_a_page() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages(REPO))
     own = [verb for group in PANELS.values() for verb in group]

@@ -127,8 +127,3 @@ def test_the_command_works_beside_what_it_needs(
         # A check of 100 ms a call says what it found, not whether this machine was busy.
         assert done.returncode in ((0, 1) if words[0] == "check" else (0,)), done.stderr[-3000:]
         assert "Traceback" not in done.stderr
-
-
-def test_the_pages_have_such_commands() -> None:
-    lines = [" ".join(one.words) for one in COMMANDS]
-    assert all(any(address in line for line in lines) for address in (*BESIDE, CONTROL_UNIT[0]))

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from docs.scripts.site import on_page_markdown, on_post_page
+from docs.scripts.site import on_page_markdown
 from tests.docs.test_pages import LINK, without_code
 
 
@@ -23,11 +23,6 @@ def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo: Path) -> 
     links = [link for link in LINK.findall(without_code(text)) if not re.match(r"[a-z]+:", link)]
     assert links
     assert [link for link in links if not (repo / "docs" / link.split("#")[0]).is_file()] == []
-
-
-def test_search_from_disk_asks_nobody() -> None:
-    page = '<script src="https://unpkg.com/iframe-worker/shim"></script>'
-    assert "https://" not in on_post_page(page)
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.build import import_drive
 from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_transforms
@@ -173,17 +172,6 @@ def test_a_colmap_model_that_is_cut_off_is_named(tmp_path: Path, name: str) -> N
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError):
         import_drive(folder, tmp_path / "out")
-
-
-def test_an_unknown_form_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "odd").mkdir()
-    (tmp_path / "odd/notes.txt").write_text("none")
-    assert (
-        run_command(
-            ["import", "drive", str(tmp_path / "odd"), "--out", str(tmp_path / "out"), "--json"]
-        )
-        == 2
-    )
 
 
 def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path: Path, walk: Path) -> None:

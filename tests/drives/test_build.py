@@ -18,7 +18,6 @@ from alpasim_plugin.drives.build import import_drive
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.source import Points
-from alpasim_plugin.gaussians.fit.photographs import read_views
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.drives.street import COUNT, STEP_M, Street, write_kitti, write_transforms
@@ -56,14 +55,6 @@ def test_the_wheels_stand_on_the_road_that_bows(imported: Path) -> None:
     ego = scenario.ego_log.xyz
     assert np.abs(ego[:, 2] - height_at(scenario.ground, ego)).max() < 0.05
     assert np.linalg.norm(np.diff(ego, axis=0), axis=1) == pytest.approx(STEP_M, abs=0.02)
-
-
-def test_the_photographs_are_read_by_the_one_reader(imported: Path) -> None:
-    views, points = read_views(imported)
-    assert len(views) == 2 * COUNT
-    assert points is not None
-    first = next(one for one in load_scenario(imported / "scenario.yaml").recording)
-    assert np.allclose(views[0].camera.K, first.K)
 
 
 def test_the_same_command_again_gives_the_same_and_another_import_is_refused(
@@ -123,17 +114,6 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
     shown = build.shown_photographs(drive, placed)
     assert sum(one.use == "held-out" for one in shown) == 5
     assert any("photographs taken along a road" in note for note in placed.notes)
-
-
-def test_views_are_half_as_wide_and_their_longer_side_is_not_small(
-    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drive = read_source(walk)
-    shown = build.Shown(drive.pictures[0], "front", "fitted", np.eye(4), "a.png", {})
-    monkeypatch.setattr(build, "FIT_PX", 200)
-    assert shown.view().rgb.shape == (80, 200, 3)  # of 320 x 128
-    monkeypatch.setattr(build, "FIT_PX", 100)
-    assert shown.view().rgb.shape == (64, 160, 3)
 
 
 def test_the_command_tells_what_it_found(

@@ -10,7 +10,6 @@ import pytest
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.drives.ground import fit_ground
 from alpasim_plugin.drives.source import Points
-from alpasim_plugin.world.ground import height_at
 
 HEIGHT_M = 1.6
 PATH_X = np.arange(0.0, 60.0, 1.0)
@@ -75,11 +74,3 @@ def test_too_few_points_are_no_ground() -> None:
     )
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert fit_ground(nothing, path()) is None
-
-
-def test_its_height_field_agrees_with_it_along_the_path() -> None:
-    xy = stream("ground", 0, "road").uniform([0, -3], [60, 3], (1500, 2))
-    strip = fit_ground(points_on(xy), path())
-    assert strip is not None
-    along = np.column_stack([PATH_X, 0.3 * np.ones(len(PATH_X))])
-    assert np.abs(height_at(strip.field(), along) - strip.z(along)).max() < 0.03

@@ -138,10 +138,3 @@ def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_
         assert bool(series.valid.all()) is valid
         assert (np.nanmax(series.value) if valid else 0.0) == touched
         assert ("not looked for" in values["collision_any"].reason) is not valid
-
-
-def test_what_stands_in_the_model_is_not_drawn_once_more() -> None:
-    from alpasim_plugin.runs.loop_state import drawn
-
-    poses = {"obstacle-001-within-0.1m": np.eye(4), "car-7": np.eye(4)}
-    assert list(drawn(poses)) == ["car-7"]

@@ -15,7 +15,7 @@ from alpasim_plugin.drives.build import _points
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, place
 from alpasim_plugin.drives.source import SourceDrive, checked
-from tests.drives.street import COUNT, STEP_M, write_colmap, write_kitti, write_transforms
+from tests.drives.street import COUNT, STEP_M, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
 
@@ -92,27 +92,6 @@ def test_photographs_are_freed_of_every_lens(
     ).mean()
     assert off < 6.0
     assert np.abs(straight.rgb()[inner].astype(float) - bent.rgb()[inner]).mean() > 2 * off
-
-
-@pytest.mark.slow
-def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
-    folder = write_kitti(tmp_path / "sequences/07")
-    for old, new in (("image_l", "image_2"), ("image_r", "image_3")):
-        (folder / old).rename(folder / new)
-    rows = (folder / "calib.txt").read_text().splitlines()
-    (folder / "calib.txt").write_text(
-        "\n".join(f"P{i}: {rows[i % 2]}" for i in range(4)) + "\nTr: " + rows[0]
-    )
-    (tmp_path / "poses").mkdir()
-    (folder / "poses.txt").rename(tmp_path / "poses/07.txt")
-    (folder / "times.txt").write_text("\n".join(f"{0.12 * i:.4e}" for i in range(COUNT)))
-    drive, placed = opened(folder)
-    assert drive.never_fitted == ("right",)
-    assert [one.t_us for one in drive.of("left")[:3]] == [0, 120_000, 240_000]
-    assert_is_the_street(placed)
-    assert np.linalg.norm(
-        placed.mounts["right"][:3, 3] - placed.mounts["left"][:3, 3]
-    ) == pytest.approx(0.54, abs=0.01)
 
 
 def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:

@@ -115,7 +115,7 @@ def test_nothing_is_decided_on_nothing():
 
 def test_the_scenes_that_a_good_answer_takes_are_counted_before_any_is_driven():
     question = asked(("offroad", 0.2), ("progress", 0.1))
-    least = least_scenes(question)
+    least = least_scenes(question, 100)
     for n, answer in ((least - 1, "open"), (least, "good")):
         values = {"offroad": np.zeros(n), "progress": np.zeros(n)}
         assert state_after(question, values, n).answer == answer

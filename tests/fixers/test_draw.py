@@ -99,18 +99,6 @@ def test_layers_have_their_colours():
         assert lit(image, np.array(COLOURS[name]) * 0.94, 20).sum() > 3, name
 
 
-def test_concave_area_stays_concave():
-    ring = line((6, -3, 0), (6, 3, 0), (12, 3, 0), (7, 0, 0), (12, -3, 0))
-    image = draw_map(prepare_map(replace(EMPTY, crosswalks=(ring,))), PIN, at(z=3.0))
-
-    def pixel(x, y):
-        return image[int(72 + 128 * 3.0 / x), int(128 - 128 * y / x)]
-
-    assert pixel(6.4, 0.0).any()
-    assert pixel(9.0, 2.4).any()
-    assert not pixel(10.0, 0.0).any()
-
-
 @pytest.mark.slow
 def test_road_users_go_from_the_front_colour_to_the_back_colour():
     side_on = draw_map(
@@ -261,13 +249,6 @@ def test_utm_sized_coordinates_draw_the_same_picture():
     assert (np.abs(near.astype(int) - far).max(axis=2) > 1).mean() < 1e-3
 
 
-def test_many_lines_do_not_overflow_the_buffers():
-    lines = tuple(line((5 + 0.01 * k, -3, 0), (5 + 0.01 * k, 3, 0)) for k in range(9000))
-    image = draw_map(prepare_map(replace(EMPTY, road_edges=lines)), PIN, at())
-    assert len(draw._buffers.strokes) > 9000
-    assert image[100, 128].any()
-
-
 # --- the twin
 
 
@@ -307,17 +288,6 @@ def test_raster_equals_the_plain_one_bit_by_bit():
     assert (fast.max(axis=2) > 0).mean() > 0.1
 
 
-def test_few_pieces_draw_what_dense_points_draw():
-    scene, boxes = street()
-    fast, twin = (
-        draw_map(scene, PIN, at(), boxes),
-        draw_map_reference(scene, PIN, at(), boxes, angle_rad=COARSE_RAD),
-    )
-    difference = np.abs(twin.astype(int) - fast).max(axis=2)
-    assert (difference > 16).mean() < 0.005
-    assert (difference > 100).mean() < 0.001
-
-
 @settings(max_examples=examples(25), deadline=None)
 @given(
     a=st.tuples(*[st.floats(-30, 60)] * 2, st.floats(-3, 6)),
@@ -336,25 +306,6 @@ def test_any_line_is_drawn_like_its_dense_points(a, b, yaw):
     assert only_one.sum() <= 0.15 * both  # rim pixels: a quarter of a pixel of bend
     same = ~only_one
     assert (np.abs(fast.astype(int) - twin).max(axis=2)[same] > 16).mean() < 0.002
-
-
-@settings(max_examples=examples(15), deadline=None)
-@given(x=st.floats(-4, 30), y=st.floats(-8, 8), yaw=st.floats(-3.1, 3.1))
-@pytest.mark.slow
-def test_any_box_is_drawn_like_its_small_pieces(x, y, yaw):
-    scene, boxes = prepare_map(EMPTY), (ActorBox(se2(x, y, yaw, 0.8), CAR, "car"),)
-    fast, twin = (
-        draw_map(scene, SMALL, at(), boxes),
-        draw_map_reference(scene, SMALL, at(), boxes, angle_rad=COARSE_RAD),
-    )
-    assert (np.abs(fast.astype(int) - twin).max(axis=2) > 40).mean() < 0.01
-
-
-def test_threads_do_not_change_the_picture():
-    scene, boxes = street()
-    np.testing.assert_array_equal(
-        draw_map(scene, PIN, at(), boxes, threads=1), draw_map(scene, PIN, at(), boxes, threads=3)
-    )
 
 
 @pytest.mark.parametrize(

@@ -132,16 +132,6 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
     np.testing.assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
 
 
-def test_a_camera_that_looks_up_sees_no_ground_and_no_picture_gives_none() -> None:
-    up = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, HEIGHT_M], [0, 0, 0, 1]])
-    view = WarpTarget(K, up, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {})
-    assert not ground_hypothesis(view, rig(0.0)).any()
-    pictures = [recorded(9.0), recorded(8.0)]
-    for image, picture in zip(carry(pictures, view, rig(0.0)), pictures, strict=True):
-        np.testing.assert_array_equal(image, warp(picture, view))
-    assert carry([], WarpTarget(K, *street(10.0)[:2], NOBODY, {}), rig(10.0)) == ()
-
-
 def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     box, then = {"car": Box(4.0, 2.0, 1.5)}, se2(17.0, 0.0, 0.0, 0.75)
     T, depth, rgb = street(9.0)

@@ -125,11 +125,6 @@ def test_dashes_lie_on_their_line_and_are_as_long_as_they_should(points, on, off
             assert np.linalg.norm(p - (a + f[:, None] * (b - a)), axis=1).min() < 1e-6
 
 
-def test_dashes_of_a_line_without_length_are_none():
-    assert cut_dashes(np.zeros((3, 3)), 3.0, 9.0) == []
-    assert cut_dashes(np.zeros((1, 3)), 3.0, 9.0) == []
-
-
 RINGS = {
     "square": [(0, 0), (1, 0), (1, 1), (0, 1)],
     "clockwise": [(0, 0), (0, 1), (1, 1), (1, 0)],
@@ -179,15 +174,6 @@ def test_star_shaped_rings_are_filled(radii):
     ring = np.column_stack([np.cos(angle), np.sin(angle)]) * np.array(radii)[:, None]
     area = sum(triangle.area for triangle in filled(ring))
     assert area == pytest.approx(shapely.Polygon(ring).area, rel=1e-9)
-
-
-def test_each_lobe_of_a_ring_that_crosses_itself_is_filled():
-    ring = np.array([(0, 0), (2, 2), (2, 0), (0, 2.0)])
-    assert sum(triangle.area for triangle in filled(ring)) == pytest.approx(2.0)
-
-
-def test_ring_without_area_is_filled_with_nothing():
-    assert filled(np.array([(0, 0), (1, 1), (2, 2.0)])) == []
 
 
 def test_labels_are_found_in_any_case():

@@ -132,14 +132,6 @@ def test_a_missing_map_is_a_black_one(bundle: Path) -> None:
     assert not np.array_equal(pixels(run(session(bundle), FRAMES, MAPS)), without)
 
 
-def test_more_steps_sample_from_noisier_sources(bundle: Path) -> None:
-    two = make_fixer("onefixer@2", at(bundle, "steps=[1000,500]"), scene_id="scene")
-    assert two.label == "onefixer@2, 9 updates, steps [1000.0, 500.0] instead of [1000.0], fp32"
-    assert not np.array_equal(
-        pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1]))
-    )
-
-
 def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
     expected = run(session(bundle), FRAMES[:3])
     fixer = session(bundle)
@@ -265,20 +257,6 @@ def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading: Path) -> 
     assert 0 <= none.facts["guessed_share"] <= 1
 
 
-def test_the_facts_of_a_frame_do_not_depend_on_the_number_of_threads(reading: Path) -> None:
-    before, found = torch.get_num_threads(), []
-    for threads in (1, 2, 3):
-        fixer = session(reading, "holes=render", "precision=fp32")
-        torch.set_num_threads(threads)
-        found.append(fixer.step([with_reference(FRAMES[0], 90)], MAPS[:1])[0].facts)
-    torch.set_num_threads(before)
-    assert found[0] == found[1] == found[2]
-    (half,) = session(reading, "holes=render", "precision=bf16").step(
-        [with_reference(FRAMES[0], 90)], MAPS[:1]
-    )
-    assert half.facts["recorded_share"] == pytest.approx(found[0]["recorded_share"], abs=0.02)
-
-
 def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading: Path) -> None:
     front, side = (
         with_reference(FRAMES[0], 90),
@@ -296,17 +274,3 @@ def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading: Pa
     )
     (out,) = session(reading, "holes=render").step([with_reference(grey, 240)], [])
     assert out.rgb.mean() > 200
-
-
-def test_a_reference_of_another_size_is_refused(reading: Path) -> None:
-    wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), np.uint8),))
-    with pytest.raises(InputError):
-        session(reading).step([wrong], MAPS[:1])
-
-
-def test_weights_that_read_no_references_leave_them_alone(bundle: Path) -> None:
-    plain, given = (
-        session(bundle).step([frame], MAPS[:1])[0]
-        for frame in (FRAMES[0], with_reference(FRAMES[0], 200))
-    )
-    assert np.array_equal(plain.rgb, given.rgb)

@@ -63,14 +63,6 @@ def test_the_order_of_references_does_not_matter() -> None:
     assert torch.allclose(one, other, atol=1e-5)
 
 
-def test_an_untrained_head_leaves_most_of_the_picture_to_the_generator() -> None:
-    net = PixelGenerator.random(SIZES, 0).eval().requires_grad_(False)
-    render, opacity, sdmap, images = inputs(2)
-    images[..., 3] = 1
-    _, state = call(net, render, opacity, sdmap, images)
-    assert 0 < float(state.recorded.max()) < 0.2
-
-
 @pytest.mark.parametrize(("batch", "references"), [(1, 0), (1, 1), (2, 3)])
 def test_the_operations_of_a_processor_give_the_same_frame(batch: int, references: int) -> None:
     net = trained_like()
@@ -112,11 +104,6 @@ def test_a_network_that_sees_smaller_images_blends_at_full_size(references: int)
             align_corners=False,
         )
         assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
-
-
-def test_sizes_with_a_blending_head_are_read_off_the_tensors() -> None:
-    net = trained_like()
-    assert PixelGenerator.from_state_dict(net.state_dict()).sizes == SIZES
 
 
 def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on() -> None:

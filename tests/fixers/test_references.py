@@ -77,17 +77,6 @@ def test_a_frame_warped_into_its_own_view_is_itself() -> None:
     assert np.abs(out[..., :3].astype(int) - one.rgb).max() <= 1
 
 
-def test_a_wall_seen_from_nearer_is_larger() -> None:
-    far, near = at(0.0), at(10.0)
-    out = warp(
-        picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {})
-    )
-    # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
-    expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
-    assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
-    assert (out[..., 3] == VALID).all()
-
-
 def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there() -> None:
     here = at(0.0)
     seen, depth = wall(20.0, here), wall(20.0, here)
@@ -257,14 +246,6 @@ def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
     return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
 
 
-def test_a_recorded_frame_is_read_when_it_is_first_needed_and_then_kept() -> None:
-    found, reads = session()
-    for step in range(5):
-        references = found.of(*request(10.0 + 0.02 * step, 500_000 + step))
-        assert [image.shape for image in references] == [(HEIGHT, WIDTH, 4)] * 2
-    assert len(reads) == 2
-
-
 def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted() -> None:
     asked, frame = request(10.0, 500_000)
     frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
@@ -277,12 +258,6 @@ def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted(
     ):
         np.testing.assert_array_equal(image, same)
         assert (image != of_lower_road).any()
-
-
-def test_a_frame_without_depth_has_no_references() -> None:
-    found, _ = session()
-    asked, frame = request(10.0, 0)
-    assert found.of(asked, Frame(0, "front", frame.rgb)) == ()
 
 
 def test_without_memory_the_same_view_has_the_same_references_whatever_came_before() -> None:

@@ -23,17 +23,6 @@ def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_
     assert difference.max_levels == np.abs(d).max()
 
 
-def test_equal_streams_have_no_difference() -> None:
-    difference = Difference()
-    difference.add(np.full((4, 4, 3), 200, np.uint8), np.full((4, 4, 3), 200, np.uint8))
-    assert difference.psnr_db == float("inf")
-    assert (difference.mean_levels, difference.max_levels) == (0, 0)
-
-
-def test_a_stream_without_frames_yields_no_block() -> None:
-    assert list(refine_frames([], make_fixer("identity", scene_id="video"))) == []
-
-
 def test_blocks_are_made_as_they_are_asked_for() -> None:
     taken = []
 

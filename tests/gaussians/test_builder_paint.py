@@ -43,11 +43,6 @@ def two_by_two() -> tuple[Strokes, F64]:
     )
 
 
-def test_unknown_paint_is_nothing() -> None:
-    strokes, _ = strokes_of(make_scenario(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r")), PATH))
-    assert len(strokes.start) == 0
-
-
 def test_unknown_edge_between_lanes_of_one_direction_is_dashed_white(
     two_by_two: tuple[Strokes, F64],
 ) -> None:
@@ -107,14 +102,6 @@ def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
     assert length(strokes, chosen) == pytest.approx(80, rel=0.02)
 
 
-def test_edge_known_to_be_bare_stays_bare() -> None:
-    lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
-    lanes["r-a1"] = replace(lanes["r-a1"], left_paint="none")
-    _, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
-    assert not at(middle, -LANE_M).any()
-    assert at(middle, LANE_M).any()
-
-
 def test_nothing_unknown_is_painted_inside_an_intersection() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 1, is_intersection=True)
     strokes, _ = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
@@ -140,10 +127,3 @@ def test_zebra_bars_lie_along_the_road_across_the_walk() -> None:
     assert np.abs(direction[:, 1]).max() < 0.01
     assert len(strokes.start) >= 14
     np.testing.assert_allclose(np.diff(np.sort(middle[:, 1])), 0.9, atol=0.02)
-
-
-def test_stop_line_is_wide_and_white() -> None:
-    stop = np.array([[20.0, -3.0, 0], [20.0, 0.0, 0]])
-    strokes, _ = strokes_of(make_scenario(LaneMap({}, stop_lines=(stop,)), PATH))
-    assert strokes.width_m.tolist() == [0.4]
-    assert strokes.colour.tolist() == [WHITE]

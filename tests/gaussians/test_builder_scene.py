@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
-from alpasim_plugin.core.types import Environment, LaneMap, Route, Scenario, Trajectory
+from alpasim_plugin.core.types import Environment, LaneMap, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import placed_cloud
 from alpasim_plugin.gaussians.scene import scene_graph
@@ -63,17 +63,6 @@ def street() -> tuple[Scenario, SceneGraph]:
 
 def test_same_scenario_builds_bit_identical_gaussians(street: tuple[Scenario, SceneGraph]) -> None:
     assert digest(street[1]) == digest(built(straight()))
-
-
-@pytest.mark.slow
-def test_another_scene_seed_builds_another_scene(street: tuple[Scenario, SceneGraph]) -> None:
-    assert digest(street[1]) != digest(built(straight(seed=1)))
-
-
-def test_every_gaussian_can_be_drawn(street: tuple[Scenario, SceneGraph]) -> None:
-    for node in (*street[1].background, *street[1].actors.values()):
-        for level in node.levels:
-            level.cloud.require_drawable(node.name)
 
 
 @lru_cache(maxsize=3)
@@ -144,56 +133,6 @@ def test_houses_leave_road_actors_and_each_other_alone() -> None:
         plan = site.frame.to_ground(node.levels[0].cloud.means.astype(np.float64))
         assert site.look_up(site.off_road_m, plan).min() > 1.5
         assert not site.look_up(site.taken, plan).any()
-
-
-def test_environment_without_houses_trees_and_poles_builds_none() -> None:
-    scenario = straight(
-        environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0)
-    )
-    kinds = {n.name.split("/")[0] for n in built(scenario).background}
-    assert kinds == {"ground", "far-ground", "paint", "surroundings", "kerb"}
-
-
-@pytest.mark.slow
-def test_everything_follows_a_sloping_ground() -> None:
-    scenario, graph = empty_street(curve)
-    for node in graph.background:
-        if node.name.startswith(("ground/", "paint/")):
-            means = node.levels[0].cloud.means.astype(np.float64)
-            above = means[:, 2] - height_at(scenario.ground, means)
-            assert above.min() > -0.04
-            assert above.max() < 0.14
-
-
-@pytest.mark.slow
-def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
-    shift = np.array([4.0e5, -3.0e5, 0.0])
-    near, graph = empty_street(straight)
-    lanes = {}
-    for k, v in near.lane_map.lanes.items():
-        assert v.left is not None
-        assert v.right is not None
-        lanes[k] = replace(v, centre=v.centre + shift, left=v.left + shift, right=v.right + shift)
-    moved = {
-        name: tuple(c + shift for c in getattr(near.lane_map, name))
-        for name in ("crosswalks", "stop_lines")
-    }
-    far = replace(
-        near,
-        lane_map=LaneMap(lanes, **moved),
-        ego_log=replace(near.ego_log, xyz=near.ego_log.xyz + shift),
-        route=Route(near.route.xyz + shift),
-    )
-    a, b = graph.render(view(near, 5), {}), built(far).render(view(far, 5), {})
-    assert np.abs(a.rgb - b.rgb).mean() < 1e-3
-
-
-@pytest.mark.slow
-def test_parked_log_of_one_pose_still_gives_a_scene() -> None:
-    base = straight(actors=())
-    log = Trajectory(np.array([0]), base.ego_log.xyz[:1], base.ego_log.quat[:1])
-    scenario = replace(base, ego_log=log, route=Route(base.ego_log.xyz[:1]), end_us=0)
-    assert built(scenario).render(view(scenario, 0), {}).alpha[100:].min() > 0.8
 
 
 def test_map_without_edges_gets_a_road_around_its_centres() -> None:

@@ -19,13 +19,6 @@ def test_pose_and_its_inverse_describe_one_camera():
     assert np.abs(cam.centre_world - T[:3, 3]).max() < 1e-12
 
 
-def test_field_of_view_spans_the_width():
-    cam = PinholeCamera.from_hfov(200, 100, np.deg2rad(90))
-    assert (cam.fx, cam.fy, cam.cx, cam.cy) == pytest.approx((100, 100, 100, 50))
-    low_x, high_x, low_y, high_y = cam.slope_limits()
-    assert (low_x, high_x, low_y, high_y) == pytest.approx((-1.3, 1.3, -0.65, 0.65))
-
-
 def test_slope_limits_follow_an_off_centre_principal_point():
     low_x, high_x, _, _ = PinholeCamera(
         40, 20, K + np.array([[0, 0, 10.0], [0, 0, 0], [0, 0, 0]]), np.eye(4)
@@ -49,8 +42,3 @@ def test_intrinsics_that_are_no_pinhole_are_an_error(row, column, value):
     bad[row, column] = value
     with pytest.raises(InputError):
         PinholeCamera(40, 20, bad, np.eye(4))
-
-
-def test_a_mirror_is_no_pose():
-    with pytest.raises(InputError):
-        PinholeCamera(40, 20, K, np.diag([1.0, 1, -1, 1]))

@@ -13,7 +13,6 @@ from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.renderers.background import coverage_of
-from scenarios.load import load_scenario
 
 PATH = np.stack([np.linspace(0.0, 80.0, 81), np.zeros(81), np.zeros(81)], axis=1)
 ROAD = """
@@ -89,14 +88,3 @@ def test_a_file_that_cannot_be_seen_is_refused_until_it_is_placed(
         r"background .*lying.ply: it spans x .* and covers \d+ % of the route; it replaces the built road",
         told,
     )
-
-
-def test_the_road_is_kept_on_request(tmp_path: Path) -> None:
-    from alpasim_plugin.renderers.gaussian import scene_of
-
-    write_ply(tmp_path / "street.ply", placed_cloud(street(), se2(20.0, 0.0, 0.0)))
-    counts = []
-    for more in ("", ", keep_road: true"):
-        (tmp_path / "scene.yaml").write_text(ROAD + f"background: {{file: street.ply{more}}}\n")
-        counts.append(len(scene_of(load_scenario(tmp_path / "scene.yaml"))))
-    assert counts[1] > counts[0] > 1000

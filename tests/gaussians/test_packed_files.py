@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians import GaussianCloud, read_ply
+from alpasim_plugin.gaussians import read_ply
 from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
@@ -74,21 +74,6 @@ def test_both_bikers_agree_after_the_axis_flip(biker: Path) -> None:
     assert ply.means[:, 0].min() - flipped[:, 0].min() == pytest.approx(8.2e-5, abs=5e-7)
     for end in (np.min, np.max):
         assert np.abs(end(ply.means, axis=0) - end(flipped, axis=0)).max() < 0.5 / 4096
-
-
-def test_both_bikers_are_one_model_in_one_place(biker: Path) -> None:
-    ply, _ = read_gaussians(biker / "biker.compressed.ply")
-    spz, report = read_gaussians(biker / "biker.spz")
-    assert report.n_kept == 152746
-    assert (
-        np.abs(ply.means - spz.means).max() <= 0.5 / 4096 * 1.01
-    )  # half a step of 12 fractional bits
-    np.testing.assert_array_equal(ply.opacities, spz.opacities)
-    same = np.abs(np.sum(ply.quats * spz.quats, axis=1))
-    assert np.quantile(same, 0.001) > 0.99999
-    log_scales = np.maximum(np.log(ply.scales), -10)  # SPZ holds nothing smaller than exp(-10)
-    assert np.abs(log_scales - np.log(spz.scales)).max() < 1 / 32 + 1e-6  # half a step of 1/16
-    assert np.abs(ply.sh - spz.sh).max() < 0.5 / 255 / 0.15 * 1.05
 
 
 @pytest.mark.parametrize("name", ["biker.compressed.ply", "biker.spz"])
@@ -164,12 +149,6 @@ def test_harmonics_element_is_channel_major(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.delete(raw.sh[0, 1:].ravel(), 3), 0.5 / 256 * 8)
 
 
-def test_chunks_that_do_not_cover_the_gaussians_are_refused(tmp_path: Path) -> None:
-    path = write_compressed(tmp_path / "a.compressed.ply", 257, 1, (0, 0, 0, 0))
-    with pytest.raises(InputError):
-        read_compressed_ply(path)
-
-
 @pytest.mark.parametrize("largest", range(4))
 def test_left_out_component_is_restored_in_its_place(largest: int) -> None:
     quat = np.array([0.1, -0.2, 0.3, 0.15])
@@ -197,13 +176,6 @@ def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, bik
     angle = 2 * np.arccos(np.clip(np.abs(np.sum(back.quats * cloud.quats, axis=1)), 0, 1))
     # Each component is off by up to 1/256, and +1 is stored as 127/128.
     assert angle.max() < 2 * np.sqrt(4) / 128
-
-
-def test_splat_written_twice_is_the_same(tmp_path: Path, biker: Path) -> None:
-    cloud, _ = read_gaussians(biker / "train-1000.ply")
-    write_splat(tmp_path / "a.splat", cloud)
-    write_splat(tmp_path / "b.splat", GaussianCloud(*read_splat(tmp_path / "a.splat")[:5]))
-    assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "b.splat").read_bytes()
 
 
 def test_splat_bytes_worked_by_hand(tmp_path: Path) -> None:
@@ -300,14 +272,6 @@ def test_turning_axes_turns_colour_with_direction(tmp_path: Path) -> None:
     np.testing.assert_allclose(after, before, atol=1e-5)
 
 
-def test_turning_axes_turns_the_ellipsoids(tmp_path: Path) -> None:
-    path = write_spz(tmp_path / "a.spz", 3, 6, 0, body_streams(3, 6, 0))
-    flip = np.diag([1.0, -1.0, -1.0])
-    turned = read_spz(path)
-    before, after = (GaussianCloud(*one[:5]).covariances() for one in (as_stored(turned), turned))
-    np.testing.assert_allclose(after, flip @ before @ flip, rtol=1e-5, atol=1e-12)
-
-
 def test_fourth_degree_is_cut_and_noted(tmp_path: Path) -> None:
     cloud, report = read_gaussians(write_spz(tmp_path / "a.spz", 4, 2, 4, body_streams(4, 2, 4)))
     assert cloud.sh.shape == (2, 16, 3)
@@ -321,12 +285,6 @@ def test_count_beyond_the_data_is_refused_without_unpacking_it(
     path = write_spz(
         tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000
     )
-    with pytest.raises(InputError):
-        read_spz(path)
-
-
-def test_absurd_count_is_refused(tmp_path: Path) -> None:
-    path = write_spz(tmp_path / "a.spz", 3, 2, 0, body_streams(3, 2, 0), claim=4_000_000_000)
     with pytest.raises(InputError):
         read_spz(path)
 
@@ -363,8 +321,3 @@ def test_unknown_form_lists_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_bytes(b"PK\x03\x04....")
     with pytest.raises(InputError):
         read_gaussians(tmp_path / "a.gltf")
-
-
-def test_missing_file_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        read_gaussians(tmp_path / "absent.spz")

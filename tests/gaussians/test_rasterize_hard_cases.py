@@ -13,7 +13,6 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
-from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, EPS2D_PX2, MIP_PX2
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.gaussians.gaussian_scenes import (
@@ -99,23 +98,6 @@ def test_ten_splats_of_a_kilometre_are_exact(backend):
     )
 
 
-def test_ten_splats_of_a_kilometre_take_bounded_time():
-    rng = np.random.default_rng(0)
-    cloud = splats(
-        rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]),
-        1000.0,
-        0.3,
-        rng.uniform(0, 1, (10, 3)),
-    )
-    cam = camera(960, 544, 700.0)
-    rasterize(cloud, cam)
-    begin = time.perf_counter()
-    for _ in range(5):
-        rasterize(cloud, cam)
-    # Ten evaluations per pixel: milliseconds. A rule that lets work explode takes seconds.
-    assert (time.perf_counter() - begin) / 5 < 0.25
-
-
 @pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("length_px", [10, 1_000, 10_000, 100_000])
 def test_needles_at_every_angle_match_float64(backend, length_px):
@@ -191,18 +173,6 @@ def test_largest_scale_that_loading_admits_gives_no_nan(backend):
 
 
 @pytest.mark.parametrize("backend", ["reference", *FAST])
-def test_length_of_a_quaternion_does_not_matter(backend):
-    cloud = random_cloud(150, 3)
-    scaled = GaussianCloud(cloud.means, cloud.quats * 7.0, cloud.scales, cloud.opacities, cloud.sh)
-    assert_same_image(
-        rasterize(scaled, camera(), backend=backend),
-        rasterize(cloud, camera(), backend=backend),
-        1e-5,
-        odd_share=2e-4,
-    )
-
-
-@pytest.mark.parametrize("backend", ["reference", *FAST])
 def test_stack_of_opaque_walls_ends_at_099_because_the_second_layer_is_left_out(backend):
     cloud = GaussianCloud.concatenate(
         [splats([0, 0, z], 50.0, 1.0, (1.0, 0.5, 0.0)) for z in np.linspace(4, 9, 10)]
@@ -212,20 +182,6 @@ def test_stack_of_opaque_walls_ends_at_099_because_the_second_layer_is_left_out(
     assert out.alpha.min() == pytest.approx(ALPHA_MAX, abs=1e-6)
     assert out.depth == pytest.approx(np.full(out.depth.shape, 4.0), abs=1e-4)
     assert out.rgb[0, 0] == pytest.approx([0.99, 0.495, 0.01], abs=1e-5)
-
-
-@pytest.mark.parametrize("backend", FAST)
-def test_layers_just_below_saturation_stop_where_the_definition_stops(backend):
-    for opacity in (0.5, 0.8, 0.9, 0.95, 0.985):
-        cloud = GaussianCloud.concatenate(
-            [splats([0, 0, z], 50.0, opacity, (1.0, z / 30, 0.0)) for z in np.linspace(4, 25, 30)]
-        )
-        want = rasterize_reference(cloud, camera(), brute=True)
-        # Four layers of 0.9 leave 1e-4, the stop itself: there rounding decides, by less than 1e-3
-        # of full scale.
-        assert_same_image(
-            rasterize(cloud, camera(), backend=backend), want, 1e-3 if opacity == 0.9 else 2e-5
-        )
 
 
 @pytest.mark.parametrize("backend", FAST)
@@ -271,19 +227,6 @@ def test_equal_depths_keep_input_order(backend):
         assert np.abs(out.rgb - rasterize(apart, camera(), backend="reference").rgb).max() < 0.01
         backwards = rasterize(cloud.take(np.arange(n)[::-1]), camera(), backend=backend)
         assert np.abs(out.rgb - backwards.rgb).max() > 0.05
-
-
-@pytest.mark.parametrize("backend", FAST)
-def test_equal_depths_stay_stable_while_the_camera_moves(backend):
-    """Coincident surfaces keep their order under motion: no flicker decided by rounding."""
-    red, green = wall(5.0, rgb=(1, 0, 0), spread=2.0), wall(5.0, rgb=(0, 1, 0), spread=2.0)
-    both = GaussianCloud.concatenate([red, green])
-    for step in range(5):
-        T = np.eye(4)
-        T[:3, 3] = [0.01 * step, 0.013 * step, 0.1 * step]
-        out = rasterize(both, camera(T_camera_world=T), backend=backend)
-        inner = out.rgb[20:44, 30:66]
-        assert np.all(inner[..., 0] > 3 * inner[..., 1])
 
 
 @pytest.mark.parametrize("backend", FAST)
@@ -372,12 +315,6 @@ def test_near_and_far_splats_in_one_view_keep_precision(backend):
         3e-5,
         odd_share=5e-4,
     )
-
-
-def test_quaternion_product_is_the_product_of_rotations():
-    a, b = random_cloud(20, 1), random_cloud(20, 2)
-    product = GaussianCloud(a.means, quat_multiply(a.quats, b.quats), a.scales, a.opacities, a.sh)
-    assert np.abs(product.rotations() - a.rotations() @ b.rotations()).max() < 1e-12
 
 
 @pytest.mark.parametrize("antialias_px2", [MIP_PX2, EPS2D_PX2])

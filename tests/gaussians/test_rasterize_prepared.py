@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
-import threading
 
 import numpy as np
 import pytest
@@ -56,15 +55,6 @@ def test_nodes_at_poses_equal_one_cloud_moved_there():
         3e-5,
         odd_share=5e-4,
     )
-
-
-def test_actor_at_the_identity_equals_the_same_gaussians_in_the_background():
-    cloud = random_cloud(300, 2)
-    first, second = prepare(cloud.take(np.arange(150))), prepare(cloud.take(np.arange(150, 300)))
-    split = rasterize_prepared([(first, None), (second, np.eye(4))], camera())
-    whole = rasterize_prepared([(prepare(cloud), None)], camera())
-    assert np.array_equal(split.rgb, whole.rgb)
-    assert np.array_equal(split.depth, whole.depth)
 
 
 def test_equal_depths_are_drawn_in_node_order():
@@ -203,25 +193,6 @@ def test_any_number_of_threads_gives_the_same_bits(n):
             assert one.stats == other.stats
 
 
-def test_two_python_threads_may_render_at_once():
-    scene, cam = prepare(driving_like_scene(20_000)), driving_camera(128, 72)
-    want = rasterize_prepared([(scene, None)], cam, threads=1).rgb
-    found: list[bool] = []
-
-    def work() -> None:
-        found.extend(
-            np.array_equal(want, rasterize_prepared([(scene, None)], cam, threads=2).rgb)
-            for _ in range(10)
-        )
-
-    workers = [threading.Thread(target=work) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert found == [True] * 30
-
-
 def _render_in_child(queue) -> None:
     scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
     queue.put(float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum()))
@@ -264,11 +235,6 @@ def test_exponential_of_the_kernels_is_exact_to_two_millionths():
         p = p * y + coefficient
     want = 2.0 ** (8.0 * y.astype(np.float64) - 4.0)
     assert np.abs(((p * p) * (p * p)) ** 2 / want - 1).max() < 2e-6
-
-
-def test_fewer_than_one_thread_is_an_error():
-    with pytest.raises(InputError):
-        rasterize_prepared([], camera(), threads=0)
 
 
 def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monkeypatch):

@@ -50,11 +50,6 @@ def _lanes_with_bit(x, position):
     return v.bits(v.has_bit(v.load(x, 0), position))
 
 
-@njit
-def _counter(cells):
-    return v.fetch_add(cells, 1, 5), v.fetch_add(cells, 1, 7)
-
-
 def test_float_operations_equal_numpy_lane_by_lane():
     x = np.random.default_rng(0).normal(size=32).astype(np.float32)
     a, b = x[:16], x[16:]
@@ -113,9 +108,3 @@ def test_bits_of_integers_are_found_lane_by_lane():
         assert (
             _lanes_with_bit(x, position) == ((1 << np.arange(16))[(x >> position) & 1 == 1]).sum()
         )
-
-
-def test_counter_returns_what_it_held():
-    cells = np.array([0, 10], np.int64)
-    assert _counter(cells) == (10, 15)
-    assert cells.tolist() == [0, 22]

@@ -50,10 +50,6 @@ def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
     assert mask.share(camera(32, 18, x_m=9.0)).max() == 0.0
 
 
-def test_without_views_nothing_is_sky() -> None:
-    assert SkyMask([]).share(camera(8, 4)).max() == 0.0
-
-
 def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None:
     height, width = 2 * STEP_PX + 3, 3 * STEP_PX + 5
     grid = np.random.default_rng(0).uniform(-1e3, 1e3, (4, 5))

@@ -4,9 +4,7 @@ how episodes end.
 
 from __future__ import annotations
 
-import importlib
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -222,14 +220,6 @@ def test_what_makes_no_environment_is_refused() -> None:
     with pytest.raises(InputError):
         env.step(np.array([np.nan, 0.0]))
     env.close()
-
-
-def test_without_gymnasium_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(InputError, match=r"extra \[gym\]"):
-        importlib.reload(doors)
-    monkeypatch.undo()
-    importlib.reload(doors)
 
 
 def blocks(name: str) -> list[str]:

@@ -4,7 +4,6 @@ image.
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from alpasim_plugin.core.geometry import inverse, se2, transform_points
 from alpasim_plugin.core.types import EgoState, Observation
 from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
-from policies.learned import WEIGHTS, Learned
+from policies.learned import Learned
 from policies.learned_input import (
     FOCAL_PX,
     HEIGHT,
@@ -99,15 +98,6 @@ def test_turn_is_announced_and_then_due(left: bool) -> None:
 @pytest.mark.parametrize("radius_m", [1e6, 200.0, 50.0])
 def test_bend_of_the_road_itself_is_no_turn(radius_m: float) -> None:
     assert route_command(route_with_turn(10.0, radius_m, left=True)) == "keep"
-
-
-def test_command_says_nothing_about_the_place_in_the_lane() -> None:
-    for after_m in (3.0, 25.0):
-        words = {
-            route_command(route_with_turn(after_m, 12.0, True, lateral_m))
-            for lateral_m in (-1.5, -0.3, 0.0, 1.5)
-        }
-        assert len(words) == 1
 
 
 def test_route_that_is_over_or_absent_gives_keep() -> None:
@@ -220,20 +210,3 @@ def test_wrong_frame_is_refused() -> None:
     policy = Learned(scenario_with())
     with pytest.raises(PolicyError, match=r"shape \(10, 10, 3\)"):
         policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
-
-
-@pytest.mark.slow
-def test_answer_takes_at_most_ten_milliseconds_on_one_thread() -> None:
-    torch.set_num_threads(1)
-    policy, took = Learned(scenario_with()), []
-    for _ in range(10):
-        policy.reset(0, policy_route())
-        for observation in seen():
-            began = time.thread_time()
-            policy.act(observation)
-            took.append(time.thread_time() - began)
-    assert np.median(took) < 0.010
-
-
-def test_shipped_weights_are_small() -> None:
-    assert WEIGHTS.stat().st_size <= 1_200_000

@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.geometry import arc_lengths, inverse
 from policies.base import _targets
-from policies.lane_filter import LaneState, predict, search, shift, start, update
+from policies.lane_filter import LaneState, predict, search, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from policies.road_vision import (
     PaintPoints,
     RidgeFilter,
     _windows,
-    brightness,
     find_paint,
     make_grid,
 )
@@ -47,15 +46,6 @@ def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera: object) 
             u, v = K[0, 0] * x / z + K[0, 2] - 0.5, K[1, 1] * y / z + K[1, 2] - 0.5
             assert grid.map_u[row, column] == pytest.approx(u, abs=1e-2)
             assert grid.map_v[row, column] == pytest.approx(v, abs=1e-2)
-
-
-def test_grid_rows_are_one_image_row_apart() -> None:
-    steps = -np.diff(GRID.map_v[:, 160])
-    assert np.all((steps > 0.7) & (steps < 1.3))
-
-
-def test_column_lookup_inverts_the_axis() -> None:
-    assert np.allclose(GRID.column_of(GRID.y_m), np.arange(len(GRID.y_m)))
 
 
 # --- ridges
@@ -95,14 +85,6 @@ def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
     value[:] = 90
     value[:, 159:162] = 200
     assert RIDGES.response(value)[5:30, 160].min() > 60.0
-
-
-def test_white_and_yellow_are_both_bright() -> None:
-    ground = np.zeros((1, 3, 3), np.uint8)
-    ground[0] = [(235, 235, 235), (230, 190, 60), (95, 95, 98)]
-    white, yellow, asphalt = brightness(ground)[0]
-    assert white > asphalt + 100
-    assert yellow > asphalt + 100
 
 
 def test_bars_of_a_crosswalk_are_not_taken_for_lines() -> None:
@@ -235,14 +217,6 @@ def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of
         )
 
 
-def test_search_without_enough_paint_finds_nothing() -> None:
-    assert search(paint_of(0, 0, 0, 3.5), np.full(48, 0.01), 0.0, 0.0, 0.0) is None
-
-
-def test_neighbouring_lane_is_one_width_away() -> None:
-    assert shift(start(0.2, 0.0, 0.0, 3.4), 1).mean[0] == pytest.approx(3.6)
-
-
 # --- obstacles
 
 
@@ -270,10 +244,6 @@ def test_pedestrian_in_the_corridor_is_seen_and_beside_it_is_not() -> None:
     person = (0.4, 0.5, 1.75)
     assert foot_in(BusyRoad(blocks=(Block(15.0, 0.3, person, (40, 40, 90)),))) is not None
     assert foot_in(BusyRoad(blocks=(Block(15.0, 2.2, person, (40, 40, 90)),))) is None
-
-
-def test_free_road_has_no_foot() -> None:
-    assert all(foot_in(PaintedRoad(), seed) is None for seed in range(5))
 
 
 def test_low_kerb_stone_is_not_taken_for_a_car() -> None:
@@ -311,17 +281,6 @@ def test_track_needs_three_sightings_and_ends_after_nine_misses() -> None:
         track = track_obstacle(track, None, 0.0, 0.1)
         assert track is not None
     assert track_obstacle(track, None, 0.0, 0.1) is None
-
-
-def test_thing_nearer_than_the_image_reaches_keeps_its_distance() -> None:
-    track = None
-    for k in range(12):
-        track = track_obstacle(track, (max(8.0 - 0.3 * k, 5.5), 0.3), 3.0, 0.1, 5.5)
-    assert track is not None
-    for _ in range(10):
-        track = track_obstacle(track, (5.5, 0.3), 0.0, 0.1, 5.5)
-        assert track is not None
-    assert track.distance_m < 5.5
 
 
 # --- lines

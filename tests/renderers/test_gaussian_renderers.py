@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
@@ -100,14 +99,6 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario: Scenar
     np.testing.assert_array_equal(first.alpha, second.alpha)
 
 
-def test_frame_does_not_depend_on_the_thread_count(scenario: Scenario) -> None:
-    one, two = (
-        make_renderer("clean", scenario, threads=n).render(request(scenario, left_m=1.0))
-        for n in (1, 2)
-    )
-    np.testing.assert_array_equal(one.rgb, two.rgb)
-
-
 def test_renderers_of_one_scenario_share_the_scene(scenario: Scenario) -> None:
     assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation("cycle")))
     assert scene_key(scenario) != scene_key(replace(scenario, seed=1))
@@ -134,26 +125,6 @@ def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario: Scenario) -> N
     np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)
 
 
-def test_unknown_renderer_names_the_nearest_known_one(scenario: Scenario) -> None:
-    with pytest.raises(InputError) as caught:
-        make_renderer("claen", scenario)
-    text = str(caught.value)
-    assert "no renderer has that name" in text
-    assert "did you mean 'clean'?" in text
-    assert "3dgs" in text
-
-
-def test_unknown_device_is_an_error(scenario: Scenario) -> None:
-    with pytest.raises(InputError):
-        make_renderer("clean", scenario, device="tpu")
-
-
-def test_actor_unknown_to_the_scene_is_an_error(scenario: Scenario) -> None:
-    r = request(scenario)
-    with pytest.raises(RendererError):
-        make_renderer("clean", scenario).render(replace(r, actors={"nobody": np.eye(4)}))
-
-
 def test_file_background_replaces_the_street_and_keeps_actors_and_sky(
     scenario: Scenario, tmp_path: object
 ) -> None:
@@ -171,10 +142,3 @@ def test_file_background_replaces_the_street_and_keeps_actors_and_sky(
     assert frame.alpha.max() > 0.9
     without = renderer.render(replace(request(filed), actors={}))
     assert np.any(without.rgb != frame.rgb)
-
-
-def test_missing_background_file_is_a_clear_error(scenario: Scenario) -> None:
-    with pytest.raises(InputError):
-        make_renderer(
-            "clean", replace(scenario, background=BackgroundFile("nowhere.ply", np.eye(4)))
-        )

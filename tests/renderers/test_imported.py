@@ -79,11 +79,6 @@ def test_what_stands_in_the_model_is_not_drawn_once_more(drive: Scenario) -> Non
     assert not renderer.graph.actors
 
 
-def test_clean_is_refused_because_nothing_was_built(drive: Scenario) -> None:
-    with pytest.raises(InputError):
-        make_renderer("clean", drive)
-
-
 def test_a_missing_model_names_the_folder(drive: Scenario, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         make_renderer("3dgs", replace(drive, model=str(tmp_path / "nowhere")))

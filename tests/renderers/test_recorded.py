@@ -11,7 +11,6 @@ import numpy as np
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.fit.views import logged_views
-from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_build import misplaced
 from alpasim_plugin.renderers.reconstruction_key import recipe_of
@@ -40,10 +39,6 @@ def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_t
         assert (rgb.shape, rgb.dtype, depth.shape) == ((36, 64, 3), np.uint8, (36, 64))
         assert (depth[:4] == 0).mean() > 0.5  # sky
         assert (depth[-4:] > 0).all()
-
-
-def test_the_clean_renderer_declares_no_recording() -> None:
-    assert make_renderer("clean", street(Degradation("none"))).recorded() == ()
 
 
 def test_a_recorded_frame_is_believed_where_registration_put_the_views_beside_it() -> None:

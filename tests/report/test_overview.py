@@ -16,16 +16,13 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
-from evaluators.numbers import DASH
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report
 from evaluators.report.ci import overview_md
-from evaluators.report.overview import Overview, decided, overview_of, tone_of
+from evaluators.report.overview import decided, overview_of, tone_of
 from evaluators.report.terminal import overview_lines
 from evaluators.statistics.paired import paired
 from evaluators.viewer import worst
@@ -105,25 +102,6 @@ def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
     assert all(any(name in line for line in lines) for name in names)
 
 
-def test_every_line_is_printed_on_its_own(three: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = overview_lines(overview_of(read_run(three)), 80)
-    show(False, {}, *lines)
-    printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    assert printed == [terminal(line.plain).rstrip() for line in lines]
-
-
-@pytest.mark.parametrize("renderers", [(), ("clean",), ("clean", "3dgs", "onefixer")])
-def test_any_number_of_variants_has_a_first_screen(
-    tmp_path: Path, renderers: tuple[str, ...]
-) -> None:
-    run = read_run(make_run(tmp_path, Plan(renderers, seeds=(0,), steps=20)))
-    shown = overview_of(run)
-    assert len(shown.rows) == len(renderers)
-    assert bool(shown.axis) == (len(renderers) > 1)
-    assert overview_lines(shown, 80)
-    assert overview_md(shown).startswith("## ")
-
-
 def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
     three: Path,
 ) -> None:
@@ -180,13 +158,6 @@ def test_a_distance_that_an_event_cut_short_says_so(three: Path) -> None:
     assert [shown.cells(row)[-2].endswith("*") for row in shown.rows] == [False, True, False]
 
 
-def test_a_missing_number_is_a_dash_and_never_zero(tmp_path: Path) -> None:
-    plan = Plan(("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])
-    (row,) = overview_of(read_run(make_run(tmp_path, plan))).rows
-    assert (row.primary, row.distance) == (DASH, DASH)
-    assert row.endings == {"not run": 1}
-
-
 @pytest.mark.parametrize(
     ("entry", "direction", "tone"),
     [
@@ -209,12 +180,12 @@ def test_identical_variants_are_called_better_or_worse_in_no_more_runs_than_one_
     three: Path,
 ) -> None:
     rng = np.random.default_rng(0)
-    drawn = (rng.random((2, 300, 40, 1)) < 0.3).astype(float)  # variant, comparison, scene, seed
+    drawn = (rng.random((2, 150, 40, 1)) < 0.3).astype(float)  # variant, comparison, scene, seed
     pool = [
         paired(rows_of(a, PRIMARY, "clean") + rows_of(b, PRIMARY), "clean")["3dgs"][PRIMARY]
         for a, b in zip(*drawn, strict=True)
     ]
-    said, uncorrected, runs = 0, 0, 100
+    said, uncorrected, runs = 0, 0, 40
     names = [f"renderer-{k}" for k in range(15)]
     for _ in range(runs):
         chosen = [pool[k] for k in rng.choice(len(pool), 15, replace=False)]
@@ -266,8 +237,3 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(
     for shot in shots:
         data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
         assert abs(float(np.mean(cv2.imdecode(data, cv2.IMREAD_COLOR))) - 150.0) < 3
-
-
-def test_a_run_without_frames_has_no_images(usual_run: Path) -> None:
-    assert worst.worst_change(read_run(usual_run)) == []
-    assert isinstance(overview_of(read_run(usual_run)), Overview)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.report.birdseye import path_data, scene_view
-from evaluators.report.rollouts import events_of
 
 VARIANTS = {("a", "p"): (0, 0)}
 
@@ -59,15 +58,6 @@ def test_path_data_stays_near_the_line(points: list[tuple[float, float]]) -> Non
         assert float(np.ptp(line, axis=0).max()) <= 3.0  # all in one pixel
 
 
-def test_path_data_writes_signs_and_joins() -> None:
-    assert (
-        path_data(np.array([[0.0, 0.0], [10.0, -5.0], [0.0, 20.0]]), tolerance=0.0)
-        == "M0 0l10 -5 -10 25"
-    )
-    assert path_data(np.array([[1.0, 1.0]])) == ""
-    assert path_data(np.zeros((5, 2))) == ""
-
-
 @pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi / 2, 3.0, -2.2])
 def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     s = np.linspace(0, 100, 50)
@@ -92,29 +82,6 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     assert (log[:, 1] <= view.height).all()
 
 
-def test_far_from_the_origin_costs_no_precision() -> None:
-    s = np.linspace(0, 60, 30)
-    rollout = Rollout("a", "p", "s", 0, "ok")
-    views = []
-    for offset in (0.0, 5_412_345.25):
-        x, y = (s + offset).tolist(), (0.05 * s + offset).tolist()
-        views.append(
-            scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, VARIANTS)
-        )
-    assert views[0] == views[1]
-
-
-def test_standstill_log_is_drawn() -> None:
-    view = scene_view("s", scene([5.0] * 10, [7.0] * 10), [], {}, VARIANTS)
-    assert view is not None
-    assert view.height > 0
-    assert view.log == ""
-
-
-def test_log_of_one_pose_is_not_drawn() -> None:
-    assert scene_view("s", scene([5.0], [7.0]), [], {}, VARIANTS) is None
-
-
 def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
     x = np.linspace(0, 100, 50).tolist()
     rollout = Rollout("a", "p", "s", 0, "ok")
@@ -136,19 +103,6 @@ def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
     ]
     assert len(areas) == 2
     assert areas[0] == areas[1]
-
-
-def test_lane_without_an_edge_gives_its_line_and_no_area() -> None:
-    view = scene_view(
-        "s",
-        scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]),
-        [],
-        {},
-        VARIANTS,
-    )
-    assert view is not None
-    assert view.lanes == ""
-    assert view.lines.count("M") == 1
 
 
 def test_event_is_marked_where_and_when_it_happened() -> None:
@@ -177,30 +131,9 @@ def test_event_is_marked_where_and_when_it_happened() -> None:
     assert mark.footprint.endswith("z")
 
 
-def test_event_during_warm_up_does_not_give_the_time() -> None:
-    rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
-    off = [1.0] * 5 + [0.0] * 10 + [1.0] * 5
-    relevant = [0.0] * 8 + [1.0] * 12
-    series = {rollout.cell: series_of([0.0] * 20, [0.0] * 20, offroad=off, eval_relevant=relevant)}
-    (event,) = events_of(rollout, series)
-    assert event.t_s == pytest.approx(1.5)
-
-
 def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
     rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
     view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, VARIANTS)
     assert view is not None
     assert view.marks[0].x is None
     assert view.marks[0].text == "a \u00b7 seed 0: off-road at a time that no step shows"
-
-
-def test_edge_without_paint_gives_no_line() -> None:
-    lane = {
-        "left": [[0, 2], [100, 2]],
-        "right": [[0, -2], [100, -2]],
-        "paint": ["none", "solid_white"],
-    }
-    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[lane]), [], {}, VARIANTS)
-    assert view is not None
-    assert view.lines.count("M") == 1
-    assert view.lanes.count("z") == 1

@@ -75,14 +75,6 @@ def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
         assert times[-1] == "\u2014"
 
 
-def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -> None:
-    browser.open(write_report(usual_run))
-    browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
-    for _ in range(2):
-        browser.evaluate("document.querySelectorAll('#table-results th .sort')[1].click()")
-        assert column(browser, "table-results", 1)[-1] == "\u2014"
-
-
 def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run: Path) -> None:
     shade = "getComputedStyle(document.body).backgroundColor"
     report = write_report(usual_run)
@@ -99,13 +91,3 @@ def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run
     browser.evaluate("document.getElementById('theme').click()")
     assert browser.evaluate(shade) == light
     browser.evaluate("localStorage.clear()")
-
-
-def test_legend_hides_one_renderer_in_every_map(browser: Browser, usual_run: Path) -> None:
-    browser.open(write_report(usual_run))
-    shown = "[...document.querySelectorAll('#views .track.variant-1')].filter(p => getComputedStyle(p).display !== 'none').length"
-    assert browser.evaluate(shown) > 0
-    browser.evaluate("document.querySelector('button[data-variant=\"1\"]').click()")
-    assert browser.evaluate(shown) == 0
-    browser.evaluate("document.querySelector('button[data-variant=\"1\"]').click()")
-    assert browser.evaluate(shown) > 0

@@ -42,11 +42,6 @@ def test_untrained_weights_and_refused_frames_are_cautions() -> None:
     )
 
 
-def test_a_frame_that_the_render_itself_had_black_is_not_the_fixers_failure() -> None:
-    only_black = {"fixers": {"f": BLOCKS}, "censoring": {"f": {"frame_events": {"black": 7}}}}
-    assert fixer_cautions(only_black) == []
-
-
 def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
     drafted, blocks = fixer_rows(SUMMARY)
     assert [cell.text.replace("\u00a0", " ") for cell in drafted["cells"][3:]] == [
@@ -58,7 +53,3 @@ def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
     assert [cell.text for cell in blocks["cells"][3:6]] == [DASH] * 3
     assert blocks["cells"][6].text == "4"
     assert len(drafted["cells"]) == len(COLUMNS)
-
-
-def test_a_run_without_fixers_says_nothing() -> None:
-    assert fixer_rows({}) == fixer_cautions({}) == []

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from hypothesis import strategies as st
 from evaluators.opening import read_run
 from evaluators.report import write_junit
 from evaluators.report.ci import clean, junit
-from tests.report.make_run import Plan, make_run
 
 
 def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
@@ -76,29 +74,6 @@ def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Pat
     error = next(root.iter("error"))
     assert error.attrib["message"] == "</script><script>alert(1)</script>"
     assert "\\x00\\x1b[31m" in (error.text or "")
-
-
-def test_empty_run_is_an_empty_suite(tmp_path: Path) -> None:
-    suite = (
-        ET.parse(write_junit(make_run(tmp_path / "empty-run", Plan(renderers=(), scenes=()))))
-        .getroot()
-        .find("testsuite")
-    )
-    assert suite is not None
-    assert (suite.attrib["name"], suite.attrib["tests"]) == ("empty-run", "0")
-
-
-def test_the_suite_has_the_name_that_the_command_gave(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "named", Plan(renderers=(), scenes=()))
-    file = run / "run.json"
-    info = json.loads(file.read_text())
-    names = []
-    for asked in (["suites/first"], ["a.yaml", "b.yaml"]):
-        file.write_text(json.dumps(info | {"asked": asked}))
-        suite = ET.parse(write_junit(run)).getroot().find("testsuite")
-        assert suite is not None
-        names.append(suite.attrib["name"])
-    assert names == ["suites/first", "named"]
 
 
 @given(st.text(st.characters(codec="utf-8")))

@@ -7,14 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.numbers import (
-    DASH,
-    count_of,
     decimals,
-    duration,
     finite,
     fixed,
     interval,
-    short,
 )
 
 
@@ -47,12 +43,6 @@ def test_three_significant_digits_are_kept(value: float) -> None:
         assert abs(round(value, places) - value) <= 0.006 * value
 
 
-def test_missing_prints_a_dash_and_zero_prints_zero() -> None:
-    assert short(None) == DASH
-    assert duration(None) == DASH
-    assert short(0.0, "m") == "0.0\u00a0m"
-
-
 @pytest.mark.parametrize("value", [None, math.nan, math.inf, -math.inf, "0.5", True, [1.0]])
 def test_only_finite_numbers_are_numbers(value: object) -> None:
     assert finite(value) is None
@@ -65,10 +55,3 @@ def test_interval_from_bounds_from_half_width_and_from_nothing() -> None:
     assert interval([None, 0.3]) is None
     assert interval(None, 1.0) is None
     assert interval([0.1, math.nan]) is None
-
-
-def test_counts_behind_a_rate() -> None:
-    assert count_of(7 / 300, 300) == "7 of 300"
-    assert count_of(0.0, 12) == "0 of 12"
-    assert count_of(0.5, 3) == ""  # a mean of scene means, not of rollouts
-    assert count_of(0.0, 0) == ""

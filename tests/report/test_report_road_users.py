@@ -39,12 +39,3 @@ def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
         assert np.isclose(np.hypot(*(corners[1] - corners[2])), lead.box.width_m, atol=0.15)
         assert len(way.split()) > 10
     assert early[0] != late[0]
-
-
-def test_scene_files_of_earlier_versions_have_no_road_users() -> None:
-    assert (
-        road_users(
-            {"actors": [{"id": "a", "label": "car", "static": False}]}, 0, np.zeros((2, 2)), write
-        )
-        == []
-    )

@@ -42,14 +42,6 @@ def test_summary_key_with_policy_stands_for_that_policy_only(usual_run: Path) ->
     )  # an unknown way of joining matches nothing rather than something
 
 
-def test_scene_file_is_found_by_the_id_inside_it(usual_run: Path) -> None:
-    run = read_run(usual_run)
-    content = run.scene_data("hard/narrow-gap-with-parked-cars")
-    assert content is not None
-    assert content["scene_id"] == "hard/narrow-gap-with-parked-cars"
-    assert run.scene_data("no such scene") is None
-
-
 @pytest.mark.parametrize("path", ["../outside", "/etc", "rollouts/../../outside", ""])
 def test_paths_that_leave_the_run_folder_are_not_followed(
     tmp_path: Path, usual_run: Path, path: str
@@ -92,12 +84,6 @@ def test_broken_folder_is_a_four_part_error(
     assert found in caught.value.message
     assert str(tmp_path) in caught.value.message
     assert caught.value.hint
-
-
-def test_run_without_steps_has_no_series(tmp_path: Path, usual_run: Path) -> None:
-    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
-    (tmp_path / "run" / "steps.parquet").unlink()
-    assert series_by_cell(read_run(tmp_path / "run").steps(["ego_x_m"])) == {}
 
 
 def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(

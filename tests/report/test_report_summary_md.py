@@ -1,17 +1,14 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.opening import read_run
 from evaluators.report import write_summary_md
-from evaluators.report.ci import CUT_NOTE, MAX_BYTES, cut, escape, overview_md, table
+from evaluators.report.ci import CUT_NOTE, cut, escape, overview_md, table
 from evaluators.report.overview import overview_of
-from tests.report.make_run import Plan, make_run
 
 
 def test_summary_has_the_first_screen_all_metrics_and_the_command(usual_run: Path) -> None:
@@ -53,20 +50,3 @@ def test_cut_keeps_within_the_limit_and_stays_text(text: str, limit: int) -> Non
     else:
         assert done.endswith(CUT_NOTE)
         assert text.startswith(done.removesuffix(CUT_NOTE))
-
-
-@pytest.mark.slow
-def test_huge_summary_is_cut_with_a_note(usual_run: Path, tmp_path: Path) -> None:
-    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
-    summary = json.loads((folder / "summary.json").read_text())
-    entry = summary["metrics"]["clean"]["offroad"]
-    summary["metrics"]["clean"] |= {f"metric_{k:06d}": entry for k in range(40_000)}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    data = write_summary_md(folder).read_bytes()
-    assert MAX_BYTES - 2000 < len(data) <= MAX_BYTES
-    assert data.decode().endswith(CUT_NOTE)
-
-
-def test_empty_run_has_a_summary(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, Plan(renderers=(), scenes=()))
-    assert "Nothing was run" in write_summary_md(folder).read_text()

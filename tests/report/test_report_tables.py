@@ -9,8 +9,8 @@ from evaluators.numbers import DASH
 from evaluators.opening import read_run
 from evaluators.report import metric_lines
 from evaluators.report.fixers import speed
-from evaluators.report.provenance import failure_rows, ledger
-from evaluators.report.tables import columns, metric_rows, pair_rows
+from evaluators.report.provenance import ledger
+from evaluators.report.tables import metric_rows, pair_rows
 
 
 def entry(mean: float | None, **more: Any) -> dict[str, Any]:
@@ -64,14 +64,6 @@ def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
     assert "no interval over scenes" in row.cells[0].note
 
 
-def test_metric_of_a_third_party_is_shown_without_help() -> None:
-    (row,) = metric_rows(
-        {"metrics": {"a": {"my_metric": entry(3.25, unit="jerk", direction="none")}}}
-    )
-    assert (row.name, row.unit, row.arrow, row.meaning) == ("my_metric", "jerk", "", "")
-    assert row.cells[0].text == "3.250"
-
-
 def test_no_event_says_which_rates_are_excluded_and_which_not() -> None:
     none = entry(0.0, ci95=0.0, ci95_clustered=[0.0, 0.7076], n_rollouts=3, n_scenes=3)
     (row,) = metric_rows({"metrics": {"a": {"offroad": none}}})
@@ -95,36 +87,6 @@ def test_pair_without_shared_cells_keeps_its_reason() -> None:
     assert row.verdict == "undecided"
 
 
-def test_a_paired_difference_is_printed_with_sign_unit_and_p() -> None:
-    pair = {
-        "baseline": "clean",
-        "diff": -0.2,
-        "ci95": [-0.3, 0.1],
-        "p_value": 0.0004,
-        "verdict": "undecided",
-        "unit": "m",
-        "direction": "lower",
-    }
-    (row,) = pair_rows({"paired": {"3dgs": {"lateral_distance_m": pair}}})
-    assert row.p_value.text == "< 0.001"
-    assert row.diff.text == "\u22120.200\u00a0m"
-
-
-def test_columns_count_done_and_failed(usual_run: Path) -> None:
-    assert [(c.n_rollouts, c.n_failed, c.n_scenes) for c in columns(read_run(usual_run))] == [
-        (12, 0, 4),
-        *[(11, 1, 4)] * 2,
-        (12, 0, 4),
-        *[(11, 1, 4)] * 2,
-    ]
-
-
-def test_failures_carry_message_and_hint(usual_run: Path) -> None:
-    rows, more = failure_rows(read_run(usual_run))
-    assert (len(rows), more) == (4, 0)
-    assert [label for label, _ in rows[0]["parts"]] == ["message", "hint"]
-
-
 def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> None:
     run = read_run(usual_run)
     table = speed(run)
@@ -132,23 +94,6 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
     assert table.pool.startswith(
         "2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total"
     )
-
-
-def test_renderer_without_frames_has_no_speed() -> None:
-    from alpasim_plugin.log.run_folder.reader import Run
-
-    nothing = dict.fromkeys(
-        (
-            "ms_per_frame_p50",
-            "ms_per_frame_mean",
-            "ms_per_frame_p95",
-            "frames_per_s",
-            "first_frame_ms",
-        )
-    )
-    speeds = {"a": nothing | {"stages": {}}}
-    table = speed(Run(Path(), {}, {"speed": speeds}, (), ()))
-    assert all(cell.missing for cell in table.rows[0]["cells"])
 
 
 def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:

@@ -20,7 +20,6 @@ from alpasim_plugin.core.types import (
     Latency,
     Observation,
     Plan,
-    Rates,
     RenderRequest,
     Route,
     Scenario,
@@ -134,21 +133,6 @@ def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
 # --- speculative
 
 
-@pytest.mark.slow
-def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(
-    straight_road: Scenario,
-) -> None:
-    run = drive(straight_road)
-    facts = run.session.facts()
-    assert (
-        facts["hits"] == facts["predicted"] == 30 - 5
-    )  # all but the first frame of each of five blocks
-    assert facts["redrafts"] == 0
-    assert facts["exact"] >= 4  # while the log is forced forecasts are equal to the last bit
-    assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
-    assert_same_pictures(run.policy.seen, run.frames)
-
-
 @pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
 def test_the_streaming_network_has_the_history_of_the_true_frames(
     straight_road: Scenario, mode: str
@@ -203,17 +187,6 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road: Scenario
 
 
 @pytest.mark.slow
-def test_the_shown_frame_of_a_hit_is_the_one_of_the_foretold_pose(straight_road: Scenario) -> None:
-    run = drive(straight_road, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
-    for start, size in ((13, 8), (21, 8)):
-        predicted = [run.requests[start], *run.requests[start].ahead[: size - 1]]
-        fixer = Blend()
-        fixed_offline(fixer, rendered(straight_road, run.requests[:start]))
-        draft = fixer.preview(rendered(straight_road, predicted), [])
-        assert_same_pictures(run.frames[start : start + size - 1], draft[:-1])
-
-
-@pytest.mark.slow
 def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(
     straight_road: Scenario,
 ) -> None:
@@ -232,18 +205,6 @@ def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_l
 
 
 @pytest.mark.slow
-def test_two_rollouts_in_turns_are_each_as_alone(straight_road: Scenario) -> None:
-    alone = [drive(straight_road, policy, tolerance_m=0.01) for policy in (Watching, Zigzag)]
-    sessions = [session_of(straight_road, Blend, tolerance_m=0.01) for _ in alone]
-    came: list[list[Frame]] = [[], []]
-    for calls in zip(*(run.calls for run in alone), strict=True):
-        for k, requests in enumerate(calls):
-            came[k] += sessions[k].render_batch(requests)
-    for k, run in enumerate(alone):
-        assert_same_pictures(came[k], run.frames)
-
-
-@pytest.mark.slow
 def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road: Scenario) -> None:
     ahead, parked = straight_road.actors
     idm = replace(
@@ -253,22 +214,6 @@ def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road
     assert facts["forecast_error"]["actor_m"]["max"] > 0.02
     assert facts["forecast_error"]["camera_m"]["max"] < 1e-6
     assert facts["redrafts"] > 0
-
-
-@pytest.mark.slow
-def test_an_actor_that_appears_by_its_track_is_foretold(straight_road: Scenario) -> None:
-    ahead, parked = straight_road.actors
-    late = slice(160, None)  # from 1.6 s on, in the middle of a block
-    track = replace(
-        ahead.track,
-        t_us=ahead.track.t_us[late],
-        xyz=ahead.track.xyz[late],
-        quat=ahead.track.quat[late],
-    )
-    facts = drive(
-        replace(straight_road, actors=(replace(ahead, track=track), parked))
-    ).session.facts()
-    assert facts["hits"] == facts["predicted"]
 
 
 def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(
@@ -326,20 +271,6 @@ def test_cameras_in_step_share_a_fixer_and_not_their_histories(
         assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline)
 
 
-@pytest.mark.slow
-def test_cameras_of_different_periods_have_fixers_of_their_own(straight_road: Scenario) -> None:
-    class Uneven(Watching):
-        sensors = (SensorSpec("front"), SensorSpec("rear", 200_000))
-
-    scenario = with_rear_camera(straight_road)
-    run = drive(scenario, Uneven)
-    assert len(run.fixers) == 2
-    for camera in ("front", "rear"):
-        requests = [request for request in run.requests if request.camera.name == camera]
-        offline = fixed_offline(Blend(), rendered(scenario, requests))
-        assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline)
-
-
 def test_the_session_of_a_finished_rollout_is_not_taken_for_another(
     straight_road: Scenario,
 ) -> None:
@@ -364,24 +295,6 @@ def test_whole_blocks_of_true_frames_equal_the_offline_result(
     )  # the block that the end cuts off is not made: nobody would look
 
 
-def test_in_whole_blocks_one_plan_is_in_force_from_question_to_question(
-    straight_road: Scenario,
-) -> None:
-    log = drive(straight_road, Zigzag, mode="chunk").recorder.log()
-    assert [plan.now_us for plan in log.plans] == [400_000, 1_200_000, 2_000_000, 2_800_000]
-    assert len(log.images) == 29
-    assert len(log.ego) == 31
-
-
-def test_blocks_of_a_slower_camera_last_longer(straight_road: Scenario) -> None:
-    class Slow(Watching):
-        sensors = (SensorSpec("front", 200_000),)
-
-    run = drive(straight_road, Slow, mode="chunk")
-    assert run.policy.asked == [800_000, 2_400_000]
-    assert [request.t_us for request in run.requests] == list(range(0, 2_600_000, 200_000))
-
-
 def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road: Scenario) -> None:
     with pytest.raises(InputError):
         drive(replace(straight_road, warmup_us=300_000), mode="chunk")
@@ -393,26 +306,6 @@ def test_cameras_of_different_periods_make_no_common_block(straight_road: Scenar
 
     with pytest.raises(InputError):
         drive(with_rear_camera(straight_road), Uneven, mode="chunk")
-
-
-def test_a_scenario_that_ends_before_the_first_block_is_refused(straight_road: Scenario) -> None:
-    with pytest.raises(InputError):
-        drive(replace(straight_road, end_us=400_000), mode="chunk")
-
-
-def test_a_policy_without_cameras_is_asked_at_its_own_period(straight_road: Scenario) -> None:
-    class Blind(Watching):
-        sensors = ()
-
-    run = drive(replace(straight_road, rates=Rates(policy_us=500_000)), Blind, mode="chunk")
-    assert run.policy.asked == list(range(0, 3_000_000, 500_000))
-    assert run.recorder.facts()["frames"] == 0
-
-
-def test_single_frames_are_refused_in_whole_blocks(straight_road: Scenario) -> None:
-    run = drive(straight_road, mode="chunk")
-    with pytest.raises(RendererError):
-        run.session.render(run.requests[0])
 
 
 # --- faults and facts

@@ -13,7 +13,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runs.cell import MANIFEST
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
@@ -141,46 +140,6 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     assert len(shown) == entry["frames"]
     assert max(shown) <= 0.02
     assert max(shown) == pytest.approx(entry["shown_error"]["camera_m"])
-
-
-def test_a_plain_run_knows_nothing_of_fixers(tmp_path: Path) -> None:
-    plan = make_plan(
-        expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions()
-    )
-    run(plan, tmp_path, report=True)
-    assert json.loads((tmp_path / "summary.json").read_text())["fixers"] == {}
-    assert 'id="fixers"' not in (tmp_path / "report.html").read_text()
-
-
-def test_the_terminal_names_the_fixer_before_and_after(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = [
-        "--renderer",
-        "identity+clean",
-        "--policy",
-        "lane-camera",
-        "--workers",
-        "1",
-        "--out",
-        str(tmp_path),
-    ]
-    for text in (*SCENE, "fixer.mode=chunk"):
-        command += ["--set", text]
-    assert run_command([*command, "smoke/straight"]) == 0
-    out = capsys.readouterr()
-    assert "identity+clean: identity, no network, chunk" in out.err
-    assert "identity+clean: identity, no network, chunk" in out.out
-    assert run_command([*command[:2], "--dry-run", "smoke/straight"]) == 0
-    assert "identity+clean: identity, no network, speculative" in capsys.readouterr().out
-
-
-def test_list_fixers_says_whose_weights_they_have(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["list", "fixers", "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)
-    assert "[no network]" in listed["identity"]
-    assert "[weights missing]" in listed["onefixer-2b"]
-    assert set(listed) >= {"onefixer", "onefixer-dit-tiny", "onefixer-dit-s"}
 
 
 def test_time_is_counted_where_it_was_spent() -> None:

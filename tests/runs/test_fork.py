@@ -11,15 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
+from alpasim_plugin.runs.fork import Change, fork_rollout
 from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import log_trace
-from alpasim_plugin.runs.reports import write_flips
 from alpasim_plugin.runs.run import RunResult, execute_run
 from scenarios.suite import expand
 from tests.examples import first_of
@@ -92,13 +90,6 @@ def test_an_untouched_continuation_is_the_log_to_the_byte(
     assert one == other
 
 
-@pytest.mark.slow
-def test_a_stateful_renderer_continues_with_its_history(root: Path, tmp_path: Path) -> None:
-    frozen = find_rollout(root, CELL.replace("clean", "broken-frozen"))
-    go(frozen, tmp_path)
-    assert read_json(tmp_path / "run.json")["fork"]["continuation"] == "equal"
-
-
 @pytest.mark.parametrize("change", first_of([{"policy": "pure-pursuit", "seed": 5}, {}]))
 def test_a_change_takes_effect_at_its_instant_and_not_before(
     past: LoggedRollout, changed: Path, tmp_path: Path, change: dict[str, object]
@@ -119,18 +110,6 @@ def test_a_change_takes_effect_at_its_instant_and_not_before(
     before = one.ego.t_us <= at_us
     np.testing.assert_array_equal(one.ego.xyz[before], other.ego.xyz[before])
     assert not np.array_equal(one.ego.xyz[~before], other.ego.xyz[~before])
-
-
-def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(
-    past: LoggedRollout, changed: Path
-) -> None:
-    pixels = {
-        fact["t_us"]: fact["rgb_sha256"] for fact in read_facts(forked(changed) / "frames.jsonl")
-    }
-    first = pixels[past.scenario.start_us]
-    assert [
-        t_us for t_us, digest in pixels.items() if digest == first and t_us > past.scenario.start_us
-    ] == [t_us for t_us in pixels if t_us >= past.scenario.start_us + AT_US]
 
 
 def test_the_run_folder_pairs_the_continuation_with_the_original(
@@ -191,21 +170,3 @@ def test_a_scenario_that_has_changed_is_refused(
     write_run_json(tmp_path, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)
-
-
-def test_two_policies_share_a_camera_at_the_shorter_period(straight_road: Scenario) -> None:
-    first, then = (
-        (SensorSpec("front"), SensorSpec("left", 200_000)),
-        (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear")),
-    )
-    assert merge_sensors(first, then, straight_road) == (
-        SensorSpec("front", 50_000),
-        SensorSpec("left"),
-        SensorSpec("rear"),
-    )
-
-
-def test_flips_are_written_for_a_run_without_any(root: Path) -> None:
-    told = read_json(write_flips(root))
-    assert told["n_pairs"] == 1
-    assert len(told["cells"]) == told["n_flips"]

@@ -68,11 +68,6 @@ def test_what_is_no_frame_is_the_renderers_failure(frame: Any) -> None:
         checked_frames(Returns(frame), [REQUEST])
 
 
-def test_a_frame_within_rounding_is_taken() -> None:
-    frame = replace(GOOD, alpha=plane(1.0 + 1e-6), depth=plane(0.0))
-    assert checked_frames(Returns(frame), [REQUEST])[0] is frame
-
-
 class Far(ConstantVelocity):
     def act(self, observation: Any) -> Plan:
         plan = super().act(observation)

@@ -12,14 +12,6 @@ def plan(t_us: int) -> Trajectory:
     return Trajectory(np.array([t_us]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
 
 
-def test_without_latency_a_plan_is_in_force_at_once() -> None:
-    queue = PlanQueue(Latency("none"))
-    assert queue.active(0) is None
-    first = plan(0)
-    queue.submit(first, 0, wall_us=10**9)
-    assert queue.active(0) is first
-
-
 def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due() -> None:
     queue = PlanQueue(Latency("fixed", 150_000))
     first, second = plan(0), plan(100_000)
@@ -56,11 +48,3 @@ def test_a_fixer_slower_than_the_camera_falls_behind() -> None:
     queue.submit(late, 200_000, wall_us=0)
     assert queue.active(449_999) is None
     assert queue.active(450_000) is late
-
-
-def test_the_fixer_counts_only_where_asked_for() -> None:
-    queue = PlanQueue(Latency("measured"))
-    queue.frames(0, {"fix": 150.0})
-    now = plan(0)
-    queue.submit(now, 0, wall_us=5_000)
-    assert queue.active(5_000) is now

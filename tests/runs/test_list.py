@@ -153,12 +153,3 @@ def test_the_table_shows_metrics_beside_their_renderers(
     (middle,) = (line for line in capsys.readouterr().out.splitlines() if "team/middle" in line)
     assert "8b07ee4+" in middle
     assert "6 x 2 suites/smoke" in middle
-
-
-def test_what_makes_no_sense_is_refused(root: Path) -> None:
-    for words in (
-        (str(root / "nowhere"),),
-        (str(root), "--since", "yesterday"),
-        (str(root), "--metric", "ofroad"),
-    ):
-        assert run_command(["list", "runs", *words]) == 2

@@ -62,13 +62,6 @@ def environment(name: str) -> tuple[str | None, str | None]:
     return os.environ.get(name), os.environ.get("PYTHONSAFEPATH")
 
 
-def test_what_was_finished_before_its_worker_died_is_not_done_again(tmp_path: Path) -> None:
-    assert dict(run_jobs(work, ["dies", "a"], 2, known={"dies": "kept"}.get)) == {
-        "dies": "kept",
-        "a": "A",
-    }
-
-
 @pytest.mark.parametrize("workers", [1, 3])
 def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
     assert dict(map_jobs(work, ["a", "b", "c", "d"], workers)) == {

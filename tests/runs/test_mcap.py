@@ -154,17 +154,6 @@ def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(
     assert "min_distance_to_obstacle_m" not in series  # never valid in this scene
 
 
-def test_the_map_lies_at_the_height_of_the_recorded_drive(
-    watched: Watched, recorded: tuple[Messages, dict[str, str], dict[str, str]]
-) -> None:
-    ((_, body),) = recorded[0]["/map"]
-    content = watched.run.scene_data("urban-left_turn")
-    assert content is not None
-    edges = next(one["lines"] for one in body["entities"] if one["id"] == "road edge")
-    assert [xyz(point)[:2] for point in edges[0]["points"]] == content["road_edges"][0]
-    assert {one["id"] for one in body["entities"]} >= {"lane border", "road edge", "recorded drive"}
-
-
 def test_a_failed_rollout_and_missing_frames_are_said(
     watched: Watched, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

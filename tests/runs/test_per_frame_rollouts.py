@@ -10,12 +10,12 @@ from types import MappingProxyType
 import numpy as np
 
 from alpasim_plugin import run_rollout
-from alpasim_plugin.core.types import F64, CameraSpec, Frame, Latency, Scenario
+from alpasim_plugin.core.types import F64, Frame, Latency, Scenario
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.loop import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from tests.runs.grey_renderer import Grey
-from tests.runs.test_fixed_rollouts import Watching, Zigzag, assert_same_pictures, drive, rendered
+from tests.runs.test_fixed_rollouts import Zigzag, assert_same_pictures, drive, rendered
 
 SMALL = ("weights.bundle=null", "generator.widths=[8,8,8]", "untrained=random", "uses_map=false")
 
@@ -46,27 +46,6 @@ def test_a_drive_sees_every_frame_fixed_once_at_its_true_pose(straight_road: Sce
     assert_same_pictures(run.frames, offline(rendered(scenario, run.requests)))
     assert_same_pictures(run.policy.seen, run.frames[: len(run.policy.seen)])
     assert session.stage_ms["fix"] > 0
-
-
-def test_cameras_of_different_rates_share_a_session(straight_road: Scenario) -> None:
-    front = straight_road.cameras[0]
-    slow: CameraSpec = replace(front, name="slow")
-    scenario = replace(straight_road, end_us=800_000, cameras=(front, slow))
-
-    class Both(Watching):
-        sensors = (
-            replace(Watching.sensors[0]),
-            replace(Watching.sensors[0], camera="slow", interval_us=200_000),
-        )
-
-    run = drive(scenario, Both, network)  # type: ignore[arg-type]
-    frames = rendered(scenario, run.requests)
-    assert {frame.camera for frame in frames} == {"front", "slow"}
-    for camera in ("front", "slow"):
-        mine = [frame for frame in frames if frame.camera == camera]
-        assert_same_pictures(
-            [frame for frame in run.frames if frame.camera == camera], offline(mine)
-        )
 
 
 def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road: Scenario) -> None:

@@ -4,7 +4,6 @@ memory that does not grow.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -16,7 +15,6 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 from alpasim_plugin.runs.refine import RefineFiles, refine_video
 
@@ -135,23 +133,6 @@ def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path: Path) -> None:
     assert side.shape == (7, 36, 128, 3)
     assert np.abs(side[:, :, :64].astype(int) - np.stack(given)).mean() < 2
     assert np.abs(side[:, :, 64:].astype(int) - images).mean() < 2
-
-
-def test_without_opacity_the_video_counts_as_opaque(tmp_path: Path) -> None:
-    fixer = Inverting()
-    refine_video(
-        RefineFiles(video(tmp_path / "in.mp4", pictures(3)), tmp_path / "out.mp4"), lambda: fixer
-    )
-    assert all(frame.alpha is None for frame in fixer.seen)
-
-
-def test_guard_events_are_counted(tmp_path: Path) -> None:
-    given = pictures(6)
-    given[2] = np.zeros_like(given[2])
-    summary = refine_video(
-        RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4"), Inverting
-    )
-    assert summary.events == {"fixer-black": 1}
 
 
 def test_odd_sizes_are_padded_in_the_file_only(tmp_path: Path) -> None:
@@ -287,26 +268,3 @@ def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_
         refine_video(files, Inverting, stop)
     assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
     assert refine_video(files, Inverting).frames == 20
-
-
-STATM = Path("/proc/self/statm")
-
-
-@pytest.mark.skipif(not STATM.exists(), reason="resident memory is read from /proc")
-def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
-    source, held_mb = tmp_path / "in.mp4", []
-    with VideoWriter(source, 1 / RATE, RATE) as writer:
-        for i in range(240):
-            writer.write(np.full((180, 320, 3), i % 200, np.uint8), i)
-
-    def look(frames: int, claimed: int | None) -> None:
-        held_mb.append(int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6)
-
-    refine_video(
-        RefineFiles(source, tmp_path / "out.mp4"),
-        lambda: make_fixer("identity", scene_id="video"),
-        look,
-    )
-    assert (
-        held_mb[-1] - held_mb[len(held_mb) // 4] < 15
-    )  # holding the 180 frames between would take 31 MB

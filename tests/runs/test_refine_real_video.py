@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 FREEWAY = "udacity/solidWhiteRight.mp4"
@@ -42,28 +41,6 @@ def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[s
     return document
 
 
-def times_and_images(path: Path) -> tuple[list[Fraction], U8]:
-    with VideoReader(path) as video:
-        frames = list(video)
-        return [frame.time * video.format.time_base for frame in frames], np.stack(
-            [frame.image for frame in frames]
-        )
-
-
-@pytest.mark.slow
-def test_a_freeway_of_an_odd_size_keeps_times_and_picture(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = small(
-        shared_data / FREEWAY, tmp_path / "in.mp4", (150, 84), 15
-    )  # neither side a multiple of 16
-    summary = refine(capsys, source, "-o", tmp_path / "out.mp4")
-    assert (summary["frames"], summary["fps"], summary["events"]) == (15, 25.0, {})
-    before, after = times_and_images(source), times_and_images(tmp_path / "out.mp4")
-    assert after[0] == before[0] == [Fraction(i, 25) for i in range(15)]
-    assert np.abs(after[1].astype(int) - before[1]).mean() < 3  # an identity, then H.264
-
-
 def test_a_street_with_its_map_video(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,24 +53,6 @@ def test_a_street_with_its_map_video(
     without = refine(capsys, source, "-o", tmp_path / "without.mp4", *options)
     assert with_map["frames"] == without["frames"] == 13
     assert with_map["mean_levels"] != without["mean_levels"]
-
-
-def test_the_map_video_as_published_has_another_size_and_is_refused(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = [
-        "refine",
-        str(shared_data / STREET.format("videos")),
-        "-o",
-        str(tmp_path / "out.mp4"),
-    ]
-    assert (
-        run_command(
-            [*command, "--sdmap", str(shared_data / STREET.format("control_input_hdmap_bbox"))]
-        )
-        == 2
-    )
-    assert "the sdmap is 1276x720, the input 1920x1080" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -53,9 +53,3 @@ def test_a_policy_that_remembers_is_not_repeatable(tmp_path: Path) -> None:
 def test_measured_latency_is_not_repeated(tmp_path: Path) -> None:
     found = repeated(plan_of("constant-velocity", "latency.kind=measured"), tmp_path)
     assert found["repeatable"] is None
-
-
-def test_a_run_is_not_repeated_unless_it_is_asked_for(tmp_path: Path) -> None:
-    plan = plan_of("constant-velocity")
-    summary = execute_run(plan, tmp_path, 1, ["simrun"], Announced(), report=False).summary
-    assert "repeat" not in summary

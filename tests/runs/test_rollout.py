@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin import make_policy, make_renderer, run_rollout
-from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
+from alpasim_plugin.core.errors import PolicyError, RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory
 from alpasim_plugin.core.types import (
     Frame,
@@ -47,12 +47,6 @@ def test_log_replay_reproduces_the_recorded_poses(straight_road: Scenario) -> No
     np.testing.assert_allclose(
         rig.xyz, recorded[:, :3, 3], atol=1e-4
     )  # poses are float32 in the log
-
-
-def test_a_policy_without_cameras_renders_nothing(straight_road: Scenario) -> None:
-    recorder = drive(straight_road, "log-replay")
-    assert recorder.facts()["frames"] == 0
-    assert "render" not in recorder.facts()["stage_ms"]
 
 
 def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(
@@ -211,11 +205,6 @@ def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
     assert recorder.facts()["frame_events"] == {"black": 30}
 
 
-def test_a_one_frame_scenario_is_refused(straight_road: Scenario) -> None:
-    with pytest.raises(InputError):
-        drive(replace(straight_road, end_us=straight_road.start_us), "log-replay")
-
-
 def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(
     straight_road: Scenario, tmp_path: Path
 ) -> None:
@@ -233,11 +222,6 @@ def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(
     assert not (tmp_path / "False" / "front.mp4").exists()
     assert logs[0] == logs[1]
     assert facts[0] == facts[1]
-
-
-def test_no_actors_at_all_is_a_valid_scene(straight_road: Scenario) -> None:
-    log = drive(replace(straight_road, actors=()), "pure-pursuit").log()
-    assert not log.actors
 
 
 def test_a_failed_rollout_leaves_no_finished_log(straight_road: Scenario, tmp_path: Path) -> None:

@@ -16,13 +16,10 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.atomic import temporary_path
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.writer import remove_left_overs
-from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.run import default_folder, execute_run
-from alpasim_plugin.runs.score_logs import check_vouched
 from scenarios.suite import expand
 from tests.runs.test_runs import Announced, comparable
 
@@ -198,14 +195,6 @@ def test_readers_make_missing_tables_again(
     assert run_command(["compare", str(root)]) == 2
 
 
-def test_a_fork_and_a_scoring_need_the_log_itself(root: Path) -> None:
-    flip(root / CELL / "rollout.asl")
-    with pytest.raises(InputError):
-        find_rollout(root, CELL)
-    with pytest.raises(InputError):
-        check_vouched(root / CELL / "rollout.asl")
-
-
 def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> None:
     (root / "summary.json").unlink()
     shutil.rmtree(root / CELL)
@@ -213,13 +202,6 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> 
     assert run(root).results.count(("ok", False)) == 1
     assert not inspect_run(root).damage
     assert not inspect_run(root).unfinished
-
-
-def test_tables_that_were_copied_without_their_rollouts_can_be_read(root: Path) -> None:
-    shutil.rmtree(root / "rollouts")
-    assert run_command(["compare", str(root)]) == 0
-    lengthen(root / "summary.json")
-    assert run_command(["compare", str(root)]) == 2
 
 
 def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -> None:

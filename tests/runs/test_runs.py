@@ -106,23 +106,6 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     assert comparable(tmp_path) == before
 
 
-@pytest.mark.slow
-def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(
-    tmp_path: Path,
-) -> None:
-    def plan(video: str) -> RunPlan:
-        refs = expand("smoke/straight", ("timing.duration_us=900000",))
-        return make_plan(refs, (GREY,), ("log-replay",), (0,), RunOptions(video=video))  # type: ignore[arg-type]
-
-    run(plan("none"), tmp_path)
-    assert run(plan("all"), tmp_path, resume=True)[1].results == [("ok", False)]
-    assert len(list(tmp_path.rglob("front.mp4"))) == 1
-    assert run(plan("all"), tmp_path)[1].results == [("ok", True)]
-    assert run(plan("failures"), tmp_path, resume=True)[1].results == [
-        ("ok", True)
-    ]  # no event: nothing is asked for
-
-
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
     run(cheap_plan(), tmp_path)
     with pytest.raises(InputError):

@@ -12,13 +12,10 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.runs.self_test import (
     CONTROL,
     REFERENCE,
-    SUITE,
     Trial,
-    broken_renderers,
     judge_against,
 )
 from evaluators.statistics.gate import GateSpec, MetricRule
-from scenarios.suite import load_suite
 from tests.evaluators.test_gate import add, rows, table_of
 
 
@@ -39,13 +36,6 @@ def test_a_sensitive_gate_is_right_about_both() -> None:
 def test_a_blunt_gate_and_a_gate_that_fails_everything_are_both_found_out() -> None:
     assert not trial(5.0, True, 0.5).is_right
     assert not trial(0.1, False, 0.0, limit=0.0).is_right
-
-
-def test_the_suite_and_the_faults_are_the_documented_ones() -> None:
-    assert len(load_suite(SUITE)) == 6
-    assert sorted(broken_renderers()) == [
-        f"broken-{n}" for n in ("black", "blurred", "frozen", "late", "mirrored", "shifted")
-    ]
 
 
 @pytest.mark.slow

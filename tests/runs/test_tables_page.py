@@ -55,10 +55,6 @@ def rows(repo: Path, number: int) -> list[dict[str, Any]]:
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
 
-def test_the_page_has_three_queries(repo: Path) -> None:
-    assert len(blocks(repo, "sql")) == 3
-
-
 def test_means_of_many_runs_are_those_of_their_summaries(repo: Path, run: Run) -> None:
     found = {(Path(row["filename"]).parent.name, row["renderer"]): row for row in rows(repo, 0)}
     assert set(found) == {("mine", "clean"), ("mine", "3dgs"), ("other", "clean")}

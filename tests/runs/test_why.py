@@ -210,17 +210,6 @@ def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_
     assert found[0] == words
 
 
-def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
-    assert not (rollout(run, "Right") / "why.html").exists()
-    page = (rollout(run, "Blind") / "why.html").relative_to(run).as_posix()
-    assert (run / page).exists()
-    assert page in (run / "report.html").read_text()
-
-
-def test_a_cell_outside_a_run_is_refused(tmp_path: Path) -> None:
-    assert run_command(["why", str(tmp_path / "clean/x/y/0")]) == 2
-
-
 @pytest.mark.parametrize("side", ["front", "lateral", "rear"])
 def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
     events = [

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios.argoverse import LABELS, PAINTS, read_argoverse
 from tests.scenarios.make_argoverse import (
     CAR,
     ORIGIN,
     STEP_NS,
     T0_NS,
-    TRACKS,
     cuboids,
     lane,
     line,
@@ -52,24 +50,6 @@ def test_cuboids_of_a_moving_ego_frame_stand_still_in_the_world(log):
     assert (walker.label, walker.is_static, len(walker.track)) == ("pedestrian", False, 11)
     assert walker.track.t_us[0] == (T0_NS + 5 * STEP_NS) // 1000
     np.testing.assert_allclose(walker.track.xyz[[0, -1], 1], [-5, 5], atol=1e-8)
-
-
-def test_cuboids_turn_with_the_ego(tmp_path):
-    ego = poses()
-    half = np.radians(90) / 2
-    ego["qw"][:], ego["qz"][:] = np.cos(half), np.sin(half)
-    rows = cuboids([("a", "BUS", (12.0, 2.5, 3.0), [3], place(0.0, 0.0, 1.5))], ego)
-    rows["tx_m"], rows["ty_m"], rows["tz_m"] = [7.0], [2.0], [1.0]
-    actor = read_argoverse(write_argoverse(tmp_path / "x", ego=ego, annotations=rows)).actors[0]
-    np.testing.assert_allclose(actor.track.xyz[0], [3.0 - 2.0, 7.0, 1.33], atol=1e-8)
-    assert yaw_from_quat(actor.track.quat[0]) == pytest.approx(np.pi / 2)
-
-
-def test_rows_of_the_ego_are_no_actor(tmp_path):
-    rows = cuboids([*TRACKS, ("ego", "EGO_VEHICLE", (4.877, 2.0, 1.473), range(21), ORIGIN)])
-    assert [
-        a.actor_id for a in read_argoverse(write_argoverse(tmp_path / "x", annotations=rows)).actors
-    ] == ["parked", "walker"]
 
 
 def test_track_with_a_hole_becomes_two_actors(tmp_path):
@@ -155,12 +135,6 @@ def test_unknown_mark_type_and_category_are_noted(tmp_path):
     assert log.actors[0].label == "other"
     assert "1 lane edges have the mark type 'ZIGZAG': taken as paint 'unknown'" in log.notes
     assert "1 tracks of the unknown category 'UNICORN' are labelled 'other'" in log.notes
-
-
-def test_same_bytes_give_the_same_hash_and_other_bytes_another(tmp_path):
-    one, two = (read_argoverse(write_argoverse(tmp_path / name)) for name in "ab")
-    other = read_argoverse(write_argoverse(tmp_path / "c", ego=poses(speed_mps=9.0)))
-    assert one.content_hash == two.content_hash != other.content_hash
 
 
 def test_opposite_neighbour_is_no_neighbour(tmp_path):

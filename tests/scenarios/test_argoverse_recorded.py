@@ -10,19 +10,16 @@ import shapely
 
 from alpasim_plugin.core.geometry import (
     interpolate,
-    matrix_from_quat,
-    se3,
     wrap_angle,
     yaw_from_quat,
 )
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.argoverse import read_argoverse, read_calibration, read_ego_poses
 from scenarios.recorded import SourceFiles
 from tests.examples import first_of
-from tests.scenarios.real_drive import boxes_at, footprint, ruling
+from tests.scenarios.real_drive import footprint
 
 FACTS = {
     "7fab2350": {
@@ -167,39 +164,6 @@ def test_real_human_is_inside_the_drivable_areas_in_every_frame(real):
     assert shapely.contains_xy(surface, poses_[:, :2, 3]).sum() == 156
 
 
-@pytest.mark.slow
-def test_real_least_gap_in_the_plane_of_the_ego(real):
-    """The published figures are taken in the ego's own xy plane; nobody touches the ego."""
-    facts, _, _, log = real
-    times = sweeps_us(log)
-    own = footprint(np.eye(4)[None], log.vehicle)[0]
-    gaps = np.array(
-        [
-            shapely.distance(own, boxes_at(log.actors, t, frame=interpolate(log.ego_log, t))).min()
-            for t in times
-        ]
-    )
-    assert gaps.min() == pytest.approx(facts["gap_m"], abs=5e-4)
-    assert (times[gaps.argmin()] - times[0]) * 1e-6 == pytest.approx(facts["gap_s"], abs=0.05)
-
-
-@pytest.mark.slow
-def test_real_least_gap_in_the_world_plane(real):
-    """In the world's xy plane the tilt of the road moves the box centre, half a height above it, by
-    millimetres.
-    """
-    facts, _, _, log = real
-    times = sweeps_us(log)
-    ego = footprint(interpolate(log.ego_log, times), log.vehicle)
-    gaps = np.array(
-        [
-            shapely.distance(shape, boxes_at(log.actors, t)).min()
-            for shape, t in zip(ego, times, strict=True)
-        ]
-    )
-    assert gaps.min() == pytest.approx(facts["world_gap_m"], abs=5e-4)
-
-
 def test_real_ego_is_in_a_lane_in_every_frame_and_in_at_most_four(real):
     _, _, _, log = real
     inside = LaneIndex(log.lane_map).containing_many(
@@ -228,30 +192,6 @@ def test_real_wheels_stand_on_the_ground(real):
     np.testing.assert_allclose(np.linalg.norm(raw.quat, axis=1), 1.0, atol=1e-12)
 
 
-def test_real_vehicle_is_the_annotated_one(real):
-    _, _, _, log = real
-    box = log.vehicle.box
-    assert (box.length_m, box.width_m, log.vehicle.rear_axle_to_centre_m) == (4.877, 2.0, 1.422)
-    assert log.vehicle.wheelbase_m == Vehicle().wheelbase_m
-
-
-# Frames at 10 Hz by the paper's rule: held by one lane, held by the union of nearby lanes, held by
-# neither, off-road.
-RULINGS = {"7fab2350": (62, 88, 10, 0), "adcf7d18": (135, 25, 0, 0), "3bffdcff": (125, 35, 0, 0)}
-
-
-def test_rule_of_the_paper_calls_no_frame_off_road(real):
-    """On leaving its junction 7fab2350 cuts a corner that the turning lanes do not cover: there the
-    road edges, 1.4 m away, decide.
-    """
-    _, folder, _, log = real
-    times = np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1], 100_000)
-    parts = ruling(log, times)
-    assert tuple(map(len, parts)) == RULINGS[folder.name]
-    if folder.name == "7fab2350":
-        assert parts[2] == list(range(150, 160))
-
-
 def test_real_calibration(shared_data):
     folder = shared_data / "av2" / "7fab2350"
     cameras = {c.name: c for c in read_calibration(folder)}
@@ -268,15 +208,3 @@ def test_real_calibration(shared_data):
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)
     sweep = folder / "sensors" / "lidar" / "315966265259836000.feather"
     assert len(SourceFiles().read_feather(sweep, {"x": "number"})["x"]) == 99229
-
-
-def test_rotations_stay_rigid(real):
-    _, _, _, log = real
-    for actor in log.actors[:20]:
-        matrices = se3(actor.track.xyz, actor.track.quat)[:, :3, :3]
-        np.testing.assert_allclose(
-            matrices @ np.swapaxes(matrices, 1, 2),
-            np.broadcast_to(np.eye(3), matrices.shape),
-            atol=1e-12,
-        )
-    assert matrix_from_quat(log.ego_log.quat)[:, 2, 2].min() > 0.99

@@ -37,7 +37,3 @@ def test_both_directions_of_a_lens_undo_each_other(values):
     radius = np.linalg.norm(project_ftheta(camera, rays) - (camera.cx, camera.cy), axis=1)
     back = polynomial(radius, camera.lens.pixel_to_angle)
     np.testing.assert_allclose(back, theta, atol=1e-9 if camera.backward_given else 1e-4)
-
-
-def test_nothing_is_seen_beyond_the_lens():
-    assert np.isnan(project_ftheta(lens_of(np.array(WIDE)), np.array([[1.0, 0.0, -1.0]]))).all()

@@ -141,15 +141,6 @@ def test_lanes_of_both_sides_run_against_each_other():
     assert found.lanes["1.0.-2"].kind == "shoulder"
 
 
-def test_with_left_hand_traffic_lanes_run_the_other_way():
-    found = lanes_of(road(left=lane(1), right=lane(-1), more='rule="LHT"'))
-    np.testing.assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
-    np.testing.assert_allclose(
-        found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12
-    )  # its left is the road's outside
-    np.testing.assert_allclose(found.lanes["1.0.1"].right[:, 1], 0.0, atol=1e-12)
-
-
 def test_widths_offsets_heights_and_borders_follow_the_true_arc_length():
     taper = lane(
         -1,
@@ -193,16 +184,6 @@ def test_lanes_are_linked_along_sections_roads_and_junctions():
     assert found.lanes["1.0.-1"].successors == ("1.1.-1",)
     assert found.lanes["1.1.-1"].successors == ("2.0.-1",)
     assert found.lanes["2.0.-1"].is_intersection
-
-
-def test_paint_of_marks():
-    mark = '<roadMark sOffset="0" type="{}" color="{}"/>'
-    middle = (
-        f'<center><lane id="0" type="none">{mark.format("solid solid", "yellow")}</lane></center>'
-    )
-    sides = f"{middle}<right>{lane(-1, more=mark.format('broken', 'white'))}</right>"
-    one = lanes_of(road(sections=f'<laneSection s="0">{sides}</laneSection>')).lanes["1.0.-1"]
-    assert (one.left_paint, one.right_paint) == ("double_yellow", "dashed_white")
 
 
 NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
@@ -374,15 +355,6 @@ def test_lanes_of_real_maps_are_sound(shared_data, name):
             # Town03 links shoulders across the tips of two head-on roads that are 8 cm and 96 cm
             # long.
             assert gap < 0.01 or one.kind == "shoulder", (one.lane_id, after, gap)
-
-
-def test_widths_of_a_real_straight_road(shared_data):
-    found, _ = lane_map_of(
-        FILES, "s", real(shared_data, "opendrive-esmini/straight_500m.xodr"), np.eye(4)
-    )
-    for key in ("1.0.-1", "1.0.1"):
-        one = found.lanes[key]
-        assert np.hypot(*(one.left[0, :2] - one.right[0, :2])) == pytest.approx(3.07)
 
 
 def test_cars_of_another_simulator_drive_in_the_lanes(shared_data):

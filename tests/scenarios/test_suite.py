@@ -8,7 +8,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
-from scenarios.suite import ScenarioRef, expand, load_suite
+from scenarios.suite import ScenarioRef, load_suite
 
 SCENE = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\ntiming: {duration_us: 2000000}\n"
 
@@ -43,21 +43,6 @@ def test_one_scenario_or_recording_is_a_suite_of_one(folder: Path, repo: Path) -
     assert load_suite(folder / "one.yaml") == [ScenarioRef(str(folder / "one.yaml"))]
     xml = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
     assert load_suite(xml) == [ScenarioRef(str(xml))]
-
-
-def test_argoverse_folder_is_one_recording(shared_data: Path) -> None:
-    log = next(p for p in sorted((shared_data / "av2").iterdir()) if p.is_dir())
-    assert load_suite(log) == [ScenarioRef(str(log))]
-
-
-def test_command_line_overrides_come_last(folder: Path) -> None:
-    refs = expand(str(folder / "suite.yaml"), ["ego.cruise_mps=9"])
-    assert refs[1].overrides == ("ego.cruise_mps=8", "ego.cruise_mps=9")
-    assert refs[0].overrides == ("ego.cruise_mps=9",)
-
-
-def test_shipped_suites_have_short_names() -> None:
-    assert load_suite("smoke") == load_suite("suites/smoke")
 
 
 def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:

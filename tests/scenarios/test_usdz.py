@@ -83,21 +83,6 @@ def test_rails_as_a_struct_of_lists_give_the_same_map(tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.lane_map.lanes["L0"].left, two.lane_map.lanes["L0"].left)
 
 
-def test_a_segment_of_exactly_two_metres_is_split_as_in_alpasims_loader(tmp_path: Path) -> None:
-    rows = [{"key": key("L"), "lane": {"left_rail": rail(1.0, 61), "right_rail": rail(-1.0, 61)}}]
-    scene = read_usdz_scene(
-        write(tmp_path / "a.usdz", changed(clipgt__lane_dot_parquet=parquet(rows)))
-    )
-    assert len(scene.lane_map.lanes["L"].centre) == 121
-
-
-def test_stripped_rails_leave_the_centres(tmp_path: Path) -> None:
-    lane = read_usdz_scene(write(tmp_path / "a.usdz"), rails=False).lane_map.lanes["L0"]
-    assert lane.left is None
-    assert lane.right is None
-    assert len(lane.centre) > 2
-
-
 def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_path: Path) -> None:
     path = write(
         tmp_path / "a.usdz", {k: v for k, v in members().items() if not k.startswith("clipgt")}
@@ -240,13 +225,6 @@ def test_a_member_that_swells_beyond_the_limit_is_refused(
     data[at + 24 : at + 28] = (1000).to_bytes(4, "little")
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match=r"more than 100000 bytes|cannot be read"):
-        read_usdz(path)
-
-
-def test_a_cut_archive_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.usdz")
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(InputError, match="no readable ZIP"):
         read_usdz(path)
 
 

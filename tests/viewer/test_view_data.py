@@ -102,20 +102,6 @@ def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
     assert thinned["t"] == [0, 300, 600, 900]
 
 
-def test_every_camera_is_kept(tmp_path: Path) -> None:
-    run = read_run(make_watched(tmp_path, SMALL, cameras=("front", "left")))
-    (cell,) = cells_of(run)
-    for drive in cell_data(run, cell, read_logs(run, cell), Fineness())["drives"]:
-        shown = [(one["name"], number_of(one["jpeg"][5])) for one in drive["cameras"]]
-        assert shown == [("front", 5), ("left", 105)]
-        assert drive["no_frames"] == ""
-
-
-def test_wide_frames_are_made_smaller_and_keep_their_shape(small_run: Path) -> None:
-    camera = only_cell(small_run, Fineness(width_px=32))["drives"][0]["cameras"][0]
-    assert (camera["width"], camera["height"]) == (32, 18)
-
-
 def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known() -> None:
     assert clock_zero_us({"start_us": 500_000}, 0) == 500_000
     assert (
@@ -327,10 +313,6 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), root / "rollouts.parquet")
     assert write_flips_page(root) == {}
     assert not (root / FLIPS_PAGE).exists()
-
-
-def test_the_whole_drive_of_the_fixture_is_watched(watched_run: Path) -> None:
-    assert {cell.scene for cell in cells_of(read_run(watched_run))} == set(WATCHED.scenes)
 
 
 def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path: Path) -> None:

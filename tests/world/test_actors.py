@@ -90,19 +90,6 @@ def test_replay_is_present_exactly_from_its_first_to_its_last_pose() -> None:
     assert present == [100_000, 1_100_000]
 
 
-def test_one_pose_track_is_there_at_its_instant() -> None:
-    one = Trajectory(
-        np.array([200_000]), np.array([[1.0, 2.0, 0.75]]), quat_from_yaw(np.array([0.3]))
-    )
-    actors = Actors([Actor("a", "car", BOX, one)], Vehicle(), 0)
-    assert actors.step(100_000, FAR_AWAY) == {}
-    np.testing.assert_allclose(actors.step(200_000, FAR_AWAY)["a"][:3, 3], [1.0, 2.0, 0.75])
-
-
-def test_no_actors_at_all() -> None:
-    assert Actors([], Vehicle(), 0).step(0, FAR_AWAY) == {}
-
-
 def test_time_must_go_forwards_until_a_reset() -> None:
     actors = Actors([Actor("a", "car", BOX, line_track(0, 5))], Vehicle(), 0)
     actors.step(500_000, FAR_AWAY)
@@ -128,12 +115,6 @@ def test_reactive_driver_stops_behind_a_standing_ego_without_contact() -> None:
     gaps = rear_of_ego - (np.array(x) + BOX.length_m / 2)
     assert gaps.min() > 1.0
     assert abs(x[-1] - x[-11]) < 1.0, "slower than 1 m/s by then"
-
-
-def test_reactive_driver_keeps_a_speed_on_a_free_road() -> None:
-    actors = Actors([idm("a", 0, 10)], Vehicle(), 500_000, ground=flat())
-    x = run(actors, FAR_AWAY, 8_000_000)["a"]
-    np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
 
 
 def test_reactive_driver_follows_a_replayed_leader_that_stops() -> None:
@@ -224,13 +205,6 @@ def test_a_track_that_begins_late_reacts_from_then_on() -> None:
     assert not any(seen[t] for t in range(0, 2_000_000, 100_000))
     assert float(seen[2_000_000]["a"][0, 3]) == pytest.approx(0.0, abs=0.9)
     assert float(seen[10_000_000]["a"][0, 3]) + 2.3 < 30 + 1.4 - 4.855 / 2
-
-
-def test_reset_gives_the_same_drive_again() -> None:
-    actors = Actors([idm("a", 0, 10), idm("b", -15, 12)], Vehicle(), 500_000, ground=flat())
-    first = run(actors, ego_at(70.0), 6_000_000)
-    actors.reset()
-    assert run(actors, ego_at(70.0), 6_000_000) == first
 
 
 def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:

@@ -19,8 +19,6 @@ from alpasim_plugin.world.idm import (
     find_leader,
     find_leaders,
     idm_acceleration,
-    nearest_ahead,
-    spans,
 )
 from alpasim_plugin.world.path import Lines, polyline_path
 
@@ -119,22 +117,6 @@ def test_a_crossing_truck_blocks_with_its_length() -> None:
         ROAD, 10.0, 0.95, car(40, 5.0, np.pi / 2, 3.0, truck)
     ).gap_m == pytest.approx(40 - 1.25 - 10)
     assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, 0.0, 3.0, truck)).index == -1
-
-
-def test_oncoming_leader_counts_as_standing() -> None:
-    assert find_leader(ROAD, 10.0, 0.95, car(40, 0, np.pi, 8.0)).speed_mps == 0.0
-
-
-def test_nobody_there() -> None:
-    assert find_leader(ROAD, 10.0, 0.95, NO_BODIES).gap_m == INF
-    assert find_leader(ROAD, 10.0, 0.95, car(190, 0), horizon_m=50).index == -1
-
-
-def test_known_places_of_standing_bodies_give_the_same_leader() -> None:
-    bodies = concatenate([car(60, 0.5), car(90, 0), car(50, 4)])
-    whole = spans(ROAD, 0.0, bodies, 300.0, window=False)
-    for front in (5.0, 40.0, 63.0, 80.0):
-        assert nearest_ahead(whole, front, 0.95) == find_leader(ROAD, front, 0.95, bodies)
 
 
 def test_the_leaders_of_many_drivers_are_those_of_each() -> None:

@@ -27,10 +27,6 @@ def straight(y: float) -> object:
     )
 
 
-def test_grid_ends_exactly_at_the_end() -> None:
-    assert grid(0, 120_000).tolist() == [0, 50_000, 100_000, 120_000]
-
-
 def test_hard_brake_stops_after_the_physical_distance() -> None:
     t = grid(0, 8_000_000)
     s = integrate(t, speed_profile(t, [(2.0, 12.0), (4.0, 0.0)]), 10.0)

@@ -93,15 +93,6 @@ def test_a_town_with_merge_split_and_two_junctions_is_sound() -> None:
     assert len(road.backward_chain(0)) == len(TOWN)
 
 
-def test_every_lane_is_drivable_ground() -> None:
-    road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
-    ground = shapely.union_all(
-        [shapely.Polygon(a[:, :2]).buffer(1e-6) for a in road.lane_map.drivable_areas]
-    )
-    for lane in road.lane_map.lanes.values():
-        assert polygon(lane).difference(ground).area < 0.05, lane.lane_id
-
-
 def test_no_seam_between_consecutive_stretches() -> None:
     road = build_road(
         [Curve(30), Curve(25, 0, 0.03), Curve(25, 0.03, -0.03), Curve(30, -0.03, 0)], Profile(2, 2)
@@ -122,22 +113,6 @@ def test_road_edges_never_cross_the_main_roads_lanes() -> None:
     )
     for edge in road.lane_map.road_edges:
         assert not middle.crosses(shapely.LineString(edge[:, :2]))
-
-
-def test_both_directions_share_the_centre_line_array() -> None:
-    lane_map = build_road([Curve(30)], Profile(1, 1)).lane_map
-    left, oncoming = lane_map.lanes["s0_f0"].left, lane_map.lanes["s0_b0"].left
-    assert left is not None
-    assert oncoming is not None
-    np.testing.assert_array_equal(left, oncoming[::-1])
-    assert lane_map.lanes["s0_f0"].left_paint == "double_yellow"
-    assert lane_map.lanes["s0_f0"].right_paint == "solid_white"
-
-
-def test_oncoming_lane_runs_the_other_way_on_the_left() -> None:
-    lane_map = build_road([Curve(30)], Profile(1, 1, lane_width_m=3.0)).lane_map
-    np.testing.assert_allclose(lane_map.lanes["s0_f0"].centre[[0, -1], :2], [[0, -1.5], [30, -1.5]])
-    np.testing.assert_allclose(lane_map.lanes["s0_b0"].centre[[0, -1], :2], [[30, 1.5], [0, 1.5]])
 
 
 def test_left_turn_leads_from_inner_to_inner_lane_and_right_turn_from_outer_to_outer() -> None:

@@ -4,7 +4,6 @@ built.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,20 +14,11 @@ from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core import limits as bounds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART
-from alpasim_plugin.core.limits import Bound
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.world.idm import Bodies
 from alpasim_plugin.world.path import FEW_DISTANCES, nearest
 from scenarios.budget import check_scenario
 from scenarios.load import load_scenario
 from tests.core.reading import past_failures as seen
-
-
-def test_every_bound_has_a_range_a_reason_and_a_name_of_its_own() -> None:
-    known = [value for value in vars(bounds).values() if isinstance(value, Bound)]
-    assert len(known) > 50
-    assert all(bound.low < bound.high and bound.reason and bound.name for bound in known)
-    assert len({bound.name for bound in known}) == len(known)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.3, 0.3])
@@ -87,15 +77,6 @@ def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built() -> None:
         )
 
 
-def queue(n: int, seed: int) -> tuple[Bodies, np.ndarray]:
-    random = np.random.Generator(np.random.Philox(seed))
-    s = np.sort(random.uniform(0, 400, n))
-    xy = np.column_stack([s, random.choice([0.0, 0.0, 1.4, 3.5, -9.0], n)])
-    yaw = random.uniform(-0.3, 0.3, n)
-    velocity = random.uniform(0, 10, (n, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    return Bodies(xy, yaw, np.full(n, 2.3), np.full(n, 0.9), velocity), s
-
-
 def test_the_tree_names_the_station_that_comparing_all_names() -> None:
     stations = np.column_stack([np.arange(0, 500, 0.25), np.zeros(2000)])
     points = np.column_stack([np.linspace(-3, 505, 400).round(3), np.full(400, 2.0)])
@@ -103,15 +84,3 @@ def test_the_tree_names_the_station_that_comparing_all_names() -> None:
     assert len(points) * len(stations) > FEW_DISTANCES
     few = np.concatenate([nearest(points[i : i + 50], stations) for i in range(0, 400, 50)])
     assert np.array_equal(nearest(points, stations), few)
-
-
-def test_the_schema_and_the_readers_name_the_same_limits() -> None:
-    schema = json.loads(
-        (Path(__file__).resolve().parents[3] / "scenarios" / "schema.json").read_text()
-    )
-    arc = schema["$defs"]["ArcSegment"]["properties"]
-    assert (arc["curvature_per_m"]["minimum"], arc["curvature_per_m"]["maximum"]) == (
-        bounds.CURVATURE_PER_M.low,
-        bounds.CURVATURE_PER_M.high,
-    )
-    assert arc["length_m"]["maximum"] == bounds.SEGMENT_M.high

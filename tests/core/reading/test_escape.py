@@ -5,10 +5,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import pytest
-
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.escape import MAX_PART, markdown, shorten, terminal, xml
+from alpasim_plugin.core.escape import MAX_PART, markdown, terminal, xml
 from evaluators.report.ci import write_junit, write_summary_md
 from tests.report.make_run import Plan, make_run
 
@@ -45,14 +43,6 @@ def test_parts_of_errors_are_short_and_cannot_act() -> None:
     assert "aaa" in error.message
     assert "more" in error.message
     assert str(error).count("\n") == 1
-
-
-@pytest.mark.parametrize("length", [599, 600, 601, 5000])
-def test_shortening_keeps_both_ends(length: int) -> None:
-    text = "<" + "x" * (length - 2) + ">"
-    short = shorten(text)
-    assert len(short) <= 600
-    assert (short[0], short[-1]) == ("<", ">")
 
 
 def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path: Path) -> None:

@@ -8,13 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.fit import SplatRecipe, drive
 from alpasim_plugin.gaussians.fit.drive import FittedDrive, fit_drive
 from alpasim_plugin.gaussians.fit.loop import SplatFit
-from alpasim_plugin.gaussians.fit.model import Exposure, needles
+from alpasim_plugin.gaussians.fit.model import Exposure
 from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth
@@ -99,18 +97,6 @@ def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(
     assert again.model.background.means.tobytes() == whole.model.background.means.tobytes()
 
 
-def test_photographs_that_share_nothing_and_no_points_are_refused(views: list[PosedView]) -> None:
-    rng = np.random.default_rng(0)
-    noise = [
-        replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8))
-        for view in views[:3]
-    ]
-    with pytest.raises(InputError):
-        fit_drive(noise, None, recipe=QUICK)
-    with pytest.raises(InputError):
-        fit_drive([], None)
-
-
 def test_photographs_that_share_nothing_start_from_given_points(views: list[PosedView]) -> None:
     rng = np.random.default_rng(0)
     noise = [
@@ -146,15 +132,6 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[Pos
         return float(np.median(run.model.clouds()[0].means[:, 0]))
 
     assert abs(fitted_to(0.5) - 8.0) < 0.5 < abs(fitted_to(0.0) - 8.0)
-
-
-def test_a_needle_costs_and_a_disc_does_not() -> None:
-    disc, needle = (
-        torch.log(torch.tensor([[1.0, 1.0, 0.01]])),
-        torch.log(torch.tensor([[1.0, 0.05, 0.05]])),
-    )
-    assert float(needles(disc, 6.0)) == 0
-    assert float(needles(needle, 6.0)) == pytest.approx(np.log(20 / 6), rel=1e-4)
 
 
 def test_an_exposure_learns_its_gain_and_keeps_the_mean() -> None:

@@ -121,8 +121,3 @@ def test_what_cannot_be_is_one_clear_error(
     change(tmp_path, **keys)
     with pytest.raises(InputError):
         read_views(tmp_path)
-
-
-def test_a_folder_without_the_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        read_views(tmp_path)

@@ -11,7 +11,7 @@ import pytest
 
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_between
-from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, adjust, corrected, follow, place
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
 
@@ -43,13 +43,6 @@ def test_points_followed_through_the_street_lie_on_its_surfaces(
     on_box = (np.abs(xyz[:, 1] - 2.9) < 1.0 + slack) & (np.abs(xyz[:, 0] - 16.0) < 2.2 + slack)
     assert good.sum() > 200
     assert (on_wall | on_road | on_box).mean() > 0.95
-
-
-def test_a_point_seen_once_is_no_track(tracks: Tracks) -> None:
-    first = tracks.only(tracks.view == 0)
-    assert first.count == 0
-    two = tracks.only(tracks.view < 2)
-    assert (np.bincount(two.point) == 2).all()
 
 
 def test_masked_pixels_start_no_track(views: list[PosedView]) -> None:
@@ -87,14 +80,6 @@ def test_poses_that_are_off_come_back_to_the_truth(views: list[PosedView]) -> No
     assert np.median(errors(list(found.cameras))) < 0.25 * np.median(
         errors([view.camera for view in wrong])
     )
-
-
-def test_poses_without_tracks_stay_as_they_are(views: list[PosedView]) -> None:
-    cameras = [view.camera for view in views]
-    none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
-    found = adjust(cameras, none)
-    assert list(found.cameras) == cameras
-    assert np.isnan(found.after_px)
 
 
 def test_depth_by_flow_is_the_street_s(

@@ -19,10 +19,9 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
-from alpasim_plugin.lab.bench.quality import Work, finish, lose_resolution, shown_frames
+from alpasim_plugin.lab.bench.quality import Work, finish, shown_frames
 from alpasim_plugin.lab.cli.bench_quality import parse_variants
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
-from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import summarise
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
@@ -134,45 +133,6 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
         assert json.loads(work.row_file.read_text())["key"] != key
 
 
-@pytest.mark.slow
-def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(
-    data: Path, bundle: Path, tmp_path: Path
-) -> None:
-    command = [
-        "bench",
-        "quality",
-        str(data),
-        "--input",
-        "truth",
-        "--baseline",
-        "small",
-        "--pictures",
-        "0",
-        "--out",
-        str(tmp_path),
-    ]
-    assert run_command([*command, "--fixer", f"identity,small={bundle}"]) == 0
-    rows = {
-        label: json.loads((tmp_path / "clips" / label / "a.json").read_text())["row"]
-        for label in ("identity", "small")
-    }
-    assert rows["identity"]["identical"] == FRAMES
-    assert rows["small"]["values"]["psnr_db"] < rows["identity"]["values"]["psnr_db"]
-    assert json.loads((tmp_path / "quality.json").read_text())["run"]["input"] == "truth"
-
-
-def test_lost_resolution_is_the_same_damage_at_every_frame_and_of_the_clip_alone() -> None:
-    video = np.random.default_rng(0).integers(0, 256, (1, 48, 64, 3), np.uint8).repeat(2, axis=0)
-    damaged, opacity = lose_resolution(video, "a")
-    assert damaged.shape == video.shape
-    assert np.array_equal(damaged[0], damaged[1])
-    assert np.array_equal(opacity[0], opacity[1])
-    steps = [np.abs(np.diff(one.astype(int), axis=2)).mean() for one in (damaged, video)]
-    assert steps[0] < 0.6 * steps[1]
-    assert np.array_equal(lose_resolution(video, "a")[0], damaged)
-    assert not np.array_equal(lose_resolution(video, "b")[0], damaged)
-
-
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
     variants = parse_variants(
         f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"]
@@ -250,14 +210,3 @@ def test_drift_holds_the_end_against_frames_50_to_100() -> None:
     made[100:] = 2
     assert clip_quality(made, black, {}).means["drift_psnr_db"] == pytest.approx(20 * np.log10(0.5))
     assert "drift_psnr_db" not in clip_quality(made[:149], black[:149], {}).means
-
-
-def test_shown_frames_lie_in_the_clip() -> None:
-    assert shown_frames(198) == (19, 98, 191)
-    assert shown_frames(2) == (0,)
-
-
-def test_pictures_of_other_sizes_are_not_laid_out() -> None:
-    a, b = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8)
-    with pytest.raises(EvaluatorError):
-        sheet({"a": [a], "b": [b]}, ["x"])

@@ -22,7 +22,7 @@ from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
 from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation
-from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
+from alpasim_plugin.lab.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.lab.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.lab.training.recipes.recipe import Recipe, Stage
 from alpasim_plugin.lab.training.recipes.registry import by_name, recipe_of, with_objective
@@ -158,33 +158,6 @@ def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_
     less = train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path / "less", stop_at=1)
     with pytest.raises(InputError):
         train_fixer(run_of(data, recipe, student=student, teacher=less), tmp_path / "run")
-
-
-@pytest.mark.parametrize(("same", "rollouts"), [(True, 1), (False, 2)])
-def test_the_critic_judges_the_students_rollout_or_one_of_its_own(
-    data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    same: bool,
-    rollouts: int,
-) -> None:
-    recipe = recipe_of("self-forcing")
-    stage = replace(recipe.stages[-1], objective=Distillation(same_rollout=same))
-    run = run_of(data, recipe)
-    task = stage.objective.task(stage_inputs(run, stage, clips_of(data, tmp_path), {}, None))
-    made: list[torch.Tensor] = []
-    judged: list[torch.Tensor] = []
-    roll_out, critic = task.roll_out, task._critic_loss
-    monkeypatch.setattr(task, "roll_out", lambda *args: made.append(roll_out(*args)) or made[-1])
-    monkeypatch.setattr(task, "_critic_loss", lambda z, *args: judged.append(z) or critic(z, *args))
-    batch = task.batch(0)
-    task.loss(batch, 0)
-    assert len(made) == rollouts
-    assert torch.equal(judged[0], made[-1])
-    assert not judged[0].requires_grad
-    assert batch.student is not None
-    assert not torch.equal(batch.student.score, batch.critic.score)
-    assert task.batch(1).student is None
 
 
 def test_a_head_that_no_longer_teaches_stops_its_run(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from shutil import copytree
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
 from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import train_fixer
-from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
 from alpasim_plugin.lab.training.trainer import Schedule
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
@@ -66,53 +64,6 @@ def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(
         Rollouts(clips, vae_of(bundle), other, 2, 4, "drawn", tmp_path / "r").digest
         != rollouts.digest
     )
-
-
-@pytest.mark.slow
-def test_a_generator_without_a_map_is_rolled_out_without_one(
-    data: Path, bundle: Path, tmp_path: Path
-) -> None:
-    clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    with_map, without = (
-        Rollouts(clips, vae_of(bundle), net, 2, 4, shown, tmp_path / "r")
-        for shown in ("drawn", "nothing")
-    )
-    assert not torch.equal(with_map[0][1], without[0][1])
-    blind = Path(copytree(data, tmp_path / "blind")) / "train"
-    for name in ("a", "b"):  # the same pairs, but for their maps
-        np.save(blind / name / "sdmap.npy", np.zeros_like(np.load(blind / name / "sdmap.npy")))
-        info = blind / name / "sequence.json"
-        info.write_text(
-            json.dumps({k: v for k, v in json.loads(info.read_text()).items() if k != "content"})
-        )
-    unmapped = clips_of(blind.parent, tmp_path / "z")
-    assert torch.equal(
-        Rollouts(unmapped, vae_of(bundle), net, 2, 4, "nothing", tmp_path / "r")[0][1],
-        without[0][1],
-    )
-    assert not torch.equal(
-        Rollouts(unmapped, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")[0][1], with_map[0][1]
-    ), "other pairs, other rollouts"
-
-
-def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
-    from alpasim_plugin.lab.training.shared_rollout import roll_out
-
-    generator = torch.Generator().manual_seed(0)
-    z_r, z_0, z_map, eps, context = (
-        torch.randn(1, 16, 5, 4, 4, generator=generator) for _ in range(5)
-    )
-    m = torch.rand(1, 1, 5, 4, 4, generator=generator).round()
-    t = torch.rand(1, 5, generator=generator)
-    text = torch.zeros(1, 1, 7)
-    net = net_of(bundle)
-    text = torch.zeros(1, 1, net.sizes.text_width)
-    made = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=2, window=4)
-    sample = Sample(z_r, z_0, z_map, m, eps, context, t, t, 2)
-    with torch.no_grad():
-        wanted = losses(net, sample, text, Objectives("own", 0), block_latents=2, window=4).rollout
-    assert wanted is not None
-    assert torch.equal(made, wanted)
 
 
 def test_only_the_decoder_learns_and_pictures_get_nearer(

@@ -4,18 +4,14 @@ learn from.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_of
-from alpasim_plugin.core.types import Trajectory
-from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.training.demonstrations import (
     DEMONSTRATIONS_FILE,
     DemonstrationRecipe,
@@ -27,7 +23,6 @@ from alpasim_plugin.lab.training.demonstrations import (
 )
 from alpasim_plugin.lab.training.perturbed_rollouts import (
     perturbed_rollouts,
-    traffic_at,
     turning_lines,
 )
 from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
@@ -118,20 +113,6 @@ def test_every_turn_of_a_junction_has_a_rollout() -> None:
     assert sorted(np.round(turned_by)) == [-90, 0, 90]
 
 
-def test_who_appears_at_this_instant_moves_as_the_log_shows_it_next(scenario) -> None:
-    actor = next(
-        a for a in scenario.actors if np.linalg.norm(np.ptp(a.track.xyz[:, :2], axis=0)) > 5.0
-    )
-    late = replace(
-        actor, track=Trajectory(actor.track.t_us[10:], actor.track.xyz[10:], actor.track.quat[10:])
-    )
-    t_us = int(late.track.t_us[0])
-    _, seen = traffic_at(replace(scenario, actors=(late,)), t_us, None)
-    _, before = traffic_at(replace(scenario, actors=(actor,)), t_us, None)
-    assert np.linalg.norm(before.velocity) > 1.0
-    np.testing.assert_allclose(seen.velocity, before.velocity, atol=0.5)
-
-
 def test_drives_leave_the_path_and_meet_others(scenario) -> None:
     drives = list(perturbed_rollouts(scenario, 12, 3.0, 0))
     lateral = np.array(
@@ -183,8 +164,3 @@ def test_sigma_sends_no_gradient_into_the_plan(root: Path) -> None:
     (plan, sigma), (plan_again, other_sigma) = gradients(0.0), gradients(1.5)
     assert torch.equal(plan, plan_again)
     assert not torch.allclose(sigma, other_sigma)
-
-
-def test_a_folder_without_scenarios_is_refused(tmp_path: Path) -> None:
-    command = ["policy", str(tmp_path), "--out", str(tmp_path / "run"), "--steps", "2"]
-    assert isinstance(CliRunner().invoke(app, command).exception, InputError)

@@ -26,7 +26,6 @@ from alpasim_plugin.lab.training.dmd import (
     score_levels,
 )
 from alpasim_plugin.lab.training.flow_matching import FlowMatching, bell_weight, noise_levels
-from alpasim_plugin.lab.training.recipes.causal_arms import long_blocks
 from alpasim_plugin.lab.training.recipes.recipe import Attention
 from alpasim_plugin.lab.training.shared_rollout import Sample
 from alpasim_plugin.lab.training.tail_drop import TailDrop, visible_share
@@ -271,10 +270,3 @@ def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one() ->
     assert float(weights.mean()) == pytest.approx(1.0, abs=1e-6)
     assert float(weights.min()) == pytest.approx(0.0, abs=1e-6)
     assert weights.argmax() == (5 * u / (1 + 4 * u) - 0.5).abs().argmin()
-
-
-def test_blocks_of_the_long_block_arm() -> None:
-    assert [long_blocks(n) for n in (24, 12)] == [
-        Attention(6, 18, 6, "last-forward"),
-        Attention(4, 12, 4, "last-forward"),
-    ]

@@ -4,14 +4,11 @@ is kept.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
@@ -61,18 +58,3 @@ def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
                 PhotographRecipe(width=64, every=5),
             )
         )
-
-
-@pytest.mark.slow
-def test_real_photographs_become_pairs_once(
-    data_set: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--width", "64", "--every", "2", "--steps", "60", "--json"]
-    command = ["train", "photographs", str(data_set("fox")), "--out", str(tmp_path), *words]
-    assert run_command(command) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert (rows["sequences"], len(rows["missing"])) == (2, 17)
-    for row in rows["rows"]:
-        assert row["psnr_db"]["held_out"] > 14.0
-    assert run_command(command) == 0
-    assert not any(row["made"] for row in json.loads(capsys.readouterr().out)["rows"])

@@ -15,15 +15,12 @@ from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.lab.training.episode_references import (
     SLOTS,
     ReferenceDraw,
-    draw_references,
     pair_references,
     road_users,
     video_references,
 )
 from alpasim_plugin.lab.training.map_errors import (
-    CHANCES,
     MapError,
-    draw_map_error,
     is_paint,
     with_error,
 )
@@ -174,13 +171,6 @@ def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path: Path)
     ]
     assert any(same)
     assert not all(same)  # most flows are bent
-
-
-def test_draws_have_every_count_and_every_error_of_the_map() -> None:
-    rng = np.random.default_rng(0)
-    draws = [draw_references(rng) for _ in range(400)]
-    assert {draw.count for draw in draws} == set(range(SLOTS + 1))
-    assert {draw_map_error(rng).kind for _ in range(400)} == set(CHANCES)
 
 
 def test_errors_of_the_map_do_what_their_names_say() -> None:

@@ -57,12 +57,6 @@ def test_blur_noise_and_contrast_count_little() -> None:
         assert float(grid_term(other, truth)) < 0.35 * marked
 
 
-def test_its_gradient_removes_the_pattern() -> None:
-    truth, size = picture(), torch.tensor(0.02, requires_grad=True)
-    (gradient,) = torch.autograd.grad(grid_term(truth + pattern(4, 1.0) * size, truth), size)
-    assert float(gradient) > 0
-
-
 def test_streams_count_one_by_one_and_a_flat_picture_is_finite() -> None:
     truth = picture()
     made = truth + pattern(4, 0.02)

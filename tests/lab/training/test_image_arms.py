@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,7 +16,6 @@ from typer.testing import CliRunner
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -26,9 +24,7 @@ from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
-from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
-from alpasim_plugin.lab.training.trainer import Schedule
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 
@@ -150,12 +146,6 @@ def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(
     assert [frame.t_us for frame in fixed] == [frame.t_us for frame in frames]
 
 
-def test_the_published_decay_of_gsfix3d_in_the_papers_updates() -> None:
-    stage = recipe_of("gsfix3d").stages[0]
-    schedule = Schedule(10_000, peak_lr=1.0, decay=stage.decay, last_share=stage.last_share)
-    assert schedule.lr(10_000) == pytest.approx(0.1585, abs=1e-4)  # a hundredth after 25,000
-
-
 @pytest.mark.parametrize(
     "recipe", ["harmonizer-temporal", pytest.param("gsfix3d", marks=pytest.mark.slow)]
 )
@@ -168,60 +158,6 @@ def test_an_arm_resumes_bit_for_bit(
     whole = load_weights(trained(recipe))
     assert again.keys() == whole.keys()
     assert all(torch.equal(value, whole[key]) for key, value in again.items())
-
-
-@pytest.mark.slow
-def test_windows_fix_recorded_clips_by_both_commands(
-    trained: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bundle, frames = trained("3dgs-enhancer"), 27  # two windows
-    make(tmp_path / "pairs", "val", "a", frames=frames, width=32)
-    given, made = tmp_path / "given", tmp_path / "made"
-    given.mkdir()
-    for i, image in enumerate(pixels(moving_picture(frames, (32, 32)))):
-        cv2.imwrite(str(given / f"{i:03d}.png"), image)
-    weights = f"fixer.weights.bundle={bundle}"
-    assert (
-        run_command(
-            [
-                "refine",
-                str(given),
-                "-o",
-                str(made),
-                "--fixer",
-                "3dgs-enhancer",
-                "--set",
-                weights,
-                "--anyway",
-                "--quiet",
-            ]
-        )
-        == 0
-    )
-    assert len(list(made.iterdir())) == frames
-    command = [
-        "bench",
-        "quality",
-        str(tmp_path / "pairs"),
-        "--split",
-        "val",
-        "--pictures",
-        "0",
-        "--out",
-        str(tmp_path / "q"),
-        "--json",
-    ]
-    capsys.readouterr()
-    assert run_command([*command, "--fixer", f"3dgs,e={bundle},g={trained('gsfix3d')}"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["arms"]["e"]["psnr_db"]["mean"] != summary["arms"]["3dgs"]["psnr_db"]["mean"]
-    units = summary["run"]["units"]
-    assert units["3dgs"] is None
-    assert (units["e"]["lookahead_frames"], units["e"]["calls_per_frame"]) == (
-        24,
-        pytest.approx(8 / 17),
-    )
-    assert (units["g"]["lookahead_frames"], units["g"]["calls_per_frame"]) == (0, 8)
 
 
 def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(

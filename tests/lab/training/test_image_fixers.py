@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.parts import resolve_renderer
@@ -20,7 +19,6 @@ from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle
 from alpasim_plugin.fixers.refine import refine_frames
-from alpasim_plugin.fixers.settings import Unit
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
@@ -113,13 +111,6 @@ def test_windows_cover_every_frame_and_their_weights_sum_to_one(frames: int) -> 
     assert {(198): 12, 900: 53}.get(frames, len(parts)) == len(parts)
 
 
-def test_where_windows_overlap_the_later_one_fades_in_linearly() -> None:
-    weights = fade_weights(windows(42, 25, 17), 8)
-    np.testing.assert_allclose(np.diff(weights[1, 16:26]), 1 / 9, atol=1e-6)
-    assert weights[1, 16] == 0
-    assert weights[1, 25] == 1
-
-
 @pytest.mark.parametrize("name", ["harmonizer-temporal", "gsfix3d"])
 def test_cameras_are_alike_alone_together_and_at_different_rates(
     session: Callable[..., Fixer], name: str
@@ -167,24 +158,6 @@ def test_the_temporal_model_looks_at_four_outputs_and_no_further(
     after = pixels(run(session("harmonizer-temporal"), changed))
     assert np.array_equal(after[1:4], temporal[1:4])
     assert levels(after[4], temporal[4]) > 0, "the fifth sees the first"
-
-
-def test_the_present_latent_does_not_depend_on_the_references_in_the_encoder_nor_the_present_frame_in_the_decoder(
-    settings_of: Callable[..., Settings],
-) -> None:
-    settings = settings_of("harmonizer-temporal")
-    networks = load_networks(settings)
-    generator = torch.Generator().manual_seed(0)
-    now, one, other = (torch.rand(1, 3, n, 16, 24, generator=generator) * 2 - 1 for n in (1, 4, 4))
-    with torch.inference_mode():
-        z_one, z_other = (
-            networks.vae.encode(torch.cat([now, references], dim=2)) for references in (one, other)
-        )
-        assert torch.equal(z_one[:, :, 0], z_other[:, :, 0])
-        assert not torch.equal(z_one[:, :, 1], z_other[:, :, 1])
-        torch.testing.assert_close(z_one[:, :, :1], networks.vae.encode(now), atol=1e-6, rtol=0)
-        five, first = networks.vae.decode(z_one), networks.vae.decode(z_one[:, :, :1])
-    torch.testing.assert_close(five[:, :, :1], first, atol=1e-6, rtol=0)
 
 
 class Spoilt(ImageFixer):
@@ -241,23 +214,6 @@ def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name: st
         resolve_renderer(name)
     with pytest.raises(InputError):
         resolve_renderer(name, [f"weights.dit={__file__}"])
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [
-        ("difix", Unit(1, 1, 1, 0)),
-        ("harmonizer", Unit(1, 1, 1, 0)),
-        ("harmonizer-temporal", Unit(1, 1, 2, 0)),
-        ("gsfix3d", Unit(1, 8, 1, 0)),
-        ("gsfix3d@4", Unit(1, 4, 1, 0)),
-        ("3dgs-enhancer", Unit(17, 8, 7, 24)),
-        ("onefixer", Unit(1, 1, 0, 0)),
-        ("onefixer-dit-tiny", Unit(8, 2, 2, 7)),
-    ],
-)
-def test_what_an_arm_costs_is_declared(name: str, unit: Unit) -> None:
-    assert fixer_settings(name).unit == unit
 
 
 def test_labels_blocks_and_refused_settings(session: Callable[..., Fixer]) -> None:

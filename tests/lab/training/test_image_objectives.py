@@ -31,11 +31,8 @@ from alpasim_plugin.lab.training.cut_outs import cut_out, soft_mask
 from alpasim_plugin.lab.training.multi_resolution_noise import multi_resolution_noise
 from alpasim_plugin.lab.training.noise_window import (
     edm_error,
-    log_normal_times,
     noise_window_errors,
-    seen_latents,
     squared_error,
-    uniform_times,
 )
 from alpasim_plugin.lab.training.render_step import RenderStep, picture_losses, warp_term
 from alpasim_plugin.lab.training.warping import flow_between, warping_loss
@@ -209,12 +206,6 @@ def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_fra
     ), "the last four, newest first"
 
 
-def test_conditions_are_dropped_between_the_ends_of_a_window() -> None:
-    seen = seen_latents(np.random.default_rng(0), (2000, 7), 0.2)
-    assert seen[:, [0, -1]].all()
-    assert seen[:, 1:-1].float().mean() == pytest.approx(0.8, abs=0.02)
-
-
 def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -> None:
     z_0, z_r, eps = (normal(3, 16, 2, 4, 4, key=key) for key in ("clean", "render", "noise"))
     s = torch.tensor([0.1, 2.0, 30.0])
@@ -233,16 +224,6 @@ def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -
         rtol=1e-3,
         atol=1e-5,
     )
-
-
-def test_times_are_uniform_and_log_normal() -> None:
-    uniform, log_normal = (
-        draw(stream("tests", 0, "times"), 20000).numpy()
-        for draw in (uniform_times, log_normal_times)
-    )
-    assert uniform.mean() == pytest.approx(0.5, abs=0.01)
-    s = np.log(log_normal / (1 - log_normal))
-    assert (s.mean(), s.std()) == pytest.approx((0.7, 1.6), abs=0.04)
 
 
 def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path() -> None:

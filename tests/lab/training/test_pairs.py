@@ -13,7 +13,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Degradation, Environment, Scenario
 from alpasim_plugin.fixers.warp import VALID
 from alpasim_plugin.lab.training.pair_store import PairSequence
-from alpasim_plugin.lab.training.pairs import MOVING_M, PairRecipe, lateral_offsets, make_sequence
+from alpasim_plugin.lab.training.pairs import PairRecipe, lateral_offsets, make_sequence
 from alpasim_plugin.lab.training.reference_store import open_references
 from alpasim_plugin.renderers.gaussian import clear_cache
 from tests.gaussians.scene_maps import parked, straight, with_camera
@@ -69,20 +69,6 @@ def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(
     assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "none"
 
 
-def test_actors_whose_tracks_are_long_count_as_moving(street: Scenario, tmp_path: Path) -> None:
-    car = street.actors[0]
-    track = replace(car.track, xyz=car.track.xyz + np.array([[0.0, 0, 0], [MOVING_M + 1, 0, 0]]))
-    moving = replace(
-        street,
-        actors=(car, replace(car, actor_id="moves", track=track)),
-        degradation=Degradation("none"),
-    )
-    folder = tmp_path / "pairs" / "val" / "s"
-    make_sequence(moving, folder, PairRecipe(), 0, split="val", family="street")
-    assert PairSequence(folder).info["moving_actors"] == 1
-    assert PairSequence(folder).info["actors"] == 2
-
-
 def test_unknown_camera_names_the_known_ones(street: Scenario, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         make_sequence(
@@ -126,7 +112,3 @@ def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_r
     (again / "references" / "t_us.npy").unlink()
     with pytest.raises(InputError):
         open_references(PairSequence(again))
-
-
-def test_one_offset_holds_for_all_frames(street: Scenario) -> None:
-    assert lateral_offsets(street, PairRecipe(offset_m=-1.0), 0).tolist() == [-1.0] * 5

@@ -5,7 +5,6 @@ the facts of a real set.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -162,28 +161,3 @@ def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> Non
     assert max(np.linalg.norm(points - mean, axis=1).min() for mean in cloud.means) < 1e-6
     with pytest.raises(InputError):
         triangulated(views, matches, [0], 1000, rng)
-
-
-def test_the_facts_of_a_real_set(data_set: Callable[[str], Path]) -> None:
-    folder = data_set("fox")
-    found = read_photographs(folder, 64)
-    assert (len(found.views), found.listed, len(found.missing)) == (50, 67, 17)
-    assert found.missing[:4] == (
-        "images/0005.jpg",
-        "images/0016.jpg",
-        "images/0017.jpg",
-        "images/0024.jpg",
-    )
-    assert {view.rgb.shape for view in found.views} == {(112, 64, 3)}
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    everywhere = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
-    np.testing.assert_allclose(
-        [everywhere.min(axis=0), everywhere.max(axis=0)],
-        [(1.47, -5.55, -2.66), (5.94, 1.54, 2.85)],
-        atol=0.006,
-    )
-    here = everywhere[[frame["file_path"] not in found.missing for frame in frames]]
-    centres = np.array([view.camera.centre_world for view in found.views])
-    spread = [np.linalg.norm(x - x.mean(axis=0), axis=1) for x in (here, centres)]
-    np.testing.assert_allclose(spread[1] / spread[0], 4.0 / spread[0].max())  # one scale for all
-    assert np.linalg.norm(centres, axis=1).max() == pytest.approx(4.0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
+from alpasim_plugin.fixers.bundle import parts_of
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, pixel_source
 from alpasim_plugin.fixers.network.reference_blend import Sources, mix
@@ -227,25 +227,6 @@ def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
     assert torch.equal(found.total, found.flow)
 
 
-def test_stages_take_their_shares_of_the_updates() -> None:
-    two = pixel_variant("V7").weighted(
-        perceptual=0.2, temporal=0.25, flow=0.25, grid=0.01, horizon=4
-    )
-    assert [two.objectives(i, 8).in_pixels for i in range(8)] == [False] * 5 + [True] * 3
-    assert two.objectives(7, 8).perceptual == 0.2
-    assert two.objectives(0, 8).perceptual == 0
-    assert two.facts(8) != two.facts(16)
-    assert pixel_variant("V9").facts(8) == pixel_variant("V9").facts(16)
-
-
-def test_a_variant_is_written_as_it_must_be_run(tmp_path: Path) -> None:
-    for name, holes, uses_map in (("V5", "noise", False), ("V6", "everywhere", True)):
-        bundle = train_per_frame(run_of(2, 1, variant=name), tmp_path / name, None)
-        settings = fixer_settings(*bundle_fixer(bundle))
-        assert isinstance(settings, PixelFixerSettings)
-        assert (settings.holes, settings.uses_map) == (holes, uses_map)
-
-
 def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
@@ -275,20 +256,6 @@ def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None
     assert all(torch.equal(value, other[key]) for key, value in one.items())
     saved = parts_of(load_weights(bundle))["generator"]
     assert torch.equal(saved["mix.weight"], one["average.mix.weight"].half())
-
-
-@pytest.mark.slow
-def test_a_run_may_be_prolonged_until_its_decay_begins(tmp_path: Path) -> None:
-    train_per_frame(run_of(20, 12), tmp_path / "long", None, stop_at=3)
-    train_per_frame(run_of(6, 4), tmp_path / "run", None, stop_at=2)
-    train_per_frame(run_of(20, 12), tmp_path / "run", None, stop_at=3)
-    assert all(
-        torch.equal(value, weights(tmp_path / "run")[key])
-        for key, value in weights(tmp_path / "long").items()
-    )
-    train_per_frame(run_of(5, 3), tmp_path / "run", None)
-    with pytest.raises(InputError):
-        train_per_frame(run_of(20, 12), tmp_path / "run", None)
 
 
 def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:

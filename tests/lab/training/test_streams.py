@@ -16,7 +16,6 @@ from alpasim_plugin.lab.training.streams import (
     StreamBatch,
     StreamShares,
     TrainingStreams,
-    _detailed,
     _lit_references,
     there_and_back,
 )
@@ -75,14 +74,6 @@ def test_shapes_types_and_ranges_are_those_promised(root: Path) -> None:
     assert batch.fresh.shape == batch.kind.shape == (3,)
 
 
-def test_slots_begin_anew_once_an_episode_and_not_all_at_once(root: Path) -> None:
-    made = streams(root)
-    fresh = torch.stack([made.update(i).fresh for i in range(9)]).numpy()
-    assert fresh[0].all()
-    assert fresh[1:].sum(axis=0).tolist() == [2, 2, 2]
-    assert fresh[1:].sum(axis=1).max() == 1
-
-
 def test_frames_follow_one_another_across_updates(root: Path) -> None:
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     for slot in range(3):
@@ -110,41 +101,6 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
     assert seen == set(KINDS)
 
 
-def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
-    made = streams(root)
-    seen = set()
-    for i in range(0, 120, 4):
-        batch = made.update(i)
-        for slot, kind in enumerate(batch.kind.tolist()):
-            (episode, at) = made.episode_of(slot, i)
-            if episode.grey:
-                assert np.ptp(batch.target[slot].numpy(), axis=1).max() < 0.5  # the grain alone
-                continue
-            index = there_and_back(
-                episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip)
-            )
-            raw = episode.sequence.clip.rgb_gt[
-                index, episode.top : episode.top + 32, episode.left : episode.left + 48
-            ]
-            raw = raw[:, :, ::-1] if episode.flip else raw
-            plain = np.stack([episode.levels[raw[..., c], c] for c in range(3)], axis=1)
-            changed = not np.array_equal(batch.target[slot].numpy(), plain)
-            assert changed == (KINDS[kind] in ("identity", "video") and episode.grain > 0)
-            seen.add((KINDS[kind], changed))
-    assert {("identity", True), ("identity", False), ("pairs", False)} <= seen
-    rng = np.random.default_rng(0)
-    grey = np.zeros((2, 3, 64, 64), np.float32)
-    noisy = _detailed(grey, 1.0, 0.05, rng)
-    assert noisy.std() == pytest.approx(0.05, rel=0.02)  # flat: nothing to sharpen
-    assert (
-        abs(np.corrcoef(noisy[0].ravel(), noisy[1].ravel())[0, 1]) < 0.05
-    )  # no pattern that stays
-    edge = np.where(np.arange(64) < 32, -0.5, 0.5).astype(np.float32) * np.ones(
-        (1, 3, 64, 1), np.float32
-    )
-    assert np.ptp(_detailed(edge, 1.0, 0.0, rng)) > 1.2 * np.ptp(edge)
-
-
 def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     compared = 0
@@ -168,20 +124,6 @@ def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
     assert compared > 3
 
 
-def test_a_moved_render_is_the_truth_out_of_place(root: Path) -> None:
-    made = streams(root, shares=StreamShares(1, 0, 0, 0))
-    episodes = [made.episode_of(slot, i)[0] for slot in range(3) for i in range(0, 400, 4)]
-    assert 0.05 < np.mean([episode.moved_px > 0 for episode in episodes]) < 0.3
-    plain = replace(episodes[0], moved_px=0.0, better=0.0, grey=False)
-    for doubled in (False, True):
-        still, moved = (
-            made._show(replace(plain, moved_px=px, doubled=doubled), 0) for px in (1e-6, 2.0)
-        )
-        np.testing.assert_allclose(still[0], still[3], atol=1e-3)
-        assert np.abs(moved[0] - moved[3]).mean() > 1e-3
-        np.testing.assert_array_equal(moved[3], made._show(plain, 0)[3])
-
-
 def test_held_out_video_is_never_shown(root: Path) -> None:
     made = streams(root, shares=StreamShares(0, 0, 0.5, 0.5))
     shown = {made.episode_of(slot, i)[0].sequence.folder for slot in range(3) for i in range(60)}
@@ -201,13 +143,6 @@ def test_a_count_keeps_the_list_while_more_are_made(root: Path, tmp_path: Path) 
         TrainingStreams(tmp_path, crop=(32, 48), shares=shares).facts()["pairs_digest"]
         != before["pairs_digest"]
     )
-
-
-def test_reflection_keeps_neighbours_together_on_both_sides() -> None:
-    for length in (1, 2, 5):
-        index = there_and_back(np.arange(-3 * length, 3 * length), length)
-        assert set(index) == set(range(length))
-        assert np.abs(np.diff(index)).max() <= 1
 
 
 @pytest.mark.parametrize(

@@ -68,28 +68,6 @@ def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
     assert steps == [f'{{"step": {i}' for i in range(1, 21)]
 
 
-def test_kill_after_a_checkpoint_repeats_the_lost_updates_once(tmp_path: Path) -> None:
-    schedule = Schedule(steps=12, save_every=5)
-    t = trainer(tmp_path, schedule)
-    for _ in range(8):
-        t._write_log(t._update())
-        if t.step % 5 == 0:
-            t.save()
-    again = trainer(tmp_path, schedule)
-    assert again.step == 5
-    again.run()
-    assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 12
-
-
-def test_kill_before_the_first_checkpoint_leaves_no_rows(tmp_path: Path) -> None:
-    t = trainer(tmp_path, Schedule(steps=4, warmup=1, save_every=4))
-    t._write_log(t._update())
-    trainer(tmp_path, Schedule(steps=4, warmup=1, save_every=4)).run()
-    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows] == [1, 2, 3, 4]
-    assert all(row["core_s"] >= 0 for row in rows)
-
-
 def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) -> None:
     schedule = Schedule(steps=9)
     t = trainer(tmp_path, schedule, bad_at=4)

@@ -19,7 +19,6 @@ from alpasim_plugin.lab.video_metrics.perceptual_net import (
     PerceptualDistance,
     load_perceptual,
     shipped_weights,
-    unit,
 )
 
 
@@ -84,27 +83,12 @@ def test_gradient_is_that_of_finite_differences() -> None:
         )
 
 
-def test_network_is_frozen_and_pictures_get_a_finite_gradient(net: PerceptualDistance) -> None:
-    assert not any(p.requires_grad for p in net.parameters())
-    a = pictures().requires_grad_()
-    net.distance(a, pictures(seed=1)).sum().backward()
-    assert a.grad is not None
-    assert torch.isfinite(a.grad).all()
-    assert a.grad.abs().sum() > 0
-
-
 def test_equal_and_flat_pictures_have_a_finite_gradient(net: PerceptualDistance) -> None:
     for value in (-1.0, 0.0, 1.0):
         flat = torch.full((1, 3, 32, 32), value, requires_grad=True)
         net.distance(flat, flat.detach()).sum().backward()
         assert flat.grad is not None
         assert torch.equal(flat.grad, torch.zeros_like(flat))
-
-
-def test_unit_features_have_unit_length_unless_they_are_nearly_nothing() -> None:
-    x = torch.tensor([3.0, 4.0, 0.0]).view(1, 3, 1, 1)
-    assert float(unit(x).norm()) == pytest.approx(1.0, abs=1e-5)
-    assert torch.equal(unit(torch.zeros(1, 3, 1, 1)), torch.zeros(1, 3, 1, 1))
 
 
 def test_shipped_distance_grows_with_blur_and_noise(net: PerceptualDistance) -> None:
@@ -135,12 +119,6 @@ def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_d
     p0 = read("ex_p0")
     p1 = read("ex_p1")
     assert float(net.distance(ref, p1)) < float(net.distance(ref, p0))
-
-
-def test_weights_are_small_and_have_a_card() -> None:
-    path = shipped_weights()
-    assert path.stat().st_size <= 700_000
-    assert path.with_suffix(".card.json").is_file()
 
 
 def test_saved_weights_load_as_they_were(tmp_path: Path) -> None:
