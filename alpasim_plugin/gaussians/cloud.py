@@ -5,7 +5,7 @@ such sets.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +77,7 @@ class GaussianCloud:
     scales: FloatArray
     opacities: FloatArray
     sh: FloatArray
-    antialias_px2: float = 0.0
+    antialias_px2: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         found = {}
@@ -248,7 +248,7 @@ class GaussianCloud:
             self.scales[i],
             self.opacities[i],
             self.sh[i],
-            self.antialias_px2,
+            antialias_px2=self.antialias_px2,
         )
 
     def transformed(self, T: F64) -> GaussianCloud:
