@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.runs.executors import local
 from alpasim_plugin.runs.executors.local import Lost, map_jobs, run_jobs
 
 
@@ -30,6 +31,8 @@ def work(item: str) -> str:
         os._exit(3)
     if item == "hangs":
         time.sleep(60)
+    if item == "stops":
+        os.kill(os.getpid(), signal.SIGSTOP)
     if item == "raises":
         raise ValueError("no")
     if item == "cannot be sent":
@@ -49,6 +52,15 @@ def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not() -> No
     found = dict(run_jobs(work, ["hangs", "a"], 1, limit_s=0.5))
     assert found["a"] == "A"
     assert "within 0.5 s" in found["hangs"].reason
+
+
+def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(local, "OVERTIME_S", 1.0)
+    found = dict(run_jobs(work, ["stops", "a"], 2, limit_s=2.0))
+    assert found["a"] == "A"
+    assert "within 2 s" in found["stops"].reason
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -85,8 +97,9 @@ def test_an_error_ends_the_work_and_reaches_the_parent(item: str, error: type[Ex
         dict(run_jobs(work, [item, "a"], 2))
 
 
-def test_work_that_is_left_early_ends_its_workers() -> None:
-    outcomes = run_jobs(work, ["hangs", "a"], 2)
+@pytest.mark.parametrize("item", ["hangs", "stops"])
+def test_work_that_is_left_early_ends_its_workers(item: str) -> None:
+    outcomes = run_jobs(work, [item, "a"], 2)
     assert next(outcomes) == ("a", "A")
     began_s = time.monotonic()
     outcomes.close()

@@ -28,6 +28,7 @@ from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, 
 J = TypeVar("J")
 R = TypeVar("R")
 
+OVERTIME_S = 10.0  # after the time limit, for a worker to end by itself
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -125,10 +126,15 @@ def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterato
 def _in_pools(
     work: Callable[[J], R], jobs: Sequence[J], workers: int, threads: int, limit_s: float | None
 ) -> Iterator[tuple[J, Future[R]]]:
-    """Yield every job with its finished future; a pool that broke is followed by another one."""
+    """Yield every job with its finished future; a pool that broke is followed by another one.
+
+    A worker ends itself at the time limit. One that is stopped cannot, so all workers are ended
+    where none has finished anything for longer than that.
+    """
     waiting = deque(jobs)
+    patience_s = None if limit_s is None else limit_s + OVERTIME_S
     while waiting:
-        with _pool(workers, threads) as pool:
+        with _pool(workers, threads) as (pool, end_workers):
             running: dict[Future[R], J] = {}
             is_broken = False
             while running or (waiting and not is_broken):
@@ -139,22 +145,30 @@ def _in_pools(
                         is_broken = True
                     else:
                         running[future] = waiting.popleft()
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                done, _ = wait(running, patience_s, return_when=FIRST_COMPLETED)
+                if not done:
+                    end_workers()
                 for future in done:
                     is_broken = is_broken or _is_lost(future)
                     yield running.pop(future), future
 
 
 @contextmanager
-def _pool(workers: int, threads: int) -> Iterator[ProcessPoolExecutor]:
-    """Open a pool for the block; when the block raises, or is left early, its workers are ended."""
+def _pool(workers: int, threads: int) -> Iterator[tuple[ProcessPoolExecutor, Callable[[], None]]]:
+    """Open a pool for the block, with a function that ends its workers; when the block raises, or
+    is left early, they are ended.
+    """
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, _context(threads), _begin)
-    try:
-        yield pool
-    except BaseException:
+
+    def end_workers() -> None:
         for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
+            worker.kill()  # a stopped process heeds no other signal
+
+    try:
+        yield pool, end_workers
+    except BaseException:
+        end_workers()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
