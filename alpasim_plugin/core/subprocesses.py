@@ -21,9 +21,8 @@ from typing import TextIO
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing from the working directory
 OURS = "simrun"  # our value of it
 ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
-MOST_BYTES = 4 << 20  # of the file; a part that prints without end does not fill the disk
+MOST_BYTES = 4 << 20  # of one rollout, and of what is printed outside of them
 LEFT_OUT = "\n(the rest is left out)\n"
-_open: list[_Output] = []
 
 
 @contextmanager
@@ -80,7 +79,7 @@ class _Output(io.TextIOBase):
     """Standard error, and a file that is made when there is something to write."""
 
     def __init__(self, path: Path | None) -> None:
-        self._path, self._written = path, 0
+        self._path, self._written, self._rest = path, 0, LEFT_OUT
         self._file: TextIO | None = None
         self._lock = threading.Lock()
 
@@ -88,14 +87,17 @@ class _Output(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Write to both; several threads may."""
-        sys.stderr.write(text)
+        """Write to both, up to the limit; several threads may."""
         with self._lock:
-            if self._path is not None and self._written < MOST_BYTES:
+            shown = text
+            self._written += len(text)
+            if self._written >= MOST_BYTES:
+                shown, self._rest = self._rest, ""
+            sys.stderr.write(shown)
+            if self._path is not None:
                 if self._file is None:
                     self._file = self._path.open("w", encoding="utf-8", errors="replace")
-                self._written += len(text)
-                self._file.write(text if self._written < MOST_BYTES else LEFT_OUT)
+                self._file.write(shown)
                 self._file.flush()
         return len(text)
 
@@ -108,6 +110,9 @@ class _Output(io.TextIOBase):
             self._path = None
             if self._file is not None:
                 self._file.close()
+
+
+_open = [_Output(None)]
 
 
 @contextmanager
@@ -127,5 +132,4 @@ def parts_print_to_stderr(file: Path | None = None) -> Iterator[None]:
 
 def say(line: str) -> None:
     """Pass on a line that a part in another process printed; any thread may call it."""
-    output = _open[-1] if _open else sys.stderr
-    output.write(f"{line}\n")
+    _open[-1].write(f"{line}\n")

@@ -303,3 +303,4 @@ def test_output_of_parts_goes_to_a_file_that_has_an_end(
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.endswith("later\n")
+    assert len(shown.err) < MOST_BYTES + 100
