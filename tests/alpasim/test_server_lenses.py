@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from alpasim_plugin.alpasim.server import views
+from alpasim_plugin.alpasim.server.lens_cache import LensCache
 from alpasim_plugin.alpasim.server.views import read_lens, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import Lens
@@ -204,3 +206,17 @@ def test_intrinsics_that_are_no_lens_are_refused(
     change(spec)
     with pytest.raises(InputError, match=found):
         read_lens(spec, 320, 180)
+
+
+def test_what_is_kept_of_lenses_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = LensCache(8 << 20)
+    monkeypatch.setattr(views, "lenses", few)
+    for i in range(12):
+        spec = fisheye()
+        spec.opencv_fisheye_param.principal_point_x += i
+        assert straight_of(spec, 320, 180) is straight_of(spec, 320, 180)
+        assert few.held <= 8 << 20
+    for i in range(200):  # pinholes, which hold no arrays
+        read_lens(pinhole(320 + i, 180), 320 + i, 180)
+        assert few.held <= 8 << 20
+    assert len(few) < 200

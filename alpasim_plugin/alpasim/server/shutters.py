@@ -10,9 +10,9 @@ that covers the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Literal
 
+from alpasim_plugin.alpasim.server.lens_cache import lenses
 from alpasim_plugin.alpasim.server.views import View, camera_of, read_lens
 from alpasim_plugin.core.lens import lens_shares
 from alpasim_plugin.core.shutter import Along, rolling
@@ -46,16 +46,17 @@ def exposure_of(
     )
     if shutter == "global" or rolls is None or view.start_us == view.t_us:
         return None
-    share = _shares(spec.SerializeToString(deterministic=True), view.width, view.height, *rolls)
+    what = ("shares", view.width, view.height, *rolls)
+    share = lenses.get(spec, what, lambda: _shares(spec, view.width, view.height, *rolls))
     return Exposure(
         share,
         {name: view.objects[name][0] if name in view.objects else T for name, T in actors.items()},
     )
 
 
-@lru_cache(maxsize=32)
-def _shares(data: bytes, width: int, height: int, along: Along, backwards: bool) -> F32:
-    spec = sensorsim_pb2.CameraSpec.FromString(data)
+def _shares(
+    spec: sensorsim_pb2.CameraSpec, width: int, height: int, along: Along, backwards: bool
+) -> F32:
     lens = read_lens(spec, width, height)
     if lens.resample is None:
         return rolling(width, height, along, backwards)

@@ -8,15 +8,14 @@ AlpaSim's own overlay does.
 from __future__ import annotations
 
 import hashlib
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 
+from alpasim_plugin.alpasim.server.lens_cache import lenses
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.lens import DO_THIS, WIDEST_RAD, Lens, lens_of, place_in_lens, resized
@@ -26,10 +25,6 @@ from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
 MAX_SIDE_PX, MAX_PIXELS = 8192, 1 << 24
 MAX_TIME_US = 2**62
-
-_INVERTING = (
-    threading.Lock()
-)  # one lens at a time: a large picture takes a gigabyte for some seconds
 
 
 @dataclass(frozen=True)
@@ -140,7 +135,8 @@ def read_lens(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Lens:
         InputError: No intrinsics, values that make no lens, a windshield model, or a view of more
             than 80 degrees from the axis.
     """
-    return _read(spec.SerializeToString(deterministic=True), width, height)
+    what = ("lens", width, height)
+    return lenses.get(spec, what, lambda: lens_of(camera_of(spec, width, height)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,30 +168,20 @@ class Straight:
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
     """Return the pinhole for the pictures ``(height, width)`` of a lens; see `read_lens`."""
-    return _straight(spec.SerializeToString(deterministic=True), width, height)
+    what = ("straight", width, height)
+    return lenses.get(spec, what, lambda: _straight(spec, width, height))
 
 
-@lru_cache(maxsize=32)
-def _straight(data: bytes, width: int, height: int) -> Straight:
-    lens = _read(data, width, height)
+def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
+    lens = read_lens(spec, width, height)
     if lens.resample is None:
         return Straight(lens.K, lens.cover, None)
     size = width, max(round(lens.cover[1] * width / lens.cover[0]), 1)
     K = np.diag([*(np.array(size) / lens.cover), 1.0]) @ lens.K
     pinhole = replace(lens, K=K, cover=size)
-    with _INVERTING:
-        place, shown = place_in_lens(camera_of(_parsed(data), width, height), pinhole)
+    place, shown = place_in_lens(camera_of(spec, width, height), pinhole)
     place[~shown] = -1e6
     return Straight(K, size, place)
-
-
-@lru_cache(maxsize=32)
-def _read(data: bytes, width: int, height: int) -> Lens:
-    return lens_of(camera_of(_parsed(data), width, height))
-
-
-def _parsed(data: bytes) -> sensorsim_pb2.CameraSpec:
-    return sensorsim_pb2.CameraSpec.FromString(data)
 
 
 def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> CameraSpec:

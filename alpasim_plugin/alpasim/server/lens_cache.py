@@ -1,0 +1,64 @@
+"""Keep what is computed of the lenses that callers name, up to a number of bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from alpasim_plugin.log.wire import sensorsim_pb2
+
+T = TypeVar("T")
+LENS_BYTES = 512 << 20
+ENTRY_BYTES = 64 << 10  # that a value counts beside its arrays, so that their number has an end
+
+
+class LensCache:
+    """Values by lens, the oldest going first; one is made at a time, since that of a large picture
+    takes a gigabyte for some seconds.
+
+    Args:
+        most_bytes: Of the arrays in all values; the newest value is kept in any case.
+    """
+
+    def __init__(self, most_bytes: int = LENS_BYTES) -> None:
+        self._most_bytes = most_bytes
+        self._kept: dict[bytes, Any] = {}
+        self._making = threading.RLock()  # making one value may need another
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def held(self) -> int:
+        """Give the bytes of all values."""
+        return sum(map(_bytes_of, self._kept.values()))
+
+    def get(self, spec: sensorsim_pb2.CameraSpec, what: object, make: Callable[[], T]) -> T:
+        """Return a value of a lens, made if it is not kept.
+
+        Args:
+            spec: The lens, as a request names it.
+            what: Which value, and for what size.
+            make: Makes it.
+        """
+        whole = spec.SerializeToString(deterministic=True) + repr(what).encode()
+        key = hashlib.blake2b(whole, digest_size=16).digest()
+        found: T | None = self._kept.get(key)
+        if found is None:
+            with self._making:
+                found = self._kept.get(key)
+                if found is None:
+                    found = self._kept[key] = make()
+                    while self.held > self._most_bytes and len(self._kept) > 1:
+                        del self._kept[next(iter(self._kept))]
+        return found
+
+
+def _bytes_of(value: Any) -> int:
+    arrays = [value] if hasattr(value, "nbytes") else vars(value).values()
+    return ENTRY_BYTES + sum(getattr(array, "nbytes", 0) for array in arrays)
+
+
+lenses = LensCache()
