@@ -26,6 +26,7 @@ from typer.core import TyperCommand, TyperGroup
 from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import installed_names
+from alpasim_plugin.core.places import damaged_kernels
 from alpasim_plugin.core.printing import print_any_character, say, warn
 
 # Panel of the help page -> verb -> module of this package and its function, and one line of help,
@@ -338,6 +339,9 @@ def _unforeseen(error: Exception, command: str) -> SimrunError:
     """Return the error for what no part of the program has foreseen; a path that the system refuses
     is bad input.
     """
+    damaged = damaged_kernels(error)
+    if damaged is not None:
+        return damaged
     if isinstance(error, MemoryError):
         return InfrastructureError(
             f"{command}: out of memory: {error}", "Use fewer --workers, or free memory."

@@ -1,4 +1,4 @@
-"""The line of the user's code at which an error was raised."""
+"""Errors of parts: the part that they are blamed on, and the line of the user's code."""
 
 from __future__ import annotations
 
@@ -6,14 +6,34 @@ import os
 import re
 import sysconfig
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
-from alpasim_plugin.core.places import PACKAGE
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.places import PACKAGE, damaged_kernels
 
 PYTHON = ("<frozen ", sysconfig.get_paths()["stdlib"] + os.sep)
 LIBRARIES = ("site-packages", "dist-packages")
 OWN_CODE = tuple(f"{PACKAGE.parent / package}{os.sep}" for package in OWN_PACKAGES)
+
+
+TRACEBACK = "Correct that line; --debug, and output.log of a rollout, have the traceback."
+
+
+@contextmanager
+def blaming(kind: type[SimrunError], name: str) -> Iterator[None]:
+    """Blame a part for whatever it raises in the block, a `SimrunError` and damaged kernels
+    excepted.
+    """
+    try:
+        yield
+    except SimrunError:
+        raise
+    except Exception as error:
+        own = kind(f"{name}: {raised(error)}", TRACEBACK)
+        raise (damaged_kernels(error) or own) from error
 
 
 def raised(error: BaseException) -> str:

@@ -13,6 +13,7 @@ import atexit
 import os
 import shutil
 import tempfile
+import traceback
 from pathlib import Path
 
 from platformdirs import user_cache_path
@@ -72,6 +73,17 @@ def require_kernels() -> None:
     """
     if os.environ.get(INTERPRETED) and not is_writable(cache()):
         raise InfrastructureError("the cache of kernels: no folder can be written", HINT)
+
+
+def damaged_kernels(error: BaseException) -> InfrastructureError | None:
+    """Return the error in place of one that reading a compiled kernel raised; None for others."""
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    if not any(file.endswith(os.path.join("numba", "core", "caching.py")) for file in files):
+        return None
+    return InfrastructureError(
+        f"compiled kernels below {kernels()}: they cannot be read ({error})",
+        "remove the files *.nbi and *.nbc there; they are compiled again",
+    )
 
 
 def temporary_folder(prefix: str) -> tempfile.TemporaryDirectory[str]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.blame import defined, is_own, raised
-from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault, SimrunError
+from alpasim_plugin.core.blame import blaming, defined, is_own
+from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
@@ -18,7 +18,6 @@ from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, R
 ALPHA, DEPTH_M = 1.0, 1e6  # largest values of a frame's planes
 ROUNDING = 1e-3
 CHECK = "simrun check policy finds all faults of a policy"
-TRACEBACK = "Correct that line; --debug, and output.log of a rollout, have the traceback."
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -33,12 +32,8 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
         return []
     kind = RendererError if is_own(renderer) else RendererFault
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
-    try:
+    with blaming(kind, name):
         frames = list(renderer.render_batch(requests))
-    except SimrunError:
-        raise
-    except Exception as error:
-        raise kind(f"{name}: {raised(error)}", TRACEBACK) from error
     problem = f"{len(frames)} frames for {len(requests)} requests"
     if len(frames) == len(requests):
         problem = "; ".join(filter(None, map(_frame_problem, frames, requests)))
@@ -103,12 +98,8 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     Raises:
         PolicyError: The policy raised.
     """
-    try:
+    with blaming(PolicyError, type(policy).__name__):
         policy.reset(seed, route)
-    except SimrunError:
-        raise
-    except Exception as error:  # whatever a foreign policy raises
-        raise PolicyError(f"{type(policy).__name__}: {raised(error)}", TRACEBACK) from error
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
@@ -119,12 +110,8 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
             does not start now.
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
-    try:
+    with blaming(PolicyError, name):
         plan = policy.act(observation)
-    except SimrunError:
-        raise
-    except Exception as error:
-        raise PolicyError(f"{name}: {raised(error)}", TRACEBACK) from error
     found = plan_problem(plan, observation.t_us)
     if found:
         raise PolicyError(f"{name}: {found}{defined(policy, 'act')}", CHECK)

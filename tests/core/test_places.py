@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -94,3 +95,38 @@ def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(
     assert os.environ["NUMBA_DISABLE_JIT"] == "1"
     with pytest.raises(InfrastructureError):
         places.require_kernels()
+
+
+USES_A_KERNEL = """
+import sys
+sys.path.insert(0, {repo!r})
+from alpasim_plugin.core.blame import blaming
+from alpasim_plugin.core.errors import RendererError, SimrunError
+import numba
+@numba.njit(cache=True)
+def twice(x):
+    return 2 * x
+try:
+    with blaming(RendererError, "a renderer"):
+        twice(1)
+except SimrunError as error:
+    sys.exit(error.exit_code)
+"""
+
+
+def test_compiled_kernels_that_are_damaged_are_no_fault_of_a_part(tmp_path: Path) -> None:
+    script, kept = tmp_path / "uses.py", tmp_path / "kept"
+    script.write_text(USES_A_KERNEL.format(repo=str(REPO)))
+    kept.mkdir()
+
+    def exit_code() -> int:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}
+        return subprocess.run([sys.executable, str(script)], env=environment).returncode
+
+    assert exit_code() == 0
+    for file in kept.rglob("*.nbi"):
+        file.write_bytes(b"damaged")
+    assert exit_code() == InfrastructureError.exit_code
+    for file in kept.rglob("*.nb?"):
+        file.unlink()
+    assert exit_code() == 0

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from alpasim_plugin.core import interfaces
-from alpasim_plugin.core.blame import raised
+from alpasim_plugin.core.blame import blaming
 from alpasim_plugin.core.errors import (
     EvaluatorError,
     FixerError,
@@ -193,16 +193,10 @@ def build(spec: PartSpec, **known: Any) -> Any:
     wanted = _arguments(
         factory, spec, {key: value for key, value in known.items() if key in kind.arguments}
     )
-    try:
+    name = f"{spec.kind} {spec.name!r}"
+    with blaming(ERRORS.get(spec.kind, InputError), name):
         part = factory(**wanted)
-    except SimrunError:
-        raise
-    except Exception as error:  # a part of any origin: the cause is chained
-        raise ERRORS.get(spec.kind, InputError)(
-            f"{spec.kind} {spec.name!r}: {raised(error)}",
-            "run with --debug for the traceback",
-        ) from error
-    return complete(part, kind.interface, f"{spec.kind} {spec.name!r}")
+    return complete(part, kind.interface, name)
 
 
 def _arguments(
