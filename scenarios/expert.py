@@ -15,18 +15,16 @@ import numpy as np
 from alpasim_plugin.core.geometry import quat_from_yaw, yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, Actor, Bool, Box, Signal, Trajectory, Vehicle
 from alpasim_plugin.world.idm import (
-    NO_BODIES,
+    BEHIND_M,
     Bodies,
     IdmParams,
     Leader,
-    Spans,
     bodies_from,
     concatenate,
     find_leader,
     find_leaders,
     idm_acceleration,
     moved_on,
-    nearest_ahead,
     spans,
 )
 from alpasim_plugin.world.path import Lines, Path
@@ -71,18 +69,15 @@ class ScriptedTracks:
             if np.ptp(s.track.xyz[:, :2], axis=0).max() < STANDING_M and s.track.t_us[-1] >= end_us
         ]
         going = [s for s in scripts if not any(s is other for other in still)]
-        xy, yaw = (
-            np.array([s.track.xyz[0, :2] for s in still]),
-            np.array([float(yaw_from_quat(s.track.quat[0])) for s in still]),
-        )
+        xy = np.array([s.track.xyz[0, :2] for s in still])
+        yaw = np.array([float(yaw_from_quat(s.track.quat[0])) for s in still])
         self.standing = bodies_from(xy, yaw, [s.box for s in still], np.zeros((len(still), 2)))
         n = len(self.times)
         self.boxes = [s.box for s in going]
-        self.xy, self.yaw = np.zeros((n, len(going), 2)), np.zeros((n, len(going)))
-        self.velocity, self.present = (
-            np.zeros((n, len(going), 2)),
-            np.zeros((n, len(going)), dtype=np.bool_),
-        )
+        self.xy = np.zeros((n, len(going), 2))
+        self.yaw = np.zeros((n, len(going)))
+        self.velocity = np.zeros((n, len(going), 2))
+        self.present = np.zeros((n, len(going)), dtype=np.bool_)
         for j, script in enumerate(going):
             track = script.track
             t = np.clip(self.times, track.t_us[0], track.t_us[-1])
@@ -98,8 +93,6 @@ class ScriptedTracks:
 
     def moving(self, t_us: int) -> Bodies:
         """Return the moving bodies present at a time on the grid."""
-        if not self.boxes:
-            return NO_BODIES
         i = min(t_us // self.step_us, len(self.times) - 1)
         keep = np.flatnonzero(self.present[i])
         return bodies_from(
@@ -126,9 +119,21 @@ class PredictedBodies:
     boxes: tuple[Box, ...]
     yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
 
+    def now(self, columns: I64) -> Bodies:
+        """Return some of the road users as they are now."""
+        boxes = [self.boxes[k] for k in columns]
+        return bodies_from(
+            self.xy[0, columns], self.yaw[0, columns], boxes, self.velocity[0, columns]
+        )
+
 
 def yielding_acceleration(
-    path: Path, front_s: float, speed_mps: float, box: Box, ahead: PredictedBodies, min_gap_m: float
+    line: Lines,
+    front_s: float,
+    speed_mps: float,
+    box: Box,
+    ahead: PredictedBodies,
+    min_gap_m: float,
 ) -> float:
     """Return the largest acceleration that keeps behind everyone who will come into the corridor;
     infinite without such a one.
@@ -140,7 +145,7 @@ def yielding_acceleration(
     behind the own front now (they are the ones to yield).
 
     Args:
-        path: The ego's line.
+        line: The ego's line, alone.
         front_s: Arc length of the front bumper.
         speed_mps: Own speed.
         box: Ego body.
@@ -148,27 +153,20 @@ def yielding_acceleration(
         min_gap_m: Gap to keep from a standing body; half a second is added for a moving one.
     """
     n, k = ahead.yaw.shape
-    if k == 0:
-        return float("inf")
-    flat = bodies_from(
+    everybody = bodies_from(
         ahead.xy.reshape(-1, 2),
         ahead.yaw.reshape(-1),
         ahead.boxes * n,
         ahead.velocity.reshape(-1, 2),
     )
-    span = spans(path, front_s, flat, HORIZON_M)
-    if span is None:
-        return float("inf")
+    window = np.array([front_s - BEHIND_M, front_s + HORIZON_M])
+    row = np.arange(n * k)
+    low, high = line.stations(0 * row, np.repeat(window[0], n * k), np.repeat(window[1], n * k))
+    span = spans(line, 0 * row, everybody, row, low, high)
     half = box.width_m / 2 + SIDE_M
-    rear = np.full(n * k, np.inf)
-    front = np.full(n * k, -np.inf)
-    speed = np.zeros(n * k)
-    inside = np.zeros(n * k, dtype=np.bool_)
-    rear[span.index], front[span.index], speed[span.index] = span.rear, span.front, span.speed
-    inside[span.index] = (span.low < half) & (span.high > -half)
-    rear, front, speed, inside = (
-        a.reshape(n, k) for a in (rear, front, speed, inside & ahead.present.reshape(-1))
-    )
+    rear, front, speed = (a.reshape(n, k) for a in (span.rear, span.front, span.speed))
+    inside = ((span.low < half) & (span.high > -half)).reshape(n, k) & ahead.present
+    inside &= (rear > window[0]) & (rear < window[1])
     tau = TIMES_S[:, None]
     passed = front < front_s + speed_mps * tau - box.length_m - 1.0
     behind = ahead.yields & (rear[0] < front_s + 0.5)
@@ -234,33 +232,28 @@ def drive(
     """
     table = ScriptedTracks(scripts, end_us, DECISION_US)
     expert = _Expert(path, s0_m, vehicle, style, table, lights_on(path, signals))
-    standing = {
-        id(f.path): spans(f.path, 0.0, table.standing, f.path.length_m + 100.0, window=False)
-        for f in followers
-    }
-    paths = {id(f.path): f.path for f in followers}
-    lights = {key: lights_on(line, signals) for key, line in paths.items()}
-    cars = [_Car(f, standing[id(f.path)], lights[id(f.path)]) for f in followers]
-    number = {key: i for i, key in enumerate(paths)}
-    lines = Lines(list(paths.values())) if paths else None
-    line = np.array([number[id(f.path)] for f in followers], dtype=np.int64)
-    half_widths = np.array([f.box.width_m / 2 for f in followers])
-    horizons = np.full(len(cars), FOLLOWED_M)
+    cars = [_Car(follower, lights_on(follower.path, signals)) for follower in followers]
+    lines = Lines([car.f.path for car in cars]) if cars else None
+    half_widths = np.array([car.f.box.width_m / 2 for car in cars])
     log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
-        driving = [car for car in cars if car.s <= car.f.path.length_m]
-        moving = concatenate([table.moving(t), _bodies(driving)])
-        wanted = expert.decide(moving, cars, t)
-        everybody = concatenate([expert.bodies(), moving])
-        own_row = {
-            id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))
-        }
+        driving = [i for i, car in enumerate(cars) if car.s <= car.f.path.length_m]
+        scripted = table.moving(t)
+        ahead = _predicted(table, cars, lines, t)
+        first = len(table.boxes) + np.array(driving, dtype=np.int64)
+        moving = concatenate([scripted, ahead.now(first)])
+        wanted = expert.decide(moving, ahead, t)
         if lines is not None:
-            rows = np.array([own_row.get(id(car), -1) for car in cars], dtype=np.int64)
+            everybody = concatenate([table.standing, expert.bodies(), moving])
+            own_row = np.full(len(cars), -1)
+            own_row[driving] = np.arange(len(everybody.xy) - len(driving), len(everybody.xy))
             fronts = np.array([car.front_s for car in cars])
-            found = find_leaders(lines, line, fronts, half_widths, everybody, horizons, rows)
-            for car, leader in zip(cars, found, strict=True):
+            horizons = np.full(len(cars), FOLLOWED_M)
+            leaders = find_leaders(
+                lines, np.arange(len(cars)), fronts, half_widths, everybody, horizons, own_row
+            )
+            for car, leader in zip(cars, leaders, strict=True):
                 car.decide(leader, t)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
@@ -303,9 +296,7 @@ class _Expert:
         lights: Sequence[LightAhead],
     ) -> None:
         self.path, self.vehicle, self.table, self.lights = path, vehicle, table, lights
-        self.lookup = path.coarser(
-            4
-        )  # projections search every station; 1 m apart is enough for them
+        self.line = Lines([path])
         self.limit = speed_limits(path, style)
         self.s, self.a, self.cap = s0_m, 0.0, float("inf")
         self.v = min(style.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
@@ -313,7 +304,6 @@ class _Expert:
             style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2
         )
         self.front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-        self.standing = spans(path, 0.0, table.standing, path.length_m + 100.0, window=False)
 
     @property
     def front_s(self) -> float:
@@ -329,29 +319,23 @@ class _Expert:
             self.v * direction,
         )
 
-    def decide(self, others: Bodies, cars: Sequence[_Car], t_us: int) -> float:
+    def decide(self, others: Bodies, ahead: PredictedBodies, t_us: int) -> float:
         """Return the wanted acceleration."""
-        ahead = float(np.interp(self.s + 0.4 * self.v, self.path.s, self.limit))
-        wanted = min(1.5 * (ahead - self.v), MAX_ACCEL_MPS2)
+        limit = float(np.interp(self.s + 0.4 * self.v, self.path.s, self.limit))
+        wanted = min(1.5 * (limit - self.v), MAX_ACCEL_MPS2)
         half = self.vehicle.box.width_m / 2
-        moving = find_leader(self.lookup, self.front_s, half, others, margin_m=0.3)
-        for leader in (moving, nearest_ahead(self.standing, self.front_s, half)):
+        for bodies, margin_m in ((others, 0.3), (self.table.standing, 0.2)):
+            leader = find_leader(self.line, self.front_s, half, bodies, margin_m=margin_m)
             if leader.index >= 0:
-                wanted = min(
-                    wanted,
-                    idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params),
-                )
+                closing = self.v - leader.speed_mps
+                accel = idm_acceleration(self.v, leader.gap_m, closing, self.params)
+                wanted = min(wanted, accel)
         red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
         if red_m < np.inf:
             wanted = min(wanted, idm_acceleration(self.v, red_m, self.v, self.params))
         if t_us % LOOKAHEAD_US == 0:
             self.cap = yielding_acceleration(
-                self.lookup,
-                self.front_s,
-                self.v,
-                self.vehicle.box,
-                _predicted(self.table, cars, t_us),
-                MIN_GAP_M,
+                self.line, self.front_s, self.v, self.vehicle.box, ahead, MIN_GAP_M
             )
         return max(min(wanted, self.cap), -MAX_BRAKE_MPS2)
 
@@ -367,28 +351,22 @@ class _Expert:
 class _Car:
     """A follower while it drives."""
 
-    def __init__(self, f: Follower, standing: Spans | None, lights: Sequence[LightAhead]) -> None:
+    def __init__(self, f: Follower, lights: Sequence[LightAhead]) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
-        self.log_s = [self.s]
-        self.standing = standing  # places of the standing bodies on its line
         self.lights = lights
+        self.log_s = [self.s]
 
     @property
     def front_s(self) -> float:
         return self.s + self.f.box.length_m / 2
 
-    def decide(self, moving: Leader, t_us: int) -> None:
+    def decide(self, leader: Leader, t_us: int) -> None:
+        closing = self.v - leader.speed_mps
         red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
-        a = idm_acceleration(self.v, red_m, self.v, self.f.params)
-        for leader in (moving, nearest_ahead(self.standing, self.front_s, self.f.box.width_m / 2)):
-            if leader.index >= 0:
-                a = min(
-                    a,
-                    idm_acceleration(
-                        self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params
-                    ),
-                )
-        self.a = a
+        self.a = min(
+            idm_acceleration(self.v, leader.gap_m, closing, self.f.params),
+            idm_acceleration(self.v, red_m, self.v, self.f.params),
+        )
 
     def advance(self, dt_s: float) -> None:
         self.s, self.v = moved_on(self.s, self.v, self.a, dt_s)
@@ -400,51 +378,32 @@ class _Car:
         )
 
 
-def _bodies(cars: Sequence[_Car]) -> Bodies:
-    """Return where reactive cars are, in their order; cars on one line are placed together."""
-    if not cars:
-        return NO_BODIES
-    xy, yaw = np.empty((len(cars), 2)), np.empty(len(cars))
-    for path, rows in _by_path(cars):
-        xyz, yaw[rows] = path.at(
-            np.array([cars[i].s for i in rows]), np.array([cars[i].f.offset_m for i in rows])
-        )
-        xy[rows] = xyz[:, :2]
-    velocity = np.array([car.v for car in cars])[:, None] * np.stack(
-        [np.cos(yaw), np.sin(yaw)], axis=1
-    )
-    return bodies_from(xy, yaw, [car.f.box for car in cars], velocity)
-
-
-def _by_path(cars: Sequence[_Car]) -> list[tuple[Path, list[int]]]:
-    """Group the indices of cars by the line that they drive on."""
-    groups: dict[int, tuple[Path, list[int]]] = {}
-    for i, car in enumerate(cars):
-        groups.setdefault(id(car.f.path), (car.f.path, []))[1].append(i)
-    return list(groups.values())
-
-
-def _predicted(table: ScriptedTracks, cars: Sequence[_Car], t_us: int) -> PredictedBodies:
+def _predicted(
+    table: ScriptedTracks, cars: Sequence[_Car], lines: Lines | None, t_us: int
+) -> PredictedBodies:
     """Return scripted tracks as they are written, and reactive cars at their present speed on their
     own lines.
     """
     rows = table.rows(t_us)
     xy, yaw = [table.xy[rows]], [table.yaw[rows]]
     velocity, present = [table.velocity[rows]], [table.present[rows]]
-    order = [i for _, rows_of in _by_path(cars) for i in rows_of]
-    for path, group in _by_path(cars):
-        v = np.array([cars[i].v for i in group])
-        s = np.array([cars[i].s for i in group]) + v * TIMES_S[:, None]  # (1 + n, K)
-        xyz, heading = path.at(s, np.array([cars[i].f.offset_m for i in group]))
-        xy.append(xyz[..., :2])
+    if lines is not None:
+        s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
+        at = s + v * TIMES_S[:, None]  # (1 + n, K)
+        line = np.broadcast_to(np.arange(len(cars)), at.shape)
+        points, heading = lines.at(
+            line.ravel(), at.ravel(), np.broadcast_to(offset, at.shape).ravel()
+        )
+        heading = heading.reshape(at.shape)
+        xy.append(points[:, :2].reshape(*at.shape, 2))
         yaw.append(heading)
         velocity.append(v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1))
-        present.append(s <= path.length_m)
+        present.append(at <= lines.length_m)
     return PredictedBodies(
         np.concatenate(xy, axis=1),
         np.concatenate(yaw, axis=1),
         np.concatenate(velocity, axis=1),
         np.concatenate(present, axis=1),
-        (*table.boxes, *(cars[i].f.box for i in order)),
+        (*table.boxes, *(car.f.box for car in cars)),
         np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
     )

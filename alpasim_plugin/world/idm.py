@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, I64, Bool, Box
-from alpasim_plugin.world.path import Lines, Path
+from alpasim_plugin.core.types import F64, I64, Box
+from alpasim_plugin.world.path import Lines
 
 
 @dataclass(frozen=True)
@@ -115,89 +115,50 @@ _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1
 
 @dataclass(frozen=True)
 class Spans:
-    """Extent of bodies along and across a path; rows are those near enough to matter."""
+    """Extent of bodies along and across lines, metres."""
 
-    index: I64  # (m,) row in `Bodies`
-    rear: F64  # (m,) smallest arc length of the outline
-    front: F64  # (m,) largest
-    low: F64  # (m,) rightmost distance from the path
-    high: F64  # (m,) leftmost
-    speed: F64  # (m,) along the path, >= 0
-
-    def only(self, keep: Bool) -> Spans:
-        """Return the rows ``(m,)`` that are kept."""
-        return Spans(*(column[keep] for column in vars(self).values()))
+    rear: F64  # (P,) smallest arc length of the outline
+    front: F64  # (P,) largest
+    low: F64  # (P,) rightmost distance from the line
+    high: F64  # (P,) leftmost
+    speed: F64  # (P,) along the line, >= 0
 
 
-def _outlines(bodies: Bodies, rows: I64) -> F64:
-    """Return corners and middles of the long sides ``(m, 6, 2)`` of some bodies."""
-    c, s = np.cos(bodies.yaw[rows])[:, None], np.sin(bodies.yaw[rows])[:, None]
-    ax = _OUTLINE[:, 0] * bodies.half_length_m[rows, None]  # (m, 6)
-    ay = _OUTLINE[:, 1] * bodies.half_width_m[rows, None]
-    return np.stack(
-        [bodies.xy[rows, 0:1] + c * ax - s * ay, bodies.xy[rows, 1:2] + s * ax + c * ay], axis=-1
-    )
-
-
-def spans(
-    path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True
-) -> Spans | None:
-    """Return where bodies lie on a path, from `BEHIND_M` behind ``from_s_m`` to ``horizon_m`` ahead; None
-    where there is none.
-
-    Without ``window`` the whole path is searched, for static bodies that are queried repeatedly.
+def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64) -> Spans:
+    """Return where bodies lie on lines: each row ``(P,)`` of ``bodies`` on its ``line (P,)``,
+    between two of its stations ``(P,)``.
     """
-    if len(bodies.xy) == 0:
-        return None
-    start, _ = path.at(from_s_m)
-    near = np.flatnonzero(
-        np.hypot(*(bodies.xy - start[:2]).T) < horizon_m + bodies.half_length_m + 5.0
+    half = np.stack([bodies.half_length_m[row], bodies.half_width_m[row]], axis=1)
+    turn = np.array([np.cos(bodies.yaw[row]), np.sin(bodies.yaw[row])])
+    x, y = np.moveaxis(_OUTLINE * half[:, None], -1, 0)  # (P, 6)
+    outline = bodies.xy[row][:, None] + np.stack(
+        [turn[0, :, None] * x - turn[1, :, None] * y, turn[1, :, None] * x + turn[0, :, None] * y],
+        axis=-1,
     )
-    if len(near) == 0:
-        return None
-    along, across = path.project(
-        _outlines(bodies, near).reshape(-1, 2),
-        (from_s_m - BEHIND_M, from_s_m + horizon_m) if window else None,
-    )
-    along, across = along.reshape(-1, 6), across.reshape(-1, 6)
+    every = [np.repeat(number, len(_OUTLINE)) for number in (line, low, high)]
+    along, across = lines.project(every[0], outline.reshape(-1, 2), *every[1:])
+    along, across = along.reshape(-1, len(_OUTLINE)), across.reshape(-1, len(_OUTLINE))
     rear = along.min(axis=1)
-    _, yaw = path.at(rear)
-    speed = bodies.velocity[near, 0] * np.cos(yaw) + bodies.velocity[near, 1] * np.sin(yaw)
+    _, yaw = lines.at(line, rear)
+    speed = bodies.velocity[row, 0] * np.cos(yaw) + bodies.velocity[row, 1] * np.sin(yaw)
     return Spans(
-        near,
-        rear,
-        along.max(axis=1),
-        across.min(axis=1),
-        across.max(axis=1),
-        np.maximum(speed, 0.0),
+        rear, along.max(axis=1), across.min(axis=1), across.max(axis=1), np.maximum(speed, 0.0)
     )
 
 
 def find_leader(
-    path: Path,
+    line: Lines,
     front_s_m: float,
     half_width_m: float,
     bodies: Bodies,
     horizon_m: float = 120.0,
     margin_m: float = 0.2,
-    own_row: int = -1,
 ) -> Leader:
-    """Return the nearest body that reaches into the corridor of a path ahead of the own front
-    bumper.
-
-    ``own_row`` is the driver's own row in ``bodies``, which is left out.
-
-    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its
-    rear end is not more than 2 m behind the own front bumper, so that touching bodies still count.
-    """
-    return nearest_ahead(
-        spans(path, front_s_m, bodies, horizon_m),
-        front_s_m,
-        half_width_m,
-        horizon_m,
-        margin_m,
-        own_row,
-    )
+    """Return the leader of one driver on the only line of ``line``; see `find_leaders`."""
+    driver = (np.array([front_s_m]), np.array([half_width_m]))
+    nobody = np.array([-1])
+    zero = np.zeros(1, dtype=np.int64)
+    return find_leaders(line, zero, *driver, bodies, np.array([horizon_m]), nobody, margin_m)[0]
 
 
 def find_leaders(
@@ -210,7 +171,11 @@ def find_leaders(
     own_row: I64,
     margin_m: float = 0.2,
 ) -> list[Leader]:
-    """Return the leader of each of many drivers; see `find_leader`.
+    """Return the leader of each of many drivers: the nearest body that reaches into the corridor of
+    its line ahead of its front bumper.
+
+    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the line and its
+    rear end is not more than 2 m behind the own front bumper, so that touching bodies still count.
 
     Args:
         lines: All lines.
@@ -222,68 +187,28 @@ def find_leaders(
         own_row: ``(N,)`` rows of the drivers in ``bodies``, -1 where they are not among them.
         margin_m: Added to the half width.
     """
-    start, _ = lines.at(line, front_s_m, np.zeros(len(line)))
+    start, _ = lines.at(line, front_s_m)
     delta = bodies.xy - start[:, None, :2]
     reaches = horizon_m[:, None] + bodies.half_length_m + 5.0
     near = np.hypot(delta[..., 0], delta[..., 1]) < reaches
     near[np.flatnonzero(own_row >= 0), own_row[own_row >= 0]] = False
     driver, body = np.nonzero(near)
-    half = np.stack([bodies.half_length_m, bodies.half_width_m], axis=1)[body]
     low, high = lines.stations(line, front_s_m - BEHIND_M, front_s_m + horizon_m)
     reach = half_width_m + margin_m
-    may = lines.may_overlap(
-        line[driver],
-        bodies.xy[body],
-        bodies.yaw[body],
-        half,
-        reach[driver],
-        low[driver],
-        high[driver],
+    half_diagonal = np.hypot(bodies.half_length_m, bodies.half_width_m)[body]
+    may = lines.may_meet(
+        line[driver], bodies.xy[body], reach[driver] + half_diagonal, low[driver], high[driver]
     )
     driver, body = driver[may], body[may]
+    span = spans(lines, line[driver], bodies, body, low[driver], high[driver])
+    gap_m = span.rear - front_s_m[driver]
+    ahead = (span.low < reach[driver]) & (span.high > -reach[driver])
+    ahead &= (gap_m > -2.0) & (gap_m < horizon_m[driver])
     out = [NO_LEADER] * len(line)
-    if len(driver) == 0:
-        return out
-    every = np.repeat(driver, len(_OUTLINE))
-    along, across = lines.project(
-        line[every], _outlines(bodies, body).reshape(-1, 2), low[every], high[every]
-    )
-    along, across = along.reshape(-1, len(_OUTLINE)), across.reshape(-1, len(_OUTLINE))
-    rear = along.min(axis=1)
-    ahead = (across.min(axis=1) < reach[driver]) & (across.max(axis=1) > -reach[driver])
-    ahead &= (rear > front_s_m[driver] - 2.0) & (rear < (front_s_m + horizon_m)[driver])
-    driver, body, rear = driver[ahead], body[ahead], rear[ahead]
-    _, yaw = lines.at(line[driver], rear, np.zeros(len(driver)))
-    speed = bodies.velocity[body, 0] * np.cos(yaw) + bodies.velocity[body, 1] * np.sin(yaw)
-    for k in np.lexsort((body, rear))[::-1].tolist():  # the nearest last
-        gap_m = float(rear[k] - front_s_m[driver[k]])
-        out[driver[k]] = Leader(gap_m, max(float(speed[k]), 0.0), int(body[k]))
+    for k in np.lexsort((body, gap_m))[::-1]:  # the nearest last
+        if ahead[k]:
+            out[driver[k]] = Leader(float(gap_m[k]), float(span.speed[k]), int(body[k]))
     return out
-
-
-def nearest_ahead(
-    span: Spans | None,
-    front_s_m: float,
-    half_width_m: float,
-    horizon_m: float = 120.0,
-    margin_m: float = 0.2,
-    own_row: int = -1,
-) -> Leader:
-    """Return the leader among bodies whose place on the path is known (see `find_leader`)."""
-    if span is None:
-        return NO_LEADER
-    reach = half_width_m + margin_m
-    ahead = (
-        (span.low < reach)
-        & (span.high > -reach)
-        & (span.rear > front_s_m - 2.0)
-        & (span.rear < front_s_m + horizon_m)
-    )
-    ahead &= span.index != own_row
-    if not ahead.any():
-        return NO_LEADER
-    k = int(np.argmin(np.where(ahead, span.rear, np.inf)))
-    return Leader(float(span.rear[k] - front_s_m), float(span.speed[k]), int(span.index[k]))
 
 
 NO_BODIES = Bodies(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 2)))

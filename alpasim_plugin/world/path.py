@@ -125,45 +125,21 @@ def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
     chord = float(np.hypot(p1[0] - p0[0], p1[1] - p0[1]))
     n = max(8, int(np.ceil(1.2 * chord / step_m)))
     t = np.linspace(0.0, 1.0, n + 1)
-    best, best_peak = None, np.inf
-    for factor in np.linspace(0.8, 2.4, 33):
-        xy, d, dd = _quintic(p0, yaw0, p1, yaw1, factor * chord, t)
+    still = np.zeros(2)
+    directions = [np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (yaw0, yaw1)]
+    least_peak = np.inf
+    for tangent_m in chord * np.linspace(0.8, 2.4, 33):
+        ends = zip((p0[:2], p1[:2]), directions, strict=True)
+        derivatives = [[point, tangent_m * direction, still] for point, direction in ends]
+        curve = scipy.interpolate.BPoly.from_derivatives([0.0, 1.0], derivatives)
+        d, dd = curve(t, 1), curve(t, 2)
         speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
         peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
-        if peak < best_peak - 1e-9:
-            best, best_peak = (xy, d), peak
-    assert best is not None
-    xy, d = best
-    yaw = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+        if peak < least_peak - 1e-9:
+            best, d_best, least_peak = curve, d, peak
+    yaw = np.unwrap(np.arctan2(d_best[:, 1], d_best[:, 0]))
     yaw[0], yaw[-1] = yaw0, yaw0 + (yaw1 - yaw0 + np.pi) % (2 * np.pi) - np.pi
-    xy[0], xy[-1] = p0[:2], p1[:2]
-    return np.column_stack([xy, yaw])
-
-
-def _quintic(
-    p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F64
-) -> tuple[F64, F64, F64]:
-    """Return position, first and second derivative ``(N, 2)`` by t of the Hermite quintic with zero
-    second derivatives at its ends.
-    """
-    blend = smoothstep(t)[:, None]
-    d_blend = (30 * t**2 * (1 - t) ** 2)[:, None]
-    dd_blend = (60 * t * (1 - t) * (1 - 2 * t))[:, None]
-    start = t - 6 * t**3 + 8 * t**4 - 3 * t**5
-    d_start = 1 - 18 * t**2 + 32 * t**3 - 15 * t**4
-    dd_start = -36 * t + 96 * t**2 - 60 * t**3
-    end = -4 * t**3 + 7 * t**4 - 3 * t**5
-    d_end = -12 * t**2 + 28 * t**3 - 15 * t**4
-    dd_end = -24 * t + 84 * t**2 - 60 * t**3
-    m0 = tangent_m * np.array([np.cos(yaw0), np.sin(yaw0)])
-    m1 = tangent_m * np.array([np.cos(yaw1), np.sin(yaw1)])
-    span = p1[:2] - p0[:2]
-    xy = p0[:2] + blend * span + start[:, None] * m0 + end[:, None] * m1
-    return (
-        xy,
-        d_blend * span + d_start[:, None] * m0 + d_end[:, None] * m1,
-        (dd_blend * span + dd_start[:, None] * m0 + dd_end[:, None] * m1),
-    )
+    return np.column_stack([best(t), yaw])
 
 
 def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
@@ -174,11 +150,6 @@ def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
     x = curve[:, 0] - d * np.sin(curve[:, 2])
     y = curve[:, 1] + d * np.cos(curve[:, 2])
     return np.column_stack([x, y, np.full(len(curve), z_m)])
-
-
-FEW_DISTANCES = (
-    200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
-)
 
 
 @dataclass(frozen=True)
@@ -206,25 +177,15 @@ class Path:
         y = np.interp(s, self.s, self.xyz[:, 1]) + d * np.cos(yaw)
         return np.stack([x, y, np.interp(s, self.s, self.xyz[:, 2])], axis=-1), yaw
 
-    def coarser(self, every: int) -> Path:
-        """Return the path with every n-th station (and the last), for quicker projection."""
-        keep = np.unique(np.append(np.arange(0, len(self.s), every), len(self.s) - 1))
-        return Path(self.s[keep], self.xyz[keep], self.yaw[keep], self.curvature[keep])
-
-    def project(self, xy: F64, window_m: tuple[float, float] | None = None) -> tuple[F64, F64]:
+    def project(self, xy: F64) -> tuple[F64, F64]:
         """Return arc length and signed distance (left positive) of points ``(M, 2)``.
 
-        ``window_m`` limits the search to a range of arc lengths. Points beyond an end are projected
-        onto the tangent there, so their arc length is negative or larger than the length.
+        Points beyond an end are projected onto the tangent there, so their arc length is negative
+        or larger than the length.
         """
-        lo, hi = 0, len(self.s)
-        if window_m is not None:
-            lo = max(0, int(np.searchsorted(self.s, window_m[0])) - 1)
-            hi = min(len(self.s), int(np.searchsorted(self.s, window_m[1])) + 1)
-            lo, hi = min(lo, len(self.s) - 2), max(hi, lo + 2)
-        i = lo + nearest(np.asarray(xy, dtype=np.float64)[:, :2], self.xyz[lo:hi, :2])
+        i = scipy.spatial.KDTree(self.xyz[:, :2]).query(xy)[1]
         along, across = _from_station(
-            xy[:, :2] - self.xyz[i, :2],
+            xy - self.xyz[i, :2],
             self.yaw[i],
             self.curvature[i],
             i == 0,
@@ -266,16 +227,16 @@ class Lines:
         self.begin = self.end - counts
         self.length_m = np.array([path.length_m for path in paths])
         self._base = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
-        joined = [np.concatenate(columns) for columns in zip(*(
-            (path.s, path.xyz, path.yaw, path.curvature) for path in paths), strict=True)]  # fmt: skip
-        self.s, self.xyz, self.yaw, self.curvature = joined
+        self.s = np.concatenate([path.s for path in paths])
+        self.xyz = np.concatenate([path.xyz for path in paths])
+        self.yaw = np.concatenate([path.yaw for path in paths])
+        self.curvature = np.concatenate([path.curvature for path in paths])
         self._x, self._y = np.ascontiguousarray(self.xyz[:, :2].T)
         self._key = self.s + np.repeat(self._base, counts)  # increases over all paths
-        self.sharpest = np.maximum.reduceat(np.abs(self.curvature), self.begin)
         self.gap_m = np.array([float(np.diff(path.s).max()) for path in paths])
         self._coarse = COARSE if self.gap_m.max() <= DENSE_M else 1
 
-    def at(self, line: I64, s_m: F64, offset_m: F64) -> tuple[F64, F64]:
+    def at(self, line: I64, s_m: F64, offset_m: float | F64 = 0.0) -> tuple[F64, F64]:
         """Return points ``(P, 3)`` and headings ``(P,)``; see `Path.at`."""
         s = np.clip(s_m, 0.0, self.length_m[line])
         i = np.searchsorted(self._key, s + self._base[line], side="right") - 1
@@ -314,73 +275,23 @@ class Lines:
         )
         return self.s[i] + along, across
 
-    def may_overlap(
-        self, line: I64, xy: F64, yaw: F64, half: F64, reach_m: F64, low: I64, high: I64
-    ) -> Bool:
-        """Return which bodies ``(P,)`` may reach into the corridor of a line; errs only towards
-        True.
-
-        Args:
-            line: Of each body.
-            xy: Their middles ``(P, 2)``.
-            yaw: Their headings.
-            half: Half lengths and widths ``(P, 2)``.
-            reach_m: Half the corridor's width.
-            low, high: Stations of the line that count.
+    def may_meet(self, line: I64, xy: F64, reach_m: F64, low: I64, high: I64) -> Bool:
+        """Return which points ``(P, 2)`` may lie within ``reach_m (P,)`` of their line between two
+        stations, or of its tangent beyond an end; errs only towards True.
         """
-        across_m = half.max(axis=1) + 0.5 * self._coarse * self.gap_m[line]
-        slack = 0.5 + self.sharpest[line] * across_m**2
-        far_m = reach_m + np.hypot(*half.T) + across_m + slack
+        far_m = reach_m + 0.5 * self._coarse * self.gap_m[line] + 0.5
         close = self._squares(xy, low, high, self._coarse) <= far_m[:, None] ** 2
-        body, number = np.nonzero(close)
-        at = np.minimum(low[body] + self._coarse * number, high[body] - 1)
-        # A line goes on beyond its ends: bodies there are near none of its stations.
-        first, last = (
-            np.flatnonzero(ends) for ends in (low == self.begin[line], high == self.end[line])
-        )
-        body = np.concatenate([body, first, last])
-        at = np.concatenate([at, low[first], high[last] - 1])
-        rest, turn = xy[body] - self.xyz[at, :2], yaw[body] - self.yaw[at]
-        c, s = np.cos(self.yaw[at]), np.sin(self.yaw[at])
-        across = np.abs(c * rest[:, 1] - s * rest[:, 0])
-        along = np.abs(c * rest[:, 0] + s * rest[:, 1])
-        extent = np.abs(np.sin(turn)) * half[body, 0] + np.abs(np.cos(turn)) * half[body, 1]
-        there = across <= (reach_m + slack)[body] + extent
-        there &= (along <= (across_m + slack)[body]) | (
-            np.arange(len(body)) >= len(body) - len(first) - len(last)
-        )
-        may = np.zeros(len(line), dtype=np.bool_)
-        may[body[there]] = True
-        return may
+        at_end = (low == self.begin[line]) | (high == self.end[line])
+        return close.any(axis=1) | at_end
 
     def _squares(self, xy: F64, low: I64, high: I64, every: int) -> F64:
         """Return the squared distances ``(P, n)`` of points to every n-th station of a range; the
         last station stands for those beyond it.
         """
-        at = self._every(low, high, every)
+        count = max(-(-int((high - low).max(initial=0)) // every), 1)
+        at = np.minimum(low[:, None] + every * np.arange(count), high[:, None] - 1)
         dx, dy = xy[:, :1] - self._x[at], xy[:, 1:] - self._y[at]
-        return np.asarray(dx * dx + dy * dy)
-
-    def _every(self, low: I64, high: I64, every: int) -> I64:
-        count = -(-int((high - low).max(initial=0)) // every)
-        return np.minimum(low[:, None] + every * np.arange(count), high[:, None] - 1)
-
-
-def nearest(xy: F64, stations: F64) -> I64:
-    """Return for each of ``(M, 2)`` points the first of the nearest of ``(N, 2)`` stations.
-
-    All distances are compared where they are few; a tree finds them where they are many, and its
-    answer is compared with the neighbours, since of two equally near stations it may name either.
-    """
-    n = len(stations)
-    if len(xy) * n <= FEW_DISTANCES:
-        delta = xy[:, None] - stations
-        return np.asarray(np.argmin(np.einsum("mnk,mnk->mn", delta, delta), axis=1))
-    found = scipy.spatial.KDTree(stations).query(xy)[1]
-    around = np.clip(found[:, None] + np.array([-1, 0, 1]), 0, n - 1)
-    delta = xy[:, None] - stations[around]
-    best = np.argmin(np.einsum("mnk,mnk->mn", delta, delta), axis=1)
-    return np.asarray(np.take_along_axis(around, best[:, None], axis=1)[:, 0])
+        return dx * dx + dy * dy
 
 
 def polyline_path(xyz: F64) -> Path:

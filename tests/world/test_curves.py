@@ -104,16 +104,6 @@ def test_projection_beyond_the_ends_follows_the_tangent() -> None:
     np.testing.assert_allclose(d, [1.0, -2.0], atol=1e-6)
 
 
-def test_windowed_projection_agrees_with_the_whole_search() -> None:
-    curve = sample_clothoid((0, 0, 0), 80.0, 0.0, 0.05)
-    path = smooth_path(np.column_stack([curve[:, :2], np.zeros(len(curve))]))
-    points, _ = path.at(np.linspace(20, 40, 9), np.linspace(-3, 3, 9))
-    np.testing.assert_array_equal(
-        path.project(points[:, :2], (10.0, 50.0)), path.project(points[:, :2])
-    )
-    assert path.coarser(4).length_m == path.length_m
-
-
 def test_path_of_one_point_is_refused() -> None:
     with pytest.raises(InputError):
         polyline_path(np.zeros((3, 3)))

@@ -13,7 +13,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, find_leader, idm_acceleration
-from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.path import Lines, Path
 from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
 from scenarios.expert import ExpertStyle, speed_limits
@@ -95,7 +95,8 @@ def leader_on(
     """Return the leader of a car with the rear axle at ``s_m`` and the front bumper ``front_m``
     ahead of it.
     """
-    return find_leader(line.path, s_m + front_m, half_width_m, bodies, horizon_m=SIGHT_M)
+    alone = Lines([line.path])
+    return find_leader(alone, s_m + front_m, half_width_m, bodies, horizon_m=SIGHT_M)
 
 
 def expert_speeds(

@@ -15,7 +15,6 @@ from alpasim_plugin.core import limits as bounds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.world.path import FEW_DISTANCES, nearest
 from scenarios.budget import check_scenario
 from scenarios.load import load_scenario
 from tests.core.reading import past_failures as seen
@@ -75,12 +74,3 @@ def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built() -> None:
         check_scenario(
             replace(scenario, actors=load_scenario("smoke/lead_car").actors * 1001), "a log"
         )
-
-
-def test_the_tree_names_the_station_that_comparing_all_names() -> None:
-    stations = np.column_stack([np.arange(0, 500, 0.25), np.zeros(2000)])
-    points = np.column_stack([np.linspace(-3, 505, 400).round(3), np.full(400, 2.0)])
-    points[:50, 0] = np.arange(50) + 0.125  # halfway between two stations
-    assert len(points) * len(stations) > FEW_DISTANCES
-    few = np.concatenate([nearest(points[i : i + 50], stations) for i in range(0, 400, 50)])
-    assert np.array_equal(nearest(points, stations), few)
