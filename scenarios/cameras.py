@@ -173,7 +173,7 @@ def _named(
 
 
 def _from_file(path: Path) -> tuple[CameraSpec, ...]:
-    """Read the cameras of an Argoverse 2 log or an AlpaSim scene."""
+    """Read the cameras of an Argoverse 2 log, an AlpaSim scene or a ``transforms.json``."""
     if os.path.isdir(path):
         from scenarios.argoverse import read_calibration
 
@@ -182,7 +182,11 @@ def _from_file(path: Path) -> tuple[CameraSpec, ...]:
         from scenarios.ftheta import rig_cameras
 
         return rig_cameras(path)
+    if path.suffix == ".json":
+        from scenarios.transforms import read_transforms
+
+        return read_transforms(path)
     raise InputError(
         f"{path}: no calibration that is known here",
-        "give an Argoverse 2 log folder, or a .usdz of AlpaSim",
+        "give an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json",
     )

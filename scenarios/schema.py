@@ -177,7 +177,7 @@ class CameraSet(Part):
     from_: str | None = Field(
         default=None,
         alias="from",
-        description="Calibration, relative to this file: an Argoverse 2 log folder or a .usdz of AlpaSim.",
+        description="Calibration, relative to this file: an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json.",
     )
     names: tuple[str, ...] = Field(
         default=(),

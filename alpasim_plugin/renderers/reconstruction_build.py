@@ -186,7 +186,7 @@ def rough_start(
                 np.clip(1 + np.float32(recipe.range_error) * smooth, LEAST, MOST), dtype=np.float32
             )
             chosen.append(replace(view, depth=wrong))
-    start = start_from_depth(chosen, boxes, splat.points, scene_id, splat.seed)
+    start = start_from_depth(chosen, boxes, splat.points, scene_id, splat.seed, splat.actor_points)
     return Start(
         _sized(start.background, recipe),
         {name: _sized(cloud, recipe) for name, cloud in start.actors.items()},

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_npz
-from alpasim_plugin.core.types import Degradation, Scenario
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.scene.log_views import SkyView
@@ -25,12 +25,17 @@ from alpasim_plugin.gaussians.scene.log_views import SkyView
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 
-# By second of the log and camera, so that a longer drive is fitted no worse.
+# By second of the log and camera, so that neither a longer drive nor a rig of more cameras is fitted
+# worse; a lens counts as the pinholes that cover it.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
-FEWEST_VIEWS = 12
-MOST_VIEWS = 180
-MOST_POINTS = 72_000
-MOST_STEPS = 1500
+LONGEST_S = 30.0  # a longer log gets the points and steps of so many seconds
+FEWEST_VIEWS, MOST_VIEWS = 12, 180  # the latter by camera
+ACTOR_POINTS = 400  # by camera
+# A camera that looks along the road sees a surface for seconds, one that looks aside for less than
+# one: with several, start points come from every second instant, and each view is learned from twice
+# as often.
+INSTANTS_ALONG, INSTANTS_ASIDE = 6, 2
+STEPS_ASIDE = 2.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class ReconstructionRecipe:
     splat: SplatRecipe
     lateral_offset_m: float
     fit_actors: bool
-    depth_every: int = 6
+    depth_every: int = INSTANTS_ALONG
     range_error: float = 0.1
     size: float = 0.6
     opacity: float = 0.2
@@ -64,35 +69,31 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
     """Return the recipe of a scenario's degradation, which is fitted to what its cameras saw along
     the log.
 
-    Raises:
-        InputError: The degradation is not one that fits a model.
-    """
-    t_us = scenario.ego_log.t_us
-    return recipe_for(
-        scenario.degradation, (t_us[-1] - t_us[0]) * 1e-6 * max(1, len(scenario.cameras))
-    )
-
-
-def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
-    """Return the recipe of a degradation of what a camera watched for so many seconds.
-
-    Few points, small views, no densification: a model that some seconds of one core can fit. Rates
-    are higher than those of a whole fit, as a schedule of hundreds of steps needs.
+    Few points, small views, no densification: a model that some seconds of one core and camera can
+    fit. Rates are higher than those of a whole fit, as a schedule of hundreds of steps needs.
 
     Raises:
         InputError: The degradation is not one that fits a model.
     """
+    amount = scenario.degradation
     if amount.kind not in ("reconstruction", "cycle"):
         raise InputError(
             f"degradation kind {amount.kind!r}: nothing to fit",
             "say reconstruction or cycle",
         )
-    points = min(MOST_POINTS, max(POINTS_PER_S, round(POINTS_PER_S * watched_s)))
+    cameras = max(1, len(scenario.cameras))
+    aside = cameras > 1
+    log_s = (scenario.ego_log.t_us[-1] - scenario.ego_log.t_us[0]) * 1e-6
+    watched_s = cameras * min(LONGEST_S, log_s)
+    steps = amount.share * FULL_STEPS_PER_S * watched_s * (STEPS_ASIDE if aside else 1.0)
+    views = min(MOST_VIEWS * cameras, round(amount.views_per_s * log_s * cameras))
+    points = max(POINTS_PER_S, round(POINTS_PER_S * watched_s))
     splat = SplatRecipe(
-        steps=max(1, round(amount.share * min(MOST_STEPS, FULL_STEPS_PER_S * watched_s))),
-        views=min(MOST_VIEWS, max(FEWEST_VIEWS, round(amount.views_per_s * watched_s))),
+        steps=max(1, round(steps)),
+        views=max(FEWEST_VIEWS, views),
         width=160,
         points=points,
+        actor_points=ACTOR_POINTS * cameras,
         cap=points,
         sh_degree=1,
         lr_means=4e-4,
@@ -109,6 +110,7 @@ def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
         splat,
         lateral_offset_m,
         on_path,
+        depth_every=INSTANTS_ASIDE if aside else INSTANTS_ALONG,
         range_error=amount.depth_error,
         pose_error_m=amount.pose_error_m,
     )

@@ -235,12 +235,14 @@ def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path: Path
 
 def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
     short, scenario = recipe_of(street()).splat, straight(degradation=FITTED)
-    long, two = (
-        recipe_of(scenario).splat,
-        recipe_of(replace(scenario, cameras=scenario.cameras * 2)).splat,
+    log = scenario.ego_log
+    minutes = replace(scenario, ego_log=replace(log, t_us=log.t_us * 40))
+    long, two, six = (
+        recipe_of(replace(minutes, cameras=scenario.cameras * count)).splat for count in (1, 2, 6)
     )
     for name in ("views", "points", "steps"):
         assert getattr(short, name) < getattr(long, name) < getattr(two, name)
+        assert getattr(six, name) == 3 * getattr(two, name)
 
 
 def turned_aside(name: str, yaw: float) -> CameraSpec:

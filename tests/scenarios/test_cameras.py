@@ -9,6 +9,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import rays_of, sides_of
+from alpasim_plugin.core.types import LensModel
 from scenarios.load import load_scenario
 from scenarios.usdz_write import write_usdz
 
@@ -67,6 +68,38 @@ def test_cameras_of_an_argoverse_log_have_its_distortion(shared_data: Path, tmp_
     cameras = load_scenario(written(tmp_path, text)).cameras
     assert [camera.name for camera in cameras] == ["ring_front_center", "ring_side_left"]
     assert all(camera.lens and camera.lens.kind == "opencv" for camera in cameras)
+
+
+RIG = """{"axes": "%s", "w": 640, "h": 480, "fl_x": 500, "fl_y": 510.0, "cx": 320.5, "cy": 240, "frames": [
+{"camera": "left", "k1": -0.1, "p2": 0.01, "transform_matrix": [[0, 0, 1, 1.5], [-1, 0, 0, 0.2], [0, -1, 0, 1.6], [0, 0, 0, 1]]},
+{"camera": "%s", "camera_model": "OPENCV_FISHEYE", "transform_matrix": [[0, 0, %s, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]]}]}"""
+
+
+def test_cameras_of_a_transforms_json_stand_where_its_poses_say(tmp_path: Path) -> None:
+    (tmp_path / "rig.json").write_text(RIG % ("opencv", "round", 1))
+    cameras = load_scenario(written(tmp_path, "{from: rig.json, width: 320}")).cameras
+    left, fisheye = sorted(cameras, key=lambda camera: camera.name)
+    assert left.lens == LensModel("opencv", (-0.1, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0))
+    assert fisheye.lens == LensModel("fisheye", (0.0,) * 4)
+    np.testing.assert_allclose(left.K[[0, 1, 0], [0, 1, 2]], [250, 255, 160.25])
+    np.testing.assert_allclose(left.T_rig_camera[:3, 2:].T, [[1, 0, 0], [1.5, 0.2, 1.6]])
+    turned = (RIG % ("opengl", "round", 1)).replace("[0, 0, 1, 1.5]", "[0, 0, -1, 1.5]")
+    (tmp_path / "rig.json").write_text(turned.replace("[0, -1, 0, 1.6]", "[0, 1, 0, 1.6]"))
+    same = load_scenario(written(tmp_path, "{from: rig.json, width: 320}")).cameras
+    np.testing.assert_array_equal(same[0].T_rig_camera, cameras[0].T_rig_camera)
+
+
+@pytest.mark.parametrize(
+    ("axes", "name", "forward", "named"),
+    [("nerf", "round", 1, "axes"), ("opencv", "left", 1, "'left'"), ("opencv", "a", 2, "rotation")],
+)
+def test_a_transforms_json_that_is_no_calibration_is_refused(
+    tmp_path: Path, axes: str, name: str, forward: int, named: str
+) -> None:
+    (tmp_path / "rig.json").write_text(RIG % (axes, name, forward))
+    with pytest.raises(InputError) as error:
+        load_scenario(written(tmp_path, "{from: rig.json, width: 320}"))
+    assert named in error.value.message
 
 
 @pytest.mark.parametrize(
