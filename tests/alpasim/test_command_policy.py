@@ -236,7 +236,6 @@ time.sleep(60)
     with subprocess.Popen(
         [sys.executable, "-c", starting], stdout=subprocess.PIPE, text=True, cwd=REPO
     ) as parent:
-        assert parent.stdout is not None
         pid = int(parent.stdout.readline())
         assert not is_gone(pid)
         parent.send_signal(number)

@@ -81,7 +81,6 @@ def test_the_right_map_stays_on(dashed: bool, contrast: int) -> None:
 @pytest.mark.parametrize("aside_m", [1.75, -1.75, 0.9, -2.2])
 def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside_m: float) -> None:
     found = judged(photograph(), prepared(aside_m))
-    assert found is not None
     assert found.here < DOUBT
     assert found.there >= FITS
     assert found.offset_m == pytest.approx(-aside_m, abs=0.01)
@@ -181,7 +180,6 @@ def test_a_server_drops_a_wrong_map_and_says_so(
                 threads=1,
             )
         )
-        assert made.scenes is not None
         entry, asked = made.scenes.get(ask().scene_id), ask()
         if entry.scene_map is not None:
             lines = replace(

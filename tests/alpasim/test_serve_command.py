@@ -36,7 +36,6 @@ def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
     with subprocess.Popen(
         [*command, "--upstream", upstream.address], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         opened = json.loads(process.stdout.readline())
         with grpc.insecure_channel(opened["at"]) as channel:
             stub = Stub(channel, "SensorsimService")

@@ -91,7 +91,6 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
     asked = ask(shutter_type, spec=spec)
     asked.resolution_w, asked.resolution_h = 160, 90
     found, lens = exposure(asked), read_lens(asked.camera_intrinsics, 160, 90)
-    assert found is not None
     assert lens.resample is not None
     assert found.share.shape == lens.cover[::-1]
     read = cv2.remap(
@@ -146,7 +145,6 @@ def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_r
 
 def test_the_map_has_the_shutter_of_the_frame() -> None:
     made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE], threads=1))
-    assert made.scenes is not None
     asked = ask()
     view, entry = read_view(asked), made.scenes.get(asked.scene_id)
     lens = read_lens(asked.camera_intrinsics, W, H)
@@ -157,7 +155,6 @@ def test_the_map_has_the_shutter_of_the_frame() -> None:
         drawn_map(entry, request, lens, 1),
         drawn_map(entry, replace(request, exposure=None), lens, 1),
     )
-    assert drawn is not None
     assert still is not None
     assert (drawn != still).any()
     assert entry.scene_map is not None

@@ -16,8 +16,6 @@ from tests.docs.test_commands import parse
 def run_tests_of(file: Path) -> int:
     """Import a test file and call its tests; return how many there are."""
     spec = importlib.util.spec_from_file_location(file.stem, file)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     tests = [value for name, value in vars(module).items() if name.startswith("test_")]

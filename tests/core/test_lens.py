@@ -34,7 +34,6 @@ def colours(ray: F64) -> F64:
 def by_equations(spec: CameraSpec, ray: F64) -> F64:
     """Where a lens shows rays ``(N, 3)``, by OpenCV and by the equation of f-theta lenses."""
     lens, none = spec.lens, np.zeros(3)
-    assert lens is not None
     from_corner = spec.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     given = np.array(lens.coefficients)
     if lens.kind == "opencv":

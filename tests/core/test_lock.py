@@ -29,7 +29,6 @@ def holder(path: Path, seconds: float, repo: Path) -> subprocess.Popen[str]:
         text=True,
         env=os.environ | {"PYTHONPATH": str(repo)},
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     return process
 

@@ -62,8 +62,6 @@ def running(words: Sequence[str], folder: Path) -> Iterator[None]:
     with subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         said = process.stdout.readline()
         try:
             assert said.startswith("serving "), said + process.stderr.read()

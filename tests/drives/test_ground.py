@@ -38,7 +38,6 @@ def test_it_follows_a_crest_in_any_unit(unit: float) -> None:
     xy = stream("ground", 0, "road").uniform([0, -3], [60, 3], (1500, 2))
     scale = np.diag([unit, unit, unit, 1.0])
     strip = fit_ground(points_on(xy).moved(scale), unit * path())
-    assert strip is not None
     assert strip.height / unit == pytest.approx(HEIGHT_M, abs=0.02)
     wheels = np.array([[x, y] for x in np.arange(4.0, 56.0, 2.0) for y in (-0.8, 0.0, 0.8)])
     assert np.abs(strip.z(unit * wheels) / unit - road(*wheels.T)).max() < 0.03
@@ -49,7 +48,6 @@ def test_what_stands_on_it_does_not_lift_it() -> None:
     xy = rng.uniform([0, -1.4], [60, 1.4], (400, 2))
     cars = rng.uniform([0, -2.2], [60, 2.2], (500, 2))
     strip = fit_ground(points_on(xy).joined(points_on(cars, rng.uniform(0.2, 1.0, 500))), path())
-    assert strip is not None
     wheels = np.column_stack([np.arange(4.0, 56.0, 2.0), np.zeros(26)])
     assert np.abs(strip.z(wheels) - road(*wheels.T)).max() < 0.05
 
@@ -61,7 +59,6 @@ def test_few_points_under_the_path_are_helped_by_those_beside_it() -> None:
         rng.uniform([0, 1.7], [60, 1.95], (60, 2)),
     )
     strip = fit_ground(points_on(np.concatenate([under, beside])), path())
-    assert strip is not None
     assert strip.height == pytest.approx(HEIGHT_M, abs=0.1)
 
 

@@ -34,7 +34,6 @@ def opened(folder: Path) -> tuple[SourceDrive, PlacedDrive]:
 def assert_is_the_street(placed: PlacedDrive, rel: float = 0.03) -> None:
     ego = placed.ego.xyz
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx(WAY_M, rel=rel)
-    assert placed.strip is not None
     assert np.abs(placed.strip.section_errors).max() < 0.05
     mount = placed.mounts[next(iter(placed.mounts))]
     assert mount[2, 3] == pytest.approx(1.5, abs=0.08)

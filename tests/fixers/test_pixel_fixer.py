@@ -227,8 +227,6 @@ def reading(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write weights that read references and give them most of the picture."""
     torch.manual_seed(5)
     net = PixelGenerator(replace(SIZES, blend=8))
-    assert net.blend is not None
-    assert net.blend.write.bias is not None
     with torch.no_grad():
         net.blend.write.bias[:4] = 4.0
     path = tmp_path_factory.mktemp("reading") / "small.safetensors"

@@ -21,7 +21,6 @@ def trained_like(seed: int = 0) -> PixelGenerator:
     """A network none of whose layers is zero, as after training."""
     net = PixelGenerator.random(SIZES, seed).eval().requires_grad_(False)
     draw = torch.Generator().manual_seed(seed)
-    assert net.blend is not None
     for parameter in net.blend.parameters():
         parameter.add_(0.2 * torch.randn(parameter.shape, generator=draw))
     return net

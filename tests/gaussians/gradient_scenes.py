@@ -20,7 +20,6 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
-from tests.gaussians.torch_rasterizer import GaussianTensors, rasterize_tensors
 
 
 def cloud_of(splats: Splats) -> GaussianCloud:
@@ -120,22 +119,6 @@ def kernel_gradients(
     weighted(out, s).backward()
     leaves = {**tensors, "background": background}
     return {name: t.grad.double().numpy() for name, t in leaves.items()}, out
-
-
-def torch_gradients(s: Scene) -> Gradients:
-    """Return the gradients of `rasterize_torch` in float64."""
-    t = {
-        name: torch.tensor(a).requires_grad_(True)
-        for name, a in {**s.arrays(), "background": np.array(s.background)}.items()
-    }
-    gaussians = GaussianTensors(
-        t["means"], t["quaternions"], t["log_scales"].exp(), t["logit_opacities"].sigmoid(), t["sh"]
-    )
-    weighted(rasterize_tensors(gaussians, s.camera, t["background"]), s).backward()
-    return {
-        name: np.zeros_like(a) if (a := leaf.grad) is None else a.numpy()
-        for name, leaf in t.items()
-    }
 
 
 def reference_loss(s: Scene, values: dict[str, np.ndarray]) -> float:

@@ -235,7 +235,6 @@ def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
 @pytest.mark.parametrize("colour", [(150, 30, 30), (235, 235, 235), (25, 25, 30), (30, 60, 160)])
 def test_foot_of_a_car_gives_its_distance(distance: float, colour: tuple[int, int, int]) -> None:
     found = foot_in(BusyRoad(blocks=(Block(distance + 2.25, colour=colour),)))
-    assert found is not None
     assert found[0] == pytest.approx(distance, abs=0.35 + 2.0 * found[1])
     assert found[1] < 0.15 * distance
 
@@ -263,7 +262,6 @@ def test_closing_speed_is_learned_from_the_feet() -> None:
     for k in range(40):
         truth = 40.0 + (6.0 - 10.0) * k * 0.1
         track = track_obstacle(track, (truth + random.normal(0, 0.4), 0.5), 10.0, 0.1)
-    assert track is not None
     assert track.confirmed
     assert track.distance_m == pytest.approx(40.0 - 4.0 * 3.9, abs=0.6)
     assert track.speed_mps == pytest.approx(6.0, abs=1.0)
@@ -271,11 +269,9 @@ def test_closing_speed_is_learned_from_the_feet() -> None:
 
 def test_track_needs_three_sightings_and_ends_after_nine_misses() -> None:
     track = track_obstacle(None, (20.0, 0.5), 5.0, 0.1)
-    assert track is not None
     assert not track.confirmed
     for k in range(5):
         track = track_obstacle(track, (20.0 - 0.5 * (k + 1), 0.5), 5.0, 0.1)
-    assert track is not None
     assert track.confirmed
     for _ in range(8):
         track = track_obstacle(track, None, 0.0, 0.1)

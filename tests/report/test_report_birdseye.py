@@ -71,7 +71,6 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
         {rollout.cell: series_of(*(v.tolist() for v in left))},
         VARIANTS,
     )
-    assert view is not None
     log, track = decode(view.log), decode(view.tracks[0].d)
     assert log[-1, 0] > log[0, 0]
     assert abs(log[-1, 1] - log[0, 1]) <= 2
@@ -87,7 +86,6 @@ def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
     rollout = Rollout("a", "p", "s", 0, "ok")
     stray = series_of(x, np.linspace(0, 5000, 50).tolist())
     view = scene_view("s", scene(x, [0.0] * 50), [rollout], {rollout.cell: stray}, VARIANTS)
-    assert view is not None
     assert view.height / view.unit_per_m < 70.0
 
 
@@ -95,7 +93,6 @@ def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
     there = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]]}
     back = {"left": [[100, -3], [0, -3]], "right": [[100, 1], [0, 1]]}
     view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[there, back]), [], {}, VARIANTS)
-    assert view is not None
     areas = [
         np.sign(shapely.LinearRing(decode(part)).is_ccw - 0.5)
         for part in view.lanes.split("z")
@@ -122,7 +119,6 @@ def test_event_is_marked_where_and_when_it_happened() -> None:
         )
     }
     view = scene_view("s", scene(x, [0.0] * 51), [rollout], series, VARIANTS)
-    assert view is not None
     (mark,) = view.marks  # off-road steps that the rollout's metric does not count are not marked
     assert (
         mark.text == "a \u00b7 seed 3: collision (front) at 2.0\u00a0s, x 21.4, y 0.0\u00a0m"
@@ -134,6 +130,5 @@ def test_event_is_marked_where_and_when_it_happened() -> None:
 def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
     rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
     view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, VARIANTS)
-    assert view is not None
     assert view.marks[0].x is None
     assert view.marks[0].text == "a \u00b7 seed 0: off-road at a time that no step shows"

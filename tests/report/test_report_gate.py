@@ -27,7 +27,6 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
     files = write_gate_files(verdict, source, run, root)
     assert [file.name for file in files] == ["gate.md", "gate.junit.xml", "gate.json"]
     section = gate_section(run)
-    assert section is not None
     assert (section["exit_code"], section["baseline"]) == (verdict.exit_code, verdict.baseline)
     assert len(section["checks"]) == len(verdict.checks)
     assert section["worst"]

@@ -13,7 +13,6 @@ from evaluators.report.ci import clean, junit
 
 def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
     suite = ET.parse(write_junit(usual_run)).getroot().find("testsuite")
-    assert suite is not None
     cases = suite.findall("testcase")
     assert len(cases) == int(suite.attrib["tests"]) == 72
     assert len({(c.attrib["classname"], c.attrib["name"]) for c in cases}) == 72
@@ -25,7 +24,6 @@ def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
         if (c.attrib["classname"], c.attrib["name"]) == ("urban/left-turn", "3dgs/lane-camera/1")
     )
     error = case.find("error")
-    assert error is not None
     assert error.attrib["type"] == "renderer"
     assert error.attrib["message"] == "1204 NaN pixels <b>&"
 

@@ -135,7 +135,6 @@ def rollout(run: Path, policy: str) -> Path:
 def queries_of(page: str) -> list[dict[str, Any]]:
     """Return the queries that a page draws."""
     found = re.search(r'<script type="application/json" id="cause">(.*?)</script>', page)
-    assert found is not None
     return list(json.loads(found[1])["queries"])
 
 

@@ -54,7 +54,6 @@ def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
 ) -> None:
     scenario, path = written
     read, view = read_usdz(path), scenario.alpasim_map
-    assert view is not None
     ids = table_ids(list(view.lanes))
     assert list(read.lane_map.lanes) == [ids[key] for key in view.lanes]
     for key, lane in view.lanes.items():

@@ -74,7 +74,6 @@ def test_poses_are_those_of_the_log(watched_run: Path) -> None:
     cell = cells_of(run)[0]
     data = cell_data(run, cell, read_logs(run, cell), None)
     content = run.scene_data(cell.scene)
-    assert content is not None
     origin = np.array([content["ego_log"][key][0] for key in ("x_m", "y_m")])
     for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
         log = read_asl(watched_run / rollout.path / "rollout.asl", images=False)
@@ -255,7 +254,6 @@ def test_a_page_is_one_file_that_asks_for_nothing(watched_run: Path, tmp_path: P
     made = write_page(read_run(watched_run), tmp_path / "view.html", Wanted())
     html = made.path.read_text()
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', html)
-    assert policy is not None
     assert "default-src 'none'" in policy[1]
     assert "unsafe" not in policy[1]
     assert "connect-src" not in policy[1]

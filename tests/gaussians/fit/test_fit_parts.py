@@ -145,7 +145,6 @@ def test_a_placed_actor_passes_gradients_to_its_own_frame() -> None:
     splats, _ = model.placed(model.motion({"car": T}), 4)
     splats.means[3:, 0].sum().backward()
     gradient = model.params["means"].grad
-    assert gradient is not None
     assert torch.allclose(
         gradient[3:], torch.as_tensor(T[0, :3], dtype=torch.float32).expand(4, 3), atol=1e-6
     )
@@ -251,7 +250,6 @@ def test_where_no_depth_is_known_an_actor_starts_all_over_its_box() -> None:
 
 def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
     sky = sky_of(posed.views)
-    assert sky is not None
     for view in posed.views[::3]:
         assert view.sky is not None
         error = np.abs(sky.image(view.camera) - view.rgb / 255.0)[view.sky]

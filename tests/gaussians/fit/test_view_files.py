@@ -93,7 +93,6 @@ def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path
     )
     change(tmp_path, ply_file_path="points.ply")
     _, start = read_views(tmp_path)
-    assert start is not None
     assert start.means.tolist() == [[1, 2, 3], [2, 2, 3]]
     assert start.sh[0, 0, 0] > 1.7
     write_points(tmp_path / "grey.ply", "x y z", np.array([[1, 2, 3]]))

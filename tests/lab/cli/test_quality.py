@@ -140,8 +140,6 @@ def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
     assert [variant.label for variant in variants] == ["3dgs", "two", "small"]
     assert variants[0].spec is None
     two, small = (variant.spec.settings for variant in variants[1:] if variant.spec)
-    assert isinstance(two, OneFixerSettings)
-    assert isinstance(small, OneFixerSettings)
     assert (two.mode, small.mode) == ("chunk", "chunk")
     assert (two.window, small.window, len(two.steps)) == (6, 5, 2)
     assert small.dit.width == 24

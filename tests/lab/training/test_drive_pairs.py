@@ -34,7 +34,6 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
     for one in made:
         sequence = PairSequence(one.folder)
         references = open_references(sequence)
-        assert references is not None
         assert sequence.size == (64, 48)
         held, recorded = set(sequence.clip.t_us.tolist()), set(references.rgb_t_us.tolist())
         assert not held & recorded

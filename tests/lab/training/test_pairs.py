@@ -84,7 +84,6 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
     make_sequence(exact, folder, PairRecipe(offset_m=0.4), 0, split="val", family="street")
     sequence = PairSequence(folder)
     recorded = open_references(sequence)
-    assert recorded is not None
     assert recorded.t_us.tolist() == sequence.clip.t_us.tolist()
     assert recorded.rgb_t_us.tolist() == [50_000, 550_000]
     for i, (image,) in enumerate(recorded.warped(len(sequence.clip), 1)):
