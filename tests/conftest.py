@@ -11,7 +11,6 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -56,7 +55,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_waiting_for_the_disk() -> Iterator[None]:
+def no_waiting_for_the_disk():
     """Let no write of this process wait until it is on the disk: thousands do, and no test cuts the
     power.
     """
@@ -66,7 +65,7 @@ def no_waiting_for_the_disk() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def same_threads() -> Iterator[None]:
+def same_threads():
     """Leave torch's number of threads as it was: two workers with two threads each wait for one
     another most of the time.
     """
@@ -88,7 +87,7 @@ def find_shared_data() -> Path | None:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Give the data folder or skip: its files have licences that keep them out of this
     repository.
     """
@@ -99,7 +98,7 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def data_set(shared_data: Path) -> Callable[[str], Path]:
+def data_set(shared_data):
     """Give what returns one of the data sets by its folder's name, or skips."""
 
     def found(name: str) -> Path:
@@ -111,13 +110,13 @@ def data_set(shared_data: Path) -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def repo() -> Path:
+def repo():
     """Give the repository root."""
     return REPO
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     """Give an installed Chromium; the test skips where there is none."""
     executable = find_chromium()
     if executable is None:

@@ -7,13 +7,12 @@ import re
 import shutil
 import subprocess
 import tomllib
-from pathlib import Path
 
 import pytest
 
 
 @pytest.fixture
-def steps(repo: Path) -> list[tuple[str, str]]:
+def steps(repo):
     """Give the instructions with their arguments, continued lines joined."""
     text = re.sub(r"^\s*#.*\n", "", (repo / "Dockerfile").read_text(), flags=re.M).replace(
         "\\\n", " "
@@ -24,7 +23,7 @@ def steps(repo: Path) -> list[tuple[str, str]]:
     ]
 
 
-def test_what_it_copies_is_there_and_is_sent(repo: Path, steps: list[tuple[str, str]]) -> None:
+def test_what_it_copies_is_there_and_is_sent(repo, steps):
     sent = {
         line[1:]
         for line in (repo / ".dockerignore").read_text().splitlines()
@@ -63,7 +62,7 @@ def engine() -> str | None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_image_builds_and_drives(repo: Path, tmp_path: Path) -> None:
+def test_the_image_builds_and_drives(repo, tmp_path):
     found = engine()
     if found is None:
         pytest.skip("no container engine answers")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tests.laboratory import DISTRIBUTION, laboratory_is_installed
 
 
-def test_laboratory_is_found_by_its_distribution_alone(tmp_path: Path) -> None:
+def test_laboratory_is_found_by_its_distribution_alone(tmp_path):
     assert not laboratory_is_installed([str(tmp_path)])
     facts = tmp_path / "alpasim_onefixer_lab-0.1.0.dist-info" / "METADATA"
     facts.parent.mkdir()

@@ -114,7 +114,7 @@ def upward_imports(module: Module) -> list[str]:
     ]
 
 
-def test_every_module_lies_in_a_room() -> None:
+def test_every_module_lies_in_a_room():
     faces = {
         "alpasim_plugin",
         "simrun",
@@ -129,17 +129,17 @@ def test_every_module_lies_in_a_room() -> None:
     } <= set(PLUG_INS)
 
 
-def test_rooms_import_only_rooms_that_stand_before_them() -> None:
+def test_rooms_import_only_rooms_that_stand_before_them():
     assert [line for module in modules() for line in upward_imports(module)] == []
 
 
-def test_no_room_imports_in_a_circle() -> None:
+def test_no_room_imports_in_a_circle():
     """Modules of one room may import one another, but not in a circle either, imports inside
     functions included.
     """
     arrows = {module.name: targets_of(module) for module in modules()}
-    done: set[str] = set()
-    path: list[str] = []
+    done = set()
+    path = []
 
     def visit(name: str) -> list[str]:
         if name in path:
@@ -180,7 +180,7 @@ def is_for_type_checkers(node: ast.AST) -> bool:
 
 
 @pytest.mark.parametrize("room", PLUG_INS)
-def test_the_core_does_not_name_a_plug_in_room(room: str) -> None:
+def test_the_core_does_not_name_a_plug_in_room(room):
     """A string that names one of their modules is an import too: it would break where the room is
     not installed.
     """
@@ -189,7 +189,7 @@ def test_the_core_does_not_name_a_plug_in_room(room: str) -> None:
     assert [module.name for module in outside if word.search(module.path.read_text())] == []
 
 
-def test_evaluators_do_not_load_torch() -> None:
+def test_evaluators_do_not_load_torch():
     own = [module for module in modules() if module.name.startswith("evaluators")]
     top = {
         m.name: {
@@ -210,7 +210,7 @@ def test_evaluators_do_not_load_torch() -> None:
     ] == []
 
 
-def test_no_global_random_generator_is_used() -> None:
+def test_no_global_random_generator_is_used():
     wrong = []
     for module in modules():
         for node in module.nodes:

@@ -57,7 +57,7 @@ def private_uses(module: Module) -> set[str]:
     }
 
 
-def test_private_and_deprecated_names_of_other_libraries_are_used_only_where_it_is_said() -> None:
+def test_private_and_deprecated_names_of_other_libraries_are_used_only_where_it_is_said():
     found = {module.name: sorted(private_uses(module)) for module in modules()}
     used = {name: uses for name, uses in found.items() if uses}
     assert {name: uses for name, uses in used.items() if name not in ALLOWED} == {}
@@ -92,7 +92,7 @@ def calls_of(module: Module) -> Iterator[str]:
             yield dotted(node.func)
 
 
-def test_text_is_printed_in_one_place_which_escapes_it() -> None:
+def test_text_is_printed_in_one_place_which_escapes_it():
     found = {
         module.name
         for module in modules()
@@ -115,7 +115,7 @@ def names_bound(statement: ast.stmt) -> list[str]:
     ]
 
 
-def test_no_module_binds_a_name_twice() -> None:
+def test_no_module_binds_a_name_twice():
     twice = {}
     for module in modules():
         counts = Counter(name for one in module.top for name in names_bound(one))
@@ -159,7 +159,7 @@ def reads_files(module: Module) -> bool:
 RAISING = {"exists", "is_file", "is_dir", "is_symlink", "resolve"}
 
 
-def test_paths_of_users_go_through_functions_that_do_not_raise() -> None:
+def test_paths_of_users_go_through_functions_that_do_not_raise():
     """`pathlib` raises for names that are too long and for circles of links; `os.path` and
     `alpasim_plugin.core.reading.real` do not.
     """
@@ -176,7 +176,7 @@ def test_paths_of_users_go_through_functions_that_do_not_raise() -> None:
     assert found == []
 
 
-def test_files_are_read_in_one_place_which_refuses_pipes_and_devices() -> None:
+def test_files_are_read_in_one_place_which_refuses_pipes_and_devices():
     found = {
         module.name
         for module in modules()

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 import torch
 
-from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
@@ -16,7 +12,7 @@ from tests.alpasim.service_cases import StandInRenderer, hosted
 
 
 @pytest.fixture(scope="session")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(tmp_path_factory):
     torch.manual_seed(5)
     net = PixelGenerator(PixelSizes((8, 12, 16), (0, 1, 1, 1, 1), 8, 4))
     with torch.no_grad():
@@ -30,17 +26,17 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def overrides(bundle: Path) -> list[str]:
+def overrides(bundle):
     """Settings of the small fixer: noise in holes, so that its key counts."""
     return [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", "keep_render=false"]
 
 
 @pytest.fixture
-def renderer() -> StandInRenderer:
+def renderer():
     return StandInRenderer()
 
 
 @pytest.fixture
-def upstream(renderer: StandInRenderer) -> Iterator[Host]:
+def upstream(renderer):
     with hosted({"SensorsimService": renderer}) as host:
         yield host

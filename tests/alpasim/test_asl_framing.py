@@ -40,9 +40,7 @@ entries_strategy = st.lists(
 
 @settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy)
-def test_any_entries_come_back_in_order(
-    tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry]
-) -> None:
+def test_any_entries_come_back_in_order(tmp_path_factory, entries):
     path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
     reader = AslReader(path)
     assert list(reader) == entries
@@ -53,10 +51,10 @@ def test_any_entries_come_back_in_order(
 @settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy, data=st.data())
 def test_a_cut_anywhere_loses_only_the_last_entry(
-    tmp_path_factory: pytest.TempPathFactory,
-    entries: list[logging_pb2.LogEntry],
-    data: st.DataObject,
-) -> None:
+    tmp_path_factory,
+    entries,
+    data,
+):
     path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
     whole = path.read_bytes()
     ends = [0]
@@ -73,7 +71,7 @@ def test_a_cut_anywhere_loses_only_the_last_entry(
         assert (reader.truncated.entries, reader.truncated.offset) == (len(kept), ends[len(kept)])
 
 
-def test_length_is_big_endian(tmp_path: Path) -> None:
+def test_length_is_big_endian(tmp_path):
     path = write(tmp_path / "a.asl", [entry()])
     assert (
         struct.unpack(">I", path.read_bytes()[:4])[0]
@@ -82,7 +80,7 @@ def test_length_is_big_endian(tmp_path: Path) -> None:
     )
 
 
-def test_truncated_tail_reads_as_a_sentence(tmp_path: Path) -> None:
+def test_truncated_tail_reads_as_a_sentence(tmp_path):
     path = write(tmp_path / "a.asl", [entry(), entry()])
     size = entry().ByteSize()
     path.write_bytes(path.read_bytes()[:-3])
@@ -94,7 +92,7 @@ def test_truncated_tail_reads_as_a_sentence(tmp_path: Path) -> None:
     )
 
 
-def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path: Path) -> None:
+def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path):
     path = write(tmp_path / "a.asl", [entry(), entry(), entry()])
     data = bytearray(path.read_bytes())
     data[2] = 0x40  # the first length now reaches far past the end of the file
@@ -104,14 +102,14 @@ def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path: Path) -> None:
     assert "entry 0 at byte 0" in caught.value.message
 
 
-def test_varint_lengths_are_refused(tmp_path: Path) -> None:
+def test_varint_lengths_are_refused(tmp_path):
     body = entry().SerializeToString()
     (tmp_path / "a.asl").write_bytes(b"".join(bytes([len(body)]) + body for _ in range(3)))
     with pytest.raises(InputError, match="a length of"):
         list(AslReader(tmp_path / "a.asl"))
 
 
-def test_garbage_in_the_middle_is_an_error_with_its_place(tmp_path: Path) -> None:
+def test_garbage_in_the_middle_is_an_error_with_its_place(tmp_path):
     path = write(tmp_path / "a.asl", [entry(), entry(), entry()])
     size = 4 + entry().ByteSize()
     data = bytearray(path.read_bytes())
@@ -123,7 +121,7 @@ def test_garbage_in_the_middle_is_an_error_with_its_place(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("length", [0, 2**31])
-def test_impossible_length_is_an_error(tmp_path: Path, length: int) -> None:
+def test_impossible_length_is_an_error(tmp_path, length):
     path = write(tmp_path / "a.asl", [entry()])
     with path.open("ab") as stream:
         stream.write(struct.pack(">I", length) + bytes(50))
@@ -131,7 +129,7 @@ def test_impossible_length_is_an_error(tmp_path: Path, length: int) -> None:
         list(AslReader(path))
 
 
-def test_empty_and_missing_files_are_errors(tmp_path: Path) -> None:
+def test_empty_and_missing_files_are_errors(tmp_path):
     (tmp_path / "a.asl").write_bytes(b"")
     with pytest.raises(InputError, match="an empty file"):
         list(AslReader(tmp_path / "a.asl"))
@@ -139,13 +137,13 @@ def test_empty_and_missing_files_are_errors(tmp_path: Path) -> None:
         list(AslReader(tmp_path / "b.asl"))
 
 
-def test_entry_of_a_future_kind_is_passed_on_unnamed(tmp_path: Path) -> None:
+def test_entry_of_a_future_kind_is_passed_on_unnamed(tmp_path):
     body = b"\xfa\x01\x02\x08\x01"  # field 31, two bytes
     (tmp_path / "a.asl").write_bytes(struct.pack(">I", len(body)) + body)
     assert [e.WhichOneof("log_entry") for e in AslReader(tmp_path / "a.asl")] == [None]
 
 
-def test_name_appears_only_when_finished(tmp_path: Path) -> None:
+def test_name_appears_only_when_finished(tmp_path):
     file = AslFile(tmp_path / "a.asl")
     file.write(entry())
     assert [p.name for p in tmp_path.iterdir()] == ["a.asl.part"]
@@ -156,7 +154,7 @@ def test_name_appears_only_when_finished(tmp_path: Path) -> None:
         file.write(entry())
 
 
-def test_failed_writer_leaves_a_readable_part_and_no_log(tmp_path: Path) -> None:
+def test_failed_writer_leaves_a_readable_part_and_no_log(tmp_path):
     def fail() -> None:
         with AslFile(tmp_path / "a.asl") as file:
             file.write(entry())
@@ -168,7 +166,7 @@ def test_failed_writer_leaves_a_readable_part_and_no_log(tmp_path: Path) -> None
     assert list(AslReader(tmp_path / "a.asl.part")) == [entry()]
 
 
-def test_failed_attempt_does_not_touch_a_finished_log(tmp_path: Path) -> None:
+def test_failed_attempt_does_not_touch_a_finished_log(tmp_path):
     write(tmp_path / "a.asl", [entry(1)])
     second = AslFile(tmp_path / "a.asl")
     second.write(entry(2))
@@ -176,7 +174,7 @@ def test_failed_attempt_does_not_touch_a_finished_log(tmp_path: Path) -> None:
     assert list(AslReader(tmp_path / "a.asl")) == [entry(1)]
 
 
-def test_full_disk_is_an_infrastructure_failure() -> None:
+def test_full_disk_is_an_infrastructure_failure():
     device = Path("/dev/full")
     if not device.exists():
         pytest.skip("this system has no /dev/full")
@@ -190,6 +188,6 @@ def test_full_disk_is_an_infrastructure_failure() -> None:
     file.abandon()
 
 
-def test_missing_folder_is_an_infrastructure_failure(tmp_path: Path) -> None:
+def test_missing_folder_is_an_infrastructure_failure(tmp_path):
     with pytest.raises(InfrastructureError, match="No such file or directory"):
         AslFile(tmp_path / "absent" / "a.asl")

@@ -19,7 +19,6 @@ import yaml
 
 from alpasim_plugin.alpasim.bridge import build as building
 from alpasim_plugin.alpasim.bridge.client import RendererClient
-from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
 from tests.alpasim.test_wire_generated import environment
@@ -54,13 +53,13 @@ WIZARD = "SIMRUN_ALPASIM_PYTHON"
 
 
 @pytest.fixture(scope="module")
-def staged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def staged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bridge")
     building.stage(folder)
     return folder
 
 
-def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged: Path) -> None:
+def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged):
     allowed = {"grpc", "google", "__future__", *sys.stdlib_module_names}
     modules = [path for path in staged.rglob("*.py") if not path.name.endswith("_pb2.py")]
     assert len(modules) >= 5
@@ -73,7 +72,7 @@ def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged: Pat
             assert {name.split(".")[0] for name in names} <= allowed, path
 
 
-def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged: Path) -> None:
+def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged):
     presets = sorted((staged / building.PACKAGE / "configs" / "renderer").glob("*.yaml"))
     kinds = {}
     for path in presets:
@@ -97,8 +96,8 @@ LINES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("words", LINES, ids=lambda words: " ".join(words[2:]))
 def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
-    staged: Path, tmp_path: Path, words: list[str]
-) -> None:
+    staged, tmp_path, words
+):
     python = os.environ.get(WIZARD)
     if python is None:
         pytest.skip(f"needs {WIZARD}, a Python that has AlpaSim's wizard")
@@ -129,9 +128,7 @@ def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
         assert all(one["address"].startswith("localhost:") for one in service["endpoints"])
 
 
-def test_the_client_asks_again_only_after_what_may_pass(
-    upstream: Host, renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_client_asks_again_only_after_what_may_pass(upstream, renderer, monkeypatch):
     monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
     frame, seen = drive(1)[0], []
 
@@ -159,7 +156,7 @@ def test_the_client_asks_again_only_after_what_may_pass(
 
 
 @pytest.mark.parametrize("items", [0, 1])
-def test_the_client_refuses_what_the_runtime_refuses(items: int) -> None:
+def test_the_client_refuses_what_the_runtime_refuses(items):
     """No item for a camera, or one without success."""
 
     class Refused(StandInRenderer):
@@ -175,9 +172,7 @@ def test_the_client_refuses_what_the_runtime_refuses(items: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(
-    upstream: Host, tmp_path: Path
-) -> None:
+def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream, tmp_path):
     wheel = building.build(tmp_path / "dist")
     python = environment(tmp_path / "venv", *PINS)
     subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True)

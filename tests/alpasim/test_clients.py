@@ -5,7 +5,6 @@ once.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from concurrent import futures
 from typing import Any
 
@@ -42,7 +41,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
+def scene(tmp_path_factory):
     """A short curve, as a file that both sides read."""
     written = yaml.safe_load(shipped_names()["smoke/curve"].read_text())
     path = tmp_path_factory.mktemp("scenes") / "curve.yaml"
@@ -52,7 +51,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def scenario(scene: str) -> Scenario:
+def scenario(scene):
     return load_scenario(scene)
 
 
@@ -80,7 +79,7 @@ def serve(
 
 
 @pytest.fixture
-def driver(scene: str) -> Iterator[tuple[DriverService, str, Calls]]:
+def driver(scene):
     """Our own policy behind AlpaSim's driver service."""
     calls = Calls()
     spec = resolve("policy", "lane-camera")
@@ -103,13 +102,11 @@ def drive(scenario: Scenario, renderer: str, policy: str) -> tuple[RolloutLog, d
 
 
 @pytest.fixture(scope="module")
-def inside(scenario: Scenario) -> RolloutLog:
+def inside(scenario):
     return drive(scenario, "clean", "lane-camera")[0]
 
 
-def test_a_driver_over_sockets_drives_as_the_policy_in_the_process(
-    scenario: Scenario, inside: RolloutLog, driver: tuple[DriverService, str, Calls]
-) -> None:
+def test_a_driver_over_sockets_drives_as_the_policy_in_the_process(scenario, inside, driver):
     service, address, calls = driver
     outside, facts = drive(scenario, "clean", f"alpasim://{address}?encoding=png")
     assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 2e-5  # poses are float32 on the wire
@@ -125,9 +122,7 @@ def test_a_driver_over_sockets_drives_as_the_policy_in_the_process(
     assert (facts["shortest_plan_s"], facts["empty_plans"], facts["samples_cut"]) == (5.0, 0, 0)
 
 
-def test_renderer_and_driver_over_sockets_at_once(
-    scenario: Scenario, scene: str, inside: RolloutLog, driver: tuple[DriverService, str, Calls]
-) -> None:
+def test_renderer_and_driver_over_sockets_at_once(scenario, scene, inside, driver):
     made = assemble(Settings(renderer="clean", scenes=(scene,)))
     with Host({"SensorsimService": made.service}, "127.0.0.1:0") as host:
         outside, _ = drive(scenario, f"nre://{host.address}", f"alpasim://{driver[1]}?encoding=png")
@@ -174,7 +169,7 @@ class Scripted:
         return self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
 
 
-def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario: Scenario) -> None:
+def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario):
     own = Scripted(egodriver_pb2.DriveResponse())
     server, address = serve("EgodriverService", own)
     with pytest.raises(PolicyError, match="an empty plan after the warm-up"):
@@ -196,7 +191,7 @@ def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario: Scenari
     assert own.sessions[0].debug_info.scene_id == scenario.scene_id
 
 
-def test_an_end_of_session_and_a_missing_service_are_said(scenario: Scenario) -> None:
+def test_an_end_of_session_and_a_missing_service_are_said(scenario):
     server, address = serve(
         "EgodriverService", Scripted(egodriver_pb2.DriveResponse(terminate_session=True))
     )
@@ -242,9 +237,7 @@ class Failing:
     ("code", "asked", "text"),
     [("UNAVAILABLE", 3, "out of film"), ("UNKNOWN", 1, "UNKNOWN: not now")],
 )
-def test_renders_are_tried_again_as_alpasim_does(
-    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, code: str, asked: int, text: str
-) -> None:
+def test_renders_are_tried_again_as_alpasim_does(scenario, monkeypatch, code, asked, text):
     monkeypatch.setattr("alpasim_plugin.alpasim.client.channel.RETRY_S", (0.0, 0.0))
     own = Failing(getattr(grpc.StatusCode, code), 2)
     server, address = serve("SensorsimService", own)
@@ -255,8 +248,8 @@ def test_renders_are_tried_again_as_alpasim_does(
 
 
 def test_our_driver_service_is_tolerant_where_alpasim_needs_it(
-    driver: tuple[DriverService, str, Calls],
-) -> None:
+    driver,
+):
     with grpc.insecure_channel(driver[1]) as channel:
         stub = Stub(channel, "EgodriverService")
         stub.close_session(egodriver_pb2.DriveSessionCloseRequest(session_uuid="never opened"))
@@ -295,9 +288,7 @@ def test_our_driver_service_is_tolerant_where_alpasim_needs_it(
 
 
 @pytest.mark.slow
-def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
-    scene: str, driver: tuple[DriverService, str, Calls], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(scene, driver, capsys):
     timing = ["--limit-ms", "60000", "--json"]
     assert run_command(["check", "driver", driver[1], "--scenario", scene, *timing]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,6 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.subprocesses import MOST_BYTES, parts_print_to_stderr, say
-from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
@@ -46,7 +45,7 @@ SHORT = (
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path, monkeypatch):
     """Give a folder with the script of the page and worse ones."""
     (script,) = re.findall(r"^```python\n([^`]*serve_policy\(.*?)^```", PAGE, re.M | re.S)
     light = f"    import sys\n    print('heavy:', sorted({set(HEAVY.split())!r} & sys.modules.keys()))\n"
@@ -115,10 +114,8 @@ def is_gone(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_the_script_of_the_page_drives_as_in_the_process(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    logs: list[list[RolloutLog]] = []
+def test_the_script_of_the_page_drives_as_in_the_process(folder, capfd):
+    logs = []
     for name in (python("remote_policy.py"), "remote_policy.py:Cruise"):
         out = str(len(logs))
         words = [
@@ -166,16 +163,14 @@ def test_the_script_of_the_page_drives_as_in_the_process(
 
 
 @pytest.mark.slow
-def test_check_policy_takes_a_command(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_check_policy_takes_a_command(folder, capfd):
     assert run_command(["check", "policy", python("remote_policy.py")]) in (0, 1)
     failed = [line for line in capfd.readouterr().out.splitlines() if line.startswith("FAIL")]
     assert all("latency" in line for line in failed)
 
 
 @pytest.mark.slow
-def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(folder, capfd):
     command = [
         "--renderer",
         "clean",
@@ -199,7 +194,7 @@ def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(
     )
 
 
-def test_a_command_that_hangs_is_ended_and_said_so(folder: Path) -> None:
+def test_a_command_that_hangs_is_ended_and_said_so(folder):
     policy = made(python("worse.py", "hangs").replace("exec:", "exec:?timeout_s=0.5 "))
     with pytest.raises(PolicyError, match="DEADLINE_EXCEEDED"):
         drive(policy)
@@ -214,7 +209,7 @@ def test_a_command_that_hangs_is_ended_and_said_so(folder: Path) -> None:
         ("import time; time.sleep(60)", "nothing listens at unix:"),
     ],
 )
-def test_a_command_that_never_serves_is_told_apart(folder: Path, code: str, found: str) -> None:
+def test_a_command_that_never_serves_is_told_apart(folder, code, found):
     before = set(Path(tempfile.gettempdir()).glob("simrun-policy-*"))
     with pytest.raises(PolicyError, match=found):
         made(python("-S", "-c", code).replace("exec:", "exec:?ready_s=1 "))
@@ -223,9 +218,7 @@ def test_a_command_that_never_serves_is_told_apart(folder: Path, code: str, foun
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_command_ends_with_the_process_that_started_it_however_that_ends(
-    tmp_path: Path, number: int
-) -> None:
+def test_a_command_ends_with_the_process_that_started_it_however_that_ends(tmp_path, number):
     starting = """
 import sys, time
 from alpasim_plugin.alpasim.client.child import Child
@@ -243,13 +236,13 @@ time.sleep(60)
 
 
 def test_a_command_deaf_to_sigterm_is_killed_with_what_it_started(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(children, "GRACE_S", 0.3)
     deaf = "import os, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); os.fork(); "
     code = deaf + "os.write(1, b'%d\\n' % os.getpid()); time.sleep(60)"
-    heard: list[str] = []
-    ended: list[bool] = []
+    heard = []
+    ended = []
     one = Child([sys.executable, "-S", "-c", code], {}, heard.append, lambda: ended.append(True))
     assert until(lambda: len(heard) == 2)
     one.stop()
@@ -258,7 +251,7 @@ def test_a_command_deaf_to_sigterm_is_killed_with_what_it_started(
     assert ended == [True]
 
 
-def test_commands_are_read_as_a_shell_would_and_refused_before_a_run() -> None:
+def test_commands_are_read_as_a_shell_would_and_refused_before_a_run():
     command = Command.parse("?cameras=front,left&timeout_s=2.5 sh drive.sh --net 'a b.pt'")
     assert (command.words, command.options) == (
         ("sh", "drive.sh", "--net", "a b.pt"),
@@ -283,9 +276,7 @@ def test_commands_are_read_as_a_shell_would_and_refused_before_a_run() -> None:
     assert (exit_reason(0), exit_reason(143)) == ("exit code 0", "exit code 143 (SIGTERM)")
 
 
-def test_output_of_parts_goes_to_a_file_that_has_an_end(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_of_parts_goes_to_a_file_that_has_an_end(tmp_path, capsys):
     with parts_print_to_stderr(tmp_path / "none.log"):
         pass
     assert not (tmp_path / "none.log").exists()

@@ -48,8 +48,8 @@ WITH_NETWORKS = (
     ids=["oldest-protobuf", "newest-protobuf", "oldest-torch"],
 )
 def test_the_project_works_at_both_ends_of_its_requirements(
-    tmp_path: Path, packages: tuple[str, ...], module: str, version: str, tests: tuple[str, ...]
-) -> None:
+    tmp_path, packages, module, version, tests
+):
     folder = tmp_path / "venv"
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
+def scene(tmp_path_factory):
     written = yaml.safe_load(shipped_names()["smoke/curve"].read_text())
     path = tmp_path_factory.mktemp("scenes") / "curve.yaml"
     timing = {"duration_us": 400_000, "warmup_us": 200_000}
@@ -121,7 +121,7 @@ class Network:
 
 
 @pytest.fixture(scope="module")
-def renderer(scene: str) -> dict[str, object]:
+def renderer(scene):
     """The service behind: frames of the scene as built, whoever asks."""
     return assemble(Settings(renderer="clean", scenes=(scene,), threads=1)).services
 
@@ -235,8 +235,8 @@ def apart(one: RolloutLog, other: RolloutLog, frames: int) -> float:
 
 
 def test_the_chain_over_sockets_equals_the_chain_in_one_process(
-    scene: str, renderer: dict[str, object], overrides: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    scene, renderer, overrides, monkeypatch
+):
     pictures = ["nre://{front}?encoding=png", "onefixer+nre://{base}"]
     (served, fixed_here), (inside, fixed_inside) = both(
         scene, renderer, overrides, "png", monkeypatch, pictures

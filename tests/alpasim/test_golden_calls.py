@@ -100,7 +100,7 @@ def replay(log: Path, scenes: Path, **settings: Any) -> list[bytes]:
     return images
 
 
-def test_the_calls_of_one_recorded_drive(shared_data: Path, overrides: list[str]) -> None:
+def test_the_calls_of_one_recorded_drive(shared_data, overrides):
     log, scenes = complete_logs(shared_data)[0], shared_data / "alpasim-golden" / "scenes"
     scene = scenes / f"{log.parents[1].name}.usdz"
     images = replay(log, scene, overrides=overrides, reliability=1.0)
@@ -117,7 +117,7 @@ def test_the_calls_of_one_recorded_drive(shared_data: Path, overrides: list[str]
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
-def test_the_calls_of_all_recorded_drives(shared_data: Path) -> None:
+def test_the_calls_of_all_recorded_drives(shared_data):
     """With the fixer that ships, its maps, and trust by the distance from each recorded path."""
     logs = complete_logs(shared_data)
     assert len(logs) > 20

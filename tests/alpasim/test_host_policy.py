@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -136,7 +135,7 @@ def reflect(channel: Any, silence: Silence) -> Any:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_streams_that_stay_open_hold_nobody_up(name: str) -> None:
+def test_streams_that_stay_open_hold_nobody_up(name):
     silence = Silence()
     with served(name) as host, channel_to(host) as channel:
         calls = [reflect(channel, silence) for _ in range(40)]
@@ -152,9 +151,7 @@ def test_streams_that_stay_open_hold_nobody_up(name: str) -> None:
     [("Health", "Check"), ("ServerReflection", "ServerReflectionInfo"), None],
     ids=lambda of: of and of[1],
 )
-def test_calls_whose_message_never_comes_hold_nobody_up(
-    name: str, of: tuple[str, str] | None
-) -> None:
+def test_calls_whose_message_never_comes_hold_nobody_up(name, of):
     silence, open_call = Silence(), say_nothing(*(of or (name, "get_version")))
     with served(name) as host, channel_to(host) as channel:
         calls = [open_call(channel, silence) for _ in range(100)]
@@ -166,9 +163,7 @@ def test_calls_whose_message_never_comes_hold_nobody_up(
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_callers_without_the_token_are_refused_without_a_thread_that_works(
-    name: str, tmp_path: Path
-) -> None:
+def test_callers_without_the_token_are_refused_without_a_thread_that_works(name, tmp_path):
     (tmp_path / "token").write_text("secret\n")
     silence = Silence()
     with (
@@ -186,8 +181,8 @@ def test_callers_without_the_token_are_refused_without_a_thread_that_works(
 
 @pytest.mark.parametrize("listen", ["0.0.0.0:0", "[::]:0"])
 def test_a_server_that_everybody_reaches_says_so_unless_callers_are_checked(
-    listen: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    listen, tmp_path, caplog
+):
     (tmp_path / "token").write_text("secret")
     for near, policy, said in (
         (listen, HostPolicy(), 1),
@@ -200,7 +195,7 @@ def test_a_server_that_everybody_reaches_says_so_unless_callers_are_checked(
         assert caplog.text.count("open to everybody who can reach it") == said
 
 
-def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
+def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory():
     identity = np.eye(4)
     with pytest.raises(InputError, match="in all"):
         read_view(request(identity, identity, START_US, size=(8192, 4096)))
@@ -209,16 +204,16 @@ def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
     assert read_view(request(identity, identity, START_US, size=(3848, 2168))).width == 3848
 
 
-def test_frames_of_too_many_pixels_together_are_refused_before_any_is_made() -> None:
+def test_frames_of_too_many_pixels_together_are_refused_before_any_is_made():
     asked = [request(np.eye(4), np.eye(4), START_US + i, size=(4096, 2048)) for i in range(5)]
-    frames: Any = FrameServer(None, None, None, None)  # type: ignore[arg-type]  # nothing of it is reached
+    frames = FrameServer(None, None, None, None)  # type: ignore[arg-type]  # nothing of it is reached
     with pytest.raises(InputError, match="41943040 pixels"):
         frames.answers(asked, CallTime())
 
 
 def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_wait(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     scenes = SceneCache(["smoke/straight", "smoke/curve"], None, False)
     loaded, other = scenes.ids
     first = scenes.get(loaded)
@@ -265,7 +260,7 @@ def moved(name: str, *times_us: int) -> egodriver_pb2.RolloutEgoTrajectory:
     return egodriver_pb2.RolloutEgoTrajectory(session_uuid=name, trajectory={"poses": poses})
 
 
-def test_abandoned_sessions_end_and_give_back_what_they_hold() -> None:
+def test_abandoned_sessions_end_and_give_back_what_they_hold():
     now = [0.0]
     service, made = driver_service(expiry_s=60.0, most_sessions=64, clock=lambda: now[0])
     with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
@@ -286,7 +281,7 @@ def test_abandoned_sessions_end_and_give_back_what_they_hold() -> None:
         assert "expired" in failure(lambda: stub.submit_image_observation(seen("7", 3)))[1]
 
 
-def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept() -> None:
+def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept():
     service, made = driver_service()
     with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
         stub = Stub(channel, "EgodriverService")
@@ -301,7 +296,7 @@ def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept() -> Non
     assert service.drives_s.maxlen is not None
 
 
-def test_a_policy_is_shown_the_pinhole_of_a_camera_with_an_f_theta_lens_and_one_size() -> None:
+def test_a_policy_is_shown_the_pinhole_of_a_camera_with_an_f_theta_lens_and_one_size():
     service, made = driver_service()
     asked = opening("a")
     asked.rollout_spec.vehicle.available_cameras[0].intrinsics.CopyFrom(ftheta(False))
@@ -323,7 +318,7 @@ def test_a_policy_is_shown_the_pinhole_of_a_camera_with_an_f_theta_lens_and_one_
     np.testing.assert_array_equal(shown.K, straight.K)
 
 
-def test_times_that_no_rollout_has_are_the_callers_fault() -> None:
+def test_times_that_no_rollout_has_are_the_callers_fault():
     service, _ = driver_service()
     with hosted({"EgodriverService": service}) as host, channel_to(host) as channel:
         stub = Stub(channel, "EgodriverService")
@@ -345,9 +340,9 @@ def test_times_that_no_rollout_has_are_the_callers_fault() -> None:
         ).trajectory.poses
 
 
-def test_one_budget_of_bytes_closes_the_sessions_that_nobody_used_for_longest() -> None:
+def test_one_budget_of_bytes_closes_the_sessions_that_nobody_used_for_longest():
     clock = itertools.count()
-    sessions: Sessions[str] = Sessions(budget=100, clock=lambda: float(next(clock)))
+    sessions = Sessions(budget=100, clock=lambda: float(next(clock)))
     for name in "abc":
         sessions.open(name, name)
     sessions.hold("a", 40)

@@ -30,7 +30,7 @@ def plain_lengths(rays: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("device", [sensorsim_pb2.PANDAR128, sensorsim_pb2.AT128])
-def test_points_of_a_plane_and_a_box_are_exact_but_at_edges(device: int) -> None:
+def test_points_of_a_plane_and_a_box_are_exact_but_at_edges(device):
     lidar = LIDARS[device]
     depths, cameras = [], lidar.cameras()
     for camera in cameras:
@@ -63,7 +63,7 @@ def test_points_of_a_plane_and_a_box_are_exact_but_at_edges(device: int) -> None
 
 
 @pytest.mark.slow
-def test_gaussians_of_a_road_and_a_car_are_where_they_are() -> None:
+def test_gaussians_of_a_road_and_a_car_are_where_they_are():
     scenario = load_scenario("smoke/lead_car")
     made = assemble(Settings(renderer="clean", scenes=["smoke/lead_car"], threads=1))
     t_us, up = scenario.start_us + 1_000_000, np.eye(4)

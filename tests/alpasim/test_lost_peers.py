@@ -80,8 +80,8 @@ def driver(address: str, *more: str) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_driven_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, capsys
+):
     address, out = f"127.0.0.1:{free_port()}", tmp_path / "out"
     command = [
         "--renderer",
@@ -128,9 +128,7 @@ class Answering:
         ("UNKNOWN", "Exception calling application", PolicyError),
     ],
 )
-def test_only_what_a_driver_does_itself_is_its_own_fault(
-    code: str, text: str, kind: type[SimrunError]
-) -> None:
+def test_only_what_a_driver_does_itself_is_its_own_fault(code, text, kind):
     with hosted({"EgodriverService": Answering(grpc.StatusCode[code], text)}) as host:
         service = Service("EgodriverService", host.address, PolicyError, retries=False)
         with pytest.raises(SimrunError) as caught:

@@ -74,19 +74,19 @@ def judged(rgb: U8, scene_map: PreparedMap, T: F64 = AHEAD) -> Any:
 
 @pytest.mark.parametrize("dashed", [False, True])
 @pytest.mark.parametrize("contrast", [25, 90])
-def test_the_right_map_stays_on(dashed: bool, contrast: int) -> None:
+def test_the_right_map_stays_on(dashed, contrast):
     assert judged(photograph(contrast, dashed=dashed), prepared(dashed=dashed)) is None
 
 
 @pytest.mark.parametrize("aside_m", [1.75, -1.75, 0.9, -2.2])
-def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside_m: float) -> None:
+def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside_m):
     found = judged(photograph(), prepared(aside_m))
     assert found.here < DOUBT
     assert found.there >= FITS
     assert found.offset_m == pytest.approx(-aside_m, abs=0.01)
 
 
-def test_a_picture_without_paint_is_no_evidence() -> None:
+def test_a_picture_without_paint_is_no_evidence():
     for rgb in (
         photograph(contrast=0),
         photograph(contrast=0, noise=40.0),
@@ -96,7 +96,7 @@ def test_a_picture_without_paint_is_no_evidence() -> None:
         assert judged(rgb, prepared(1.75)) is None
 
 
-def test_a_map_without_lines_or_with_few_in_view_is_not_judged() -> None:
+def test_a_map_without_lines_or_with_few_in_view_is_not_judged():
     assert judged(photograph(), prepare_map(LaneMap({}))) is None
     assert (
         judged(photograph(), prepared(), se2(0, 0, np.pi) @ AHEAD @ np.diag([1.0, 1, 1, 1])) is None
@@ -106,7 +106,7 @@ def test_a_map_without_lines_or_with_few_in_view_is_not_judged() -> None:
     assert contradiction(prepared(1.75), small, AHEAD, (), tiny) is None
 
 
-def test_a_road_user_hides_lines_from_the_comparison() -> None:
+def test_a_road_user_hides_lines_from_the_comparison():
     bus, striped = (
         ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus"),
         photograph(contrast=0),
@@ -118,7 +118,7 @@ def test_a_road_user_hides_lines_from_the_comparison() -> None:
     assert contradiction(prepared(1.75), SPEC, AHEAD, (bus,), striped) is None
 
 
-def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
+def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence():
     """A poor reconstruction seen from a metre beside the path: its lines are aside by that metre.
     Others still are evidence.
     """
@@ -138,7 +138,7 @@ def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
     )
 
 
-def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side() -> None:
+def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side():
     paint = top_hat(np.random.default_rng(2).integers(0, 255, (200, 300, 3), dtype=np.uint8))
     rows, ones = np.arange(200), np.ones(200, np.int64)
     found = agreement(Pieces(rows, 100 * ones, 104 * ones), paint)
@@ -168,9 +168,7 @@ def ask(size: tuple[int, int] = (240, 136)) -> Any:
 
 
 @pytest.mark.parametrize(("aside_m", "is_off"), [(0.0, False), (1.75, True)])
-def test_a_server_drops_a_wrong_map_and_says_so(
-    aside_m: float, is_off: bool, overrides: list[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_drops_a_wrong_map_and_says_so(aside_m, is_off, overrides, caplog):
     def served(*more: str, moved_m: float = aside_m) -> tuple[U8, int]:
         made = assemble(
             Settings(

@@ -19,9 +19,7 @@ def frames(requests: list[sensorsim_pb2.RGBRenderRequest], **settings: object) -
 
 
 @pytest.mark.parametrize("renderer", ["clean", "onefixer+clean"])
-def test_a_smaller_picture_is_enlarged_to_the_size_asked_for(
-    renderer: str, overrides: list[str]
-) -> None:
+def test_a_smaller_picture_is_enlarged_to_the_size_asked_for(renderer, overrides):
     given = {} if renderer == "clean" else {"overrides": overrides}
     asked = [ask(1.0 + 0.1 * i) for i in range(2)]
     small = [ask(1.0 + 0.1 * i) for i in range(2)]

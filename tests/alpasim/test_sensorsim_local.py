@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import grpc
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, assemble
+from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, RenderRequest
@@ -32,7 +29,7 @@ W, H = 64, 36
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[tuple[Any, Assembled]]:
+def served():
     made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1))
     with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
         yield Stub(channel, "SensorsimService"), made
@@ -69,8 +66,8 @@ def ask(
 
 
 def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(
-    served: tuple[Any, Assembled],
-) -> None:
+    served,
+):
     asked, scenario = ask(), load_scenario(SCENE)
     view = read_view(asked)
     camera = replace(
@@ -88,7 +85,7 @@ def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(
     np.testing.assert_array_equal(decode_image(data), direct.rgb)
 
 
-def test_a_moved_object_and_another_lens_are_seen(served: tuple[Any, Assembled]) -> None:
+def test_a_moved_object_and_another_lens_are_seen(served):
     asked = ask()
     (before,) = answers(served[0], [asked])
     for o in asked.dynamic_objects:
@@ -111,7 +108,7 @@ def test_a_moved_object_and_another_lens_are_seen(served: tuple[Any, Assembled])
     assert before != bent
 
 
-def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Path) -> None:
+def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path):
     """A PLY file replaces what the scenario builds; a car of the request is drawn in it as
     Gaussians, where the request puts it.
     """
@@ -148,7 +145,7 @@ def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Pat
     assert places[1] < places[0] - 2
 
 
-def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> None:
+def test_questions_about_scenes_are_answered(served):
     stub, made = served
     (scene_id,) = stub.get_available_scenes(common_pb2.Empty()).scene_ids
     cameras = stub.get_available_cameras(
@@ -197,9 +194,7 @@ def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> N
         ),
     ],
 )
-def test_what_is_not_here_is_refused_with_a_reason(
-    served: tuple[Any, Assembled], call: Any, code: str, found: str
-) -> None:
+def test_what_is_not_here_is_refused_with_a_reason(served, call, code, found):
     with pytest.raises(grpc.RpcError) as caught:
         call(served[0])
     assert caught.value.code().name == code

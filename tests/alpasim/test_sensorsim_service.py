@@ -4,13 +4,10 @@ every drive as if it were alone.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import grpc
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.alpasim.server.sources import trusted_opacity
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -23,7 +20,6 @@ from tests.alpasim.service_cases import (
     START_US,
     STEP_US,
     WIDTH,
-    StandInRenderer,
     answers,
     channel_to,
     drive,
@@ -44,9 +40,7 @@ def batch(requests: list[sensorsim_pb2.RGBRenderRequest]) -> sensorsim_pb2.Batch
     )
 
 
-def test_identity_hands_images_and_answers_on_bit_by_bit(
-    upstream: Host, renderer: StandInRenderer
-) -> None:
+def test_identity_hands_images_and_answers_on_bit_by_bit(upstream, renderer):
     frames = [*drive(3), *drive(2, image_format=JPEG)]
     with channel_to(upstream) as channel, in_front_of(upstream, renderer="identity") as (stub, _):
         direct = Stub(channel, "SensorsimService")
@@ -77,8 +71,8 @@ def test_identity_hands_images_and_answers_on_bit_by_bit(
 
 @pytest.mark.parametrize("image_format", [PNG, JPEG])
 def test_interleaved_drives_get_the_bytes_that_each_gets_alone(
-    upstream: Host, overrides: list[str], tmp_path: Path, image_format: int
-) -> None:
+    upstream, overrides, tmp_path, image_format
+):
     drives = [
         drive(12, parts_at=5 + i, image_format=image_format, **kind)
         for i, kind in enumerate(SLOWLY_APART)
@@ -96,9 +90,7 @@ def test_interleaved_drives_get_the_bytes_that_each_gets_alone(
     assert len({data for one in alone for data in one}) > 20
 
 
-def test_answers_equal_the_fixer_in_this_process(
-    upstream: Host, overrides: list[str], tmp_path: Path
-) -> None:
+def test_answers_equal_the_fixer_in_this_process(upstream, overrides, tmp_path):
     frames = drive(6, parts_at=1, aside_mps=4.0)
     mask = holes(tmp_path)
     with in_front_of(upstream, overrides=overrides, masks={CAMERA: mask}, reliability=0.9) as (
@@ -121,9 +113,7 @@ def test_answers_equal_the_fixer_in_this_process(
         assert (got != picture(asked)).any()
 
 
-def test_a_batch_has_one_item_for_each_camera_with_success_set(
-    upstream: Host, overrides: list[str], renderer: StandInRenderer
-) -> None:
+def test_a_batch_has_one_item_for_each_camera_with_success_set(upstream, overrides, renderer):
     cameras = [CAMERA, "camera_rear_tele_30fov"]
     frames = [drive(2, camera=camera) for camera in cameras]
     with in_front_of(upstream, overrides=overrides, reliability=1.0) as (stub, _):
@@ -139,9 +129,7 @@ def test_a_batch_has_one_item_for_each_camera_with_success_set(
     assert renderer.calls == ["batch_render_rgb"] * 2  # handed on as a batch
 
 
-def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(
-    upstream: Host, overrides: list[str]
-) -> None:
+def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overrides):
     frame = drive(1)[0]
     with in_front_of(upstream, overrides=overrides) as (stub, _):
         reply = stub.render_aggregated(sensorsim_pb2.AggregatedRenderRequest(rgb_requests=[frame]))
@@ -150,8 +138,8 @@ def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(
 
 
 def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
-    upstream: Host, overrides: list[str], tmp_path: Path
-) -> None:
+    upstream, overrides, tmp_path
+):
     def version(**settings: object) -> common_pb2.VersionId:
         with in_front_of(upstream, **settings) as (stub, _):
             return stub.get_version(EMPTY)

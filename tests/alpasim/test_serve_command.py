@@ -10,18 +10,16 @@ import shlex
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import grpc
 
-from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import load_verb, verbs
 from alpasim_plugin.log.wire import common_pb2
 from alpasim_plugin.log.wire.services import Stub
 from tests.alpasim.service_cases import answers, drive
 
 
-def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
+def test_the_command_serves_until_it_is_stopped(upstream):
     command = [
         sys.executable,
         "-m",
@@ -51,7 +49,7 @@ def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
     assert counts["failed"] == {}
 
 
-def test_the_commands_of_the_page_are_valid(repo: Path) -> None:
+def test_the_commands_of_the_page_are_valid(repo):
     """Every `simrun` line of the page parses; files and addresses in it are not touched."""
     page = (repo / "docs" / "alpasim.md").read_text()
     lines = [

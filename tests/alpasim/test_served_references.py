@@ -26,7 +26,7 @@ degradation: {share: 0.02}
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "served.yaml"
     path.write_text(SCENE)
     return path
@@ -44,7 +44,7 @@ def request(entry: SceneEntry, t_us: int) -> RenderRequest:
 
 
 @pytest.mark.slow
-def test_a_view_has_the_same_references_whatever_was_asked_before(file: Path) -> None:
+def test_a_view_has_the_same_references_whatever_was_asked_before(file):
     entry = served(file, "onefixer")
     alone = entry.render(request(entry, 820_000)).references
     entry.render(request(entry, 1_500_000))

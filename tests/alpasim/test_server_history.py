@@ -61,9 +61,7 @@ FAST_APART = ({}, {}, {"aside_mps": 1.5}, {"aside_mps": -1.2}, {"brake_mps2": 8.
 
 
 @pytest.mark.parametrize(("shutter_us", "kinds"), [(30_000, SLOWLY_APART), (0, FAST_APART)])
-def test_interleaved_drives_have_the_past_that_each_has_alone(
-    shutter_us: int, kinds: Sequence[dict[str, float]]
-) -> None:
+def test_interleaved_drives_have_the_past_that_each_has_alone(shutter_us, kinds):
     """Drives that are equal, swerve, or brake to a stop, so that one lies a step or more behind
     another in the same lane.
     """
@@ -82,7 +80,7 @@ def test_interleaved_drives_have_the_past_that_each_has_alone(
         assert shared.counts.starts == 1
 
 
-def test_a_step_back_forks_and_leaves_the_first_branch_alone() -> None:
+def test_a_step_back_forks_and_leaves_the_first_branch_alone():
     kept = tree()
     first = views(12)
     second = views(12, parts_at=5, aside_mps=0.4)
@@ -95,7 +93,7 @@ def test_a_step_back_forks_and_leaves_the_first_branch_alone() -> None:
     assert (after[-1][-1], kept.counts.forks, kept.counts.starts) == (second[-1].key, 1, 1)
 
 
-def test_another_place_camera_lens_or_scene_starts_a_history() -> None:
+def test_another_place_camera_lens_or_scene_starts_a_history():
     kept, known = tree(), drive(5)
     for r in known:
         serve(kept, read_view(r))
@@ -109,7 +107,7 @@ def test_another_place_camera_lens_or_scene_starts_a_history() -> None:
     assert kept.parent_of(read_view(wider)) is None
 
 
-def test_drives_that_differ_in_traffic_alone_stay_apart() -> None:
+def test_drives_that_differ_in_traffic_alone_stay_apart():
     def with_car(requests: list[sensorsim_pb2.RGBRenderRequest], later_mps: float) -> list[View]:
         for step, r in enumerate(requests):
             car = r.dynamic_objects.add(track_id="car")
@@ -130,7 +128,7 @@ def test_drives_that_differ_in_traffic_alone_stay_apart() -> None:
         assert got[-1][i] == tuple(view.key for view in drives[i])
 
 
-def test_memory_is_bounded_and_the_drives_ends_go_last() -> None:
+def test_memory_is_bounded_and_the_drives_ends_go_last():
     kept, slow = tree(max_bytes=1000), views(3, parts_at=1, aside_mps=2.0)
     for view in slow:
         serve(kept, view)
@@ -143,7 +141,7 @@ def test_memory_is_bounded_and_the_drives_ends_go_last() -> None:
     assert kept.counts.starts == 1
 
 
-def test_motion_is_continued_in_place_and_turn() -> None:
+def test_motion_is_continued_in_place_and_turn():
     a, b = se2(0, 0, 0.1), se2(1, 0.5, 0.2)
     assert apart(on_line(a, b, 3.0), se2(3, 1.5, 0.4)) < 1e-6
     assert apart(on_line(a, b, -1.0), se2(-1, -0.5, 0.0)) < 1e-6
@@ -165,9 +163,7 @@ def test_motion_is_continued_in_place_and_turn() -> None:
         ),
     ],
 )
-def test_a_request_that_is_no_view_is_refused(
-    change: Callable[[sensorsim_pb2.RGBRenderRequest], object], found: str
-) -> None:
+def test_a_request_that_is_no_view_is_refused(change, found):
     bad = drive(1)[0]
     change(bad)
     with pytest.raises(InputError, match=found):

@@ -4,8 +4,6 @@ model puts it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 import pytest
@@ -127,9 +125,7 @@ def by_ftheta(spec: Spec) -> F64:
         (ftheta(False), by_ftheta),
     ],
 )
-def test_each_direction_is_shown_where_the_lens_puts_it(
-    spec: Spec, project: Callable[[Spec], F64]
-) -> None:
+def test_each_direction_is_shown_where_the_lens_puts_it(spec, project):
     lens = read_lens(spec, 320, 180)
     for ray, pixel in zip(RAYS, project(spec), strict=True):
         assert 1 < pixel[0] < 319
@@ -143,8 +139,8 @@ def test_each_direction_is_shown_where_the_lens_puts_it(
     [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)],
 )
 def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
-    spec: Spec, project: Callable[[Spec], F64], size: tuple[int, int]
-) -> None:
+    spec, project, size
+):
     straight = straight_of(spec, *size)
     assert straight.place is not None
     assert straight.size[0] == size[0]
@@ -156,14 +152,14 @@ def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
         np.testing.assert_allclose(found + 0.5, pixel, atol=0.05)
 
 
-def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black() -> None:
+def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black():
     assert straight_of(pinhole(64, 32), 64, 32).place is None
     picture = straight_of(ftheta(False), 320, 180).image(np.full((180, 320, 3), 200, np.uint8))
     assert picture[0, 0].tolist() == [0, 0, 0]  # beyond the picture's curved edge
     assert picture[picture.shape[0] // 2, 160].tolist() == [200, 200, 200]
 
 
-def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
+def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
     spec = fisheye()
     spec.opencv_fisheye_param.max_angle = 0.6
     lens = read_lens(spec, 320, 180)
@@ -199,16 +195,14 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
         (lambda s: s.bivariate_windshield_model_param.horizontal_poly.append(1.0), "windshield"),
     ],
 )
-def test_intrinsics_that_are_no_lens_are_refused(
-    change: Callable[[Spec], object], found: str
-) -> None:
+def test_intrinsics_that_are_no_lens_are_refused(change, found):
     spec = ftheta(False)
     change(spec)
     with pytest.raises(InputError, match=found):
         read_lens(spec, 320, 180)
 
 
-def test_what_is_kept_of_lenses_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_kept_of_lenses_has_an_end(monkeypatch):
     few = LensCache(8 << 20)
     monkeypatch.setattr(views, "lenses", few)
     for i in range(12):

@@ -11,7 +11,6 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -27,7 +26,6 @@ from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import (
-    StandInRenderer,
     answers,
     channel_to,
     drive,
@@ -74,15 +72,15 @@ def failure(call: Callable[[], object]) -> tuple[Any, str]:
 )
 @pytest.mark.parametrize("served", ["onefixer", "identity"])
 def test_an_upstreams_failure_arrives_as_the_status_that_is_retried_or_not(
-    upstream: Host,
-    renderer: StandInRenderer,
-    overrides: list[str],
-    sent: Any,
-    text: str,
-    code: Any,
-    details: str,
-    served: str,
-) -> None:
+    upstream,
+    renderer,
+    overrides,
+    sent,
+    text,
+    code,
+    details,
+    served,
+):
     frames = drive(3)
     options = {"overrides": overrides} if served == "onefixer" else {}
     with in_front_of(upstream, renderer=served, **options) as (stub, made):
@@ -108,12 +106,12 @@ def test_an_upstreams_failure_arrives_as_the_status_that_is_retried_or_not(
     ],
 )
 def test_a_broken_or_resized_picture_is_retried_and_never_enters_a_history(
-    upstream: Host,
-    renderer: StandInRenderer,
-    overrides: list[str],
-    spoil: Callable[[bytes], bytes],
-    found: str,
-) -> None:
+    upstream,
+    renderer,
+    overrides,
+    spoil,
+    found,
+):
     frames = drive(3)
     with in_front_of(upstream, overrides=overrides) as (stub, _):
         whole = answers(stub, frames)
@@ -128,9 +126,7 @@ def test_a_broken_or_resized_picture_is_retried_and_never_enters_a_history(
         assert made.tree.counts.frames == 3
 
 
-def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(
-    renderer: StandInRenderer, overrides: list[str]
-) -> None:
+def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(renderer, overrides):
     frames = drive(4)
     with (
         hosted({"SensorsimService": renderer}) as first,
@@ -144,7 +140,7 @@ def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(
         assert failure(lambda: stub.render_rgb(frames[2]))[0] == Code.UNAVAILABLE
         again = Host({"SensorsimService": renderer}, dying.address).start()
         try:
-            after: list[bytes] = []
+            after = []
             while not after:  # as the runtime does, after pauses
                 with contextlib.suppress(grpc.RpcError):
                     after = answers(stub, frames[2:])
@@ -154,9 +150,7 @@ def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(
             again.stop(0.0)
 
 
-def test_a_caller_that_leaves_or_is_late_costs_nobody_else(
-    upstream: Host, renderer: StandInRenderer, overrides: list[str]
-) -> None:
+def test_a_caller_that_leaves_or_is_late_costs_nobody_else(upstream, renderer, overrides):
     frames = drive(2)
     entered = threading.Event()
     leave = threading.Event()
@@ -181,9 +175,7 @@ def test_a_caller_that_leaves_or_is_late_costs_nobody_else(
 
 
 @pytest.mark.parametrize("count", [44, pytest.param(200, marks=pytest.mark.slow)])
-def test_malformed_messages_change_nothing(
-    upstream: Host, overrides: list[str], count: int
-) -> None:
+def test_malformed_messages_change_nothing(upstream, overrides, count):
     frames, rng = drive(3), np.random.default_rng(7)
     whole = frames[0].SerializeToString()
     with in_front_of(upstream, overrides=overrides) as (stub, made):
@@ -215,7 +207,7 @@ def test_malformed_messages_change_nothing(
         assert not made.service.frames._in_work
 
 
-def test_health_and_reflection_answer_under_public_names(upstream: Host) -> None:
+def test_health_and_reflection_answer_under_public_names(upstream):
     service = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address))).service
     with hosted({"SensorsimService": service}) as host, channel_to(host) as to:
         health, name = Stub(to, "Health"), "nre.grpc.protos.sensorsim.SensorsimService"
@@ -242,9 +234,7 @@ def test_health_and_reflection_answer_under_public_names(upstream: Host) -> None
         assert missing.error_response.error_code == 5
 
 
-def test_running_calls_finish_while_the_server_stops(
-    upstream: Host, renderer: StandInRenderer, overrides: list[str]
-) -> None:
+def test_running_calls_finish_while_the_server_stops(upstream, renderer, overrides):
     frame = drive(1)[0]
     entered = threading.Event()
     leave = threading.Event()
@@ -267,9 +257,7 @@ def test_running_calls_finish_while_the_server_stops(
     made.close()
 
 
-def test_only_callers_with_the_token_are_served_but_health_is_open(
-    upstream: Host, tmp_path: Path
-) -> None:
+def test_only_callers_with_the_token_are_served_but_health_is_open(upstream, tmp_path):
     (tmp_path / "token").write_text(" secret \n")
     policy = HostPolicy(token_file=tmp_path / "token")
     with in_front_of(upstream, policy, renderer="identity") as (stub, made):
@@ -292,7 +280,7 @@ def test_only_callers_with_the_token_are_served_but_health_is_open(
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def pair(tmp_path_factory):
     """Return a key and a certificate that signs itself."""
     key, cert = (tmp_path_factory.mktemp("tls") / name for name in ("key.pem", "cert.pem"))
     made = [
@@ -328,11 +316,11 @@ HELLO = bytes.fromhex(
 
 @pytest.mark.parametrize("with_tls", [True, False], ids=["tls", "plain"])
 def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
-    pair: tuple[Path, Path],
-    renderer: StandInRenderer,
-    monkeypatch: pytest.MonkeyPatch,
-    with_tls: bool,
-) -> None:
+    pair,
+    renderer,
+    monkeypatch,
+    with_tls,
+):
     monkeypatch.setattr(hosting, "HANDSHAKE_S", 1.0)
     key, cert = pair
     ways = (
@@ -366,9 +354,7 @@ def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
                     pass
 
 
-def test_tls_with_an_upstream_behind_tls_and_a_token(
-    pair: tuple[Path, Path], renderer: StandInRenderer, tmp_path: Path
-) -> None:
+def test_tls_with_an_upstream_behind_tls_and_a_token(pair, renderer, tmp_path):
     key, cert = pair
     (tmp_path / "token").write_text("secret")
     with hosted(
@@ -413,8 +399,6 @@ def test_tls_with_an_upstream_behind_tls_and_a_token(
         (["--upstream", "h:1", "--tls-cert", "/none.pem"], "one of certificate and key"),
     ],
 )
-def test_options_that_do_not_fit_are_refused_before_the_port_opens(
-    args: list[str], found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_that_do_not_fit_are_refused_before_the_port_opens(args, found, capsys):
     assert run_command(["serve", *args]) == 2
     assert found in capsys.readouterr().err

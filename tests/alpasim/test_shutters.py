@@ -85,9 +85,7 @@ def exposure(asked: Any, shutter: Shutter = "asked") -> Exposure | None:
 
 @pytest.mark.parametrize("spec", [distorted(), fisheye(), ftheta(False), ftheta(True)])
 @pytest.mark.parametrize("shutter_type", [DOWN, UP, RIGHT, LEFT])
-def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
-    spec: Any, shutter_type: int
-) -> None:
+def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec, shutter_type):
     asked = ask(shutter_type, spec=spec)
     asked.resolution_w, asked.resolution_h = 160, 90
     found, lens = exposure(asked), read_lens(asked.camera_intrinsics, 160, 90)
@@ -116,7 +114,7 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
         (ask(DOWN, ms=0), "asked", False),
     ],
 )
-def test_what_rolls(asked: Any, shutter: Shutter, rolls: bool) -> None:
+def test_what_rolls(asked, shutter, rolls):
     found = exposure(asked, shutter)
     assert (found is not None) == rolls
     if found is not None:
@@ -131,7 +129,7 @@ def served(shutter: Shutter, asked: Any) -> U8:
     return decode_image(made.service.frames.answers([asked], CallTime())[0])
 
 
-def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row() -> None:
+def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row():
     asked = ask()
     rolled = served("asked", asked)
     still = served("global", asked)
@@ -143,7 +141,7 @@ def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_r
     )
 
 
-def test_the_map_has_the_shutter_of_the_frame() -> None:
+def test_the_map_has_the_shutter_of_the_frame():
     made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE], threads=1))
     asked = ask()
     view, entry = read_view(asked), made.scenes.get(asked.scene_id)

@@ -57,11 +57,11 @@ def environment(folder: Path, *requirements: str) -> Path:
     return python
 
 
-def test_checked_in_modules_belong_to_the_checked_in_sources() -> None:
+def test_checked_in_modules_belong_to_the_checked_in_sources():
     assert json.loads((PROTOS / compiling.CHECKSUMS).read_text()) == compiling.digests(PROTOS)
 
 
-def test_a_changed_source_is_noticed(tmp_path: Path) -> None:
+def test_a_changed_source_is_noticed(tmp_path):
     for path in [*PROTOS.glob("*.proto"), *PROTOS.glob("*_pb2.py*")]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     with (tmp_path / "common.proto").open("a") as file:
@@ -73,7 +73,7 @@ def test_a_changed_source_is_noticed(tmp_path: Path) -> None:
     assert {name for name in kept if kept[name] != found[name]} == {"common.proto"}
 
 
-def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path: Path) -> None:
+def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True
     )
@@ -82,7 +82,7 @@ def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protobuf", ["==4.25.*", "==5.29.*", ">=6,<7"])
-def test_the_messages_load_under_every_allowed_protobuf(tmp_path: Path, protobuf: str) -> None:
+def test_the_messages_load_under_every_allowed_protobuf(tmp_path, protobuf):
     python = environment(tmp_path / "venv", f"protobuf{protobuf}", "grpcio>=1.62")
     done = subprocess.run(
         [python, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True
@@ -92,7 +92,7 @@ def test_the_messages_load_under_every_allowed_protobuf(tmp_path: Path, protobuf
 
 
 @pytest.mark.slow
-def test_the_compiler_writes_what_is_checked_in(tmp_path: Path) -> None:
+def test_the_compiler_writes_what_is_checked_in(tmp_path):
     python = environment(tmp_path / "venv", f"grpcio-tools=={compiling.GENERATOR}", "setuptools<81")
     out = tmp_path / "out"
     out.mkdir()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.unknown_fields import UnknownFieldSet
@@ -32,7 +31,7 @@ def all_messages() -> list[Descriptor]:
     ]
 
 
-def test_counts_are_those_of_the_published_interface() -> None:
+def test_counts_are_those_of_the_published_interface():
     """0.54.0 has 108 messages and 357 fields; `ScenePrefetchRequest` (twice) and two fields of
     `RolloutSpec` are newer.
     """
@@ -43,23 +42,23 @@ def test_counts_are_those_of_the_published_interface() -> None:
     assert top + sum(len(m.enum_types) for m in all_messages()) == 10
 
 
-def test_packages_are_private() -> None:
+def test_packages_are_private():
     assert all(m.full_name.startswith("simrun.wire.") for m in all_messages())
 
 
-def test_every_service_has_the_path_that_is_dialled() -> None:
+def test_every_service_has_the_path_that_is_dialled():
     services = {name for module in MODULES for name in module.DESCRIPTOR.services_by_name}
     assert services | {"Health", "ServerReflection"} == set(wire.SERVICE_PATHS)
 
 
-def test_time_stamps_are_eight_fixed_bytes() -> None:
+def test_time_stamps_are_eight_fixed_bytes():
     entry = wire.logging_pb2.LogEntry()
     entry.actor_poses.timestamp_us = 1_689_697_803_493_732
     stamp = (1_689_697_803_493_732).to_bytes(8, "little")
     assert entry.SerializeToString() == b"\x12\x09" + b"\x09" + stamp
 
 
-def test_foreign_entries_come_back_byte_for_byte(shared_data: Path) -> None:
+def test_foreign_entries_come_back_byte_for_byte(shared_data):
     """Parsing and serialising again changes nothing, and no field is unknown at the top."""
     logs = sorted((shared_data / "alpasim-golden" / "rollouts").rglob("rollout.asl"))
     kinds = set()

@@ -35,7 +35,7 @@ def parts(settings: OneFixerSettings) -> dict[str, dict[str, torch.Tensor]]:
 
 
 @pytest.fixture
-def bundle(tmp_path: Path) -> Path:
+def bundle(tmp_path):
     path = tmp_path / "tiny.safetensors"
     settings = small_settings("holes=noise")
     save_bundle(path, parts(settings), settings, trained=True, note="500 steps")
@@ -65,7 +65,7 @@ def refusal(settings: OneFixerSettings) -> str:
     return str(caught.value)
 
 
-def test_a_bundle_is_loaded_whole(bundle: Path) -> None:
+def test_a_bundle_is_loaded_whole(bundle):
     session = fixer(at(bundle))
     assert session.trained
     assert session.label == "onefixer-dit-tiny, 500 steps"
@@ -81,17 +81,17 @@ def test_a_bundle_is_loaded_whole(bundle: Path) -> None:
     )
 
 
-def test_what_is_set_otherwise_than_trained_for_is_in_the_label(bundle: Path) -> None:
+def test_what_is_set_otherwise_than_trained_for_is_in_the_label(bundle):
     assert "history finalise instead of last-forward" in fixer(at(bundle, "history=finalise")).label
 
 
-def test_weights_for_other_conventions_are_refused(bundle: Path) -> None:
+def test_weights_for_other_conventions_are_refused(bundle):
     text = refusal(at(bundle, "rope_ratios=[1.0,1.0,1.0]", "decoder.kind=latent"))
     assert "rope_ratios is [1.0, 1.0, 1.0] for [3.0, 3.0, 1.0]" in text
     assert "decoder.kind is latent for render" in text
 
 
-def test_a_bundle_without_an_autoencoder_is_refused(bundle: Path) -> None:
+def test_a_bundle_without_an_autoencoder_is_refused(bundle):
     spoil(
         bundle,
         **{key.replace(".", "__"): None for key in load_file(bundle) if key.startswith("vae.")},
@@ -101,7 +101,7 @@ def test_a_bundle_without_an_autoencoder_is_refused(bundle: Path) -> None:
         save_bundle(bundle, {"dit": {}}, at(bundle), trained=False)
 
 
-def test_a_pickle_a_foreign_file_and_no_file_are_refused(bundle: Path, tmp_path: Path) -> None:
+def test_a_pickle_a_foreign_file_and_no_file_are_refused(bundle, tmp_path):
     pickled, foreign = tmp_path / "net.safetensors", tmp_path / "plain.safetensors"
     torch.save(load_file(bundle), pickled)
     save_file(load_file(bundle), foreign)
@@ -113,8 +113,8 @@ def test_a_pickle_a_foreign_file_and_no_file_are_refused(bundle: Path, tmp_path:
 
 
 def test_a_checkpoint_of_a_transformer_by_path_with_anything_but_tensors_is_refused(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     class Payload:
         def __reduce__(self):
             return (print, ("loaded",))
@@ -124,7 +124,7 @@ def test_a_checkpoint_of_a_transformer_by_path_with_anything_but_tensors_is_refu
     assert "could run code" in refusal(small_settings(f"weights.dit={path}"))
 
 
-def test_an_untrained_bundle_says_so(bundle: Path) -> None:
+def test_an_untrained_bundle_says_so(bundle):
     settings = small_settings("holes=noise")
     save_bundle(bundle, parts(settings), settings, trained=False)
     assert read_bundle(bundle, at(bundle)).note == "untrained"

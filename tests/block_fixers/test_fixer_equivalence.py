@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -37,7 +35,7 @@ CASES = [
 
 
 @pytest.fixture(scope="module")
-def others() -> list[np.ndarray]:
+def others():
     """What the cases so far came to: were two alike, a test could not tell one choice from
     another.
     """
@@ -45,9 +43,7 @@ def others() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("overrides", first_of(CASES, 4), ids=",".join)
-def test_blocks_equal_the_whole_clip(
-    weights: Path, others: list[np.ndarray], overrides: tuple[str, ...]
-) -> None:
+def test_blocks_equal_the_whole_clip(weights, others, overrides):
     settings = busy_settings(weights, *overrides)
     frames = moving_picture(29)
     maps = maps_of(frames)
@@ -76,7 +72,7 @@ def test_blocks_equal_the_whole_clip(
 
 
 @pytest.mark.parametrize("count", [1, 6, 13])
-def test_any_number_of_frames_and_any_size(weights: Path, count: int) -> None:
+def test_any_number_of_frames_and_any_size(weights, count):
     settings = busy_settings(weights)
     frames = moving_picture(count, size=(29, 50))
     maps = maps_of(frames)
@@ -88,7 +84,7 @@ def test_any_number_of_frames_and_any_size(weights: Path, count: int) -> None:
     )
 
 
-def test_a_short_block_is_the_block_with_its_last_frame_repeated(weights: Path) -> None:
+def test_a_short_block_is_the_block_with_its_last_frame_repeated(weights):
     settings = busy_settings(weights)
     frames = moving_picture(5)
     maps = maps_of(frames)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from alpasim_plugin.block_fixers import onefixer
@@ -27,13 +25,13 @@ def failures(x: torch.Tensor) -> list[str]:
     return guard.failures(guard.measures(x).numpy())
 
 
-def test_a_single_nan_or_infinity_spoils_its_frame_alone() -> None:
+def test_a_single_nan_or_infinity_spoils_its_frame_alone():
     x = video(0.0, 0.0, 0.0)
     x[1, 3, 4, 1], x[2, 5, 5, 2] = torch.nan, torch.inf
     assert failures(x) == ["", "fixer-nan", "fixer-nan"]
 
 
-def test_overshoot_at_a_few_pixels_is_not_out_of_range() -> None:
+def test_overshoot_at_a_few_pixels_is_not_out_of_range():
     x = video(0.0, 0.0, -1.4)
     x[0, 0, :3, 0] = 9.0  # 1 % of 300 values
     x[1, 0, :4, 0] = -9.0
@@ -41,14 +39,14 @@ def test_overshoot_at_a_few_pixels_is_not_out_of_range() -> None:
     assert failures(x.bfloat16()) == ["", "fixer-range", ""]
 
 
-def test_black_counts_only_where_the_render_is_not_black() -> None:
+def test_black_counts_only_where_the_render_is_not_black():
     dark, grey = np.full((4, 4, 3), 10, np.uint8), np.full((4, 4, 3), 90, np.uint8)
     assert guard.black(dark, grey)
     assert not guard.black(dark, dark)
     assert not guard.black(grey, grey)
 
 
-def test_frozen_counts_only_where_the_render_moves() -> None:
+def test_frozen_counts_only_where_the_render_moves():
     raw = pixels(FRAMES[:3])
     out = np.stack([raw[0], raw[0], raw[1]])
     fine = np.zeros((3, 3), np.float32)
@@ -63,9 +61,7 @@ def test_frozen_counts_only_where_the_render_moves() -> None:
     assert guard.check_frames(fine, standing, flicker, None) == ["", "", ""]
 
 
-def test_numbers_that_are_none_are_replaced_and_do_not_stay(
-    weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_that_are_none_are_replaced_and_do_not_stay(weights, monkeypatch):
     session = fixer(busy_settings(weights))
     real = onefixer.latent_noise
 
@@ -84,9 +80,7 @@ def test_numbers_that_are_none_are_replaced_and_do_not_stay(
     assert np.abs(pixels(after).astype(int) - pixels(FRAMES[13:])).max() > 2
 
 
-def test_a_previewed_failure_leaves_no_trace(
-    weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_previewed_failure_leaves_no_trace(weights, monkeypatch):
     settings = busy_settings(weights)
     alone = pixels(run_blocks(fixer(settings), FRAMES[:21], MAPS[:21]))
     session = fixer(settings)
@@ -107,7 +101,7 @@ def test_a_previewed_failure_leaves_no_trace(
     assert np.array_equal(pixels(out), alone)
 
 
-def test_weights_that_overflow_half_precision_are_seen(weights: Path) -> None:
+def test_weights_that_overflow_half_precision_are_seen(weights):
     settings = small_settings("untrained=random", "holes=noise", "precision=fp16")
     session = fixer(settings)
     session.networks.dit.final_layer.linear.weight.data.mul_(1e3).clamp_(-6e4, 6e4)
@@ -119,6 +113,6 @@ def test_weights_that_overflow_half_precision_are_seen(weights: Path) -> None:
     assert np.array_equal(pixels(list(out)), pixels(FRAMES[:5]))
 
 
-def test_events_of_the_renderer_are_kept() -> None:
+def test_events_of_the_renderer_are_kept():
     frames = [replace(FRAMES[0], events=("black",))]
     assert fixer(small_settings()).step(frames, MAPS[:1])[0].events == ("black",)

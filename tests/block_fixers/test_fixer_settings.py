@@ -26,12 +26,12 @@ def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
 @pytest.mark.parametrize(
     "name", ["onefixer", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"]
 )
-def test_every_fixer_has_settings_that_load(name: str) -> None:
+def test_every_fixer_has_settings_that_load(name):
     assert name in names("fixer")
     assert isinstance(fixer_settings(name), FixerSettings)
 
 
-def test_step_count_after_the_name() -> None:
+def test_step_count_after_the_name():
     four = fixer_settings("onefixer-dit-tiny@4", ["window=8"])
     assert four.steps == (1000, 750, 500, 250)
     assert four.window == 8
@@ -58,17 +58,17 @@ def test_step_count_after_the_name() -> None:
         ("tolerance_m=-1", ("tolerance_m = -1",)),
     ],
 )
-def test_bad_values_are_named_with_their_place(override: str, words: tuple[str, ...]) -> None:
+def test_bad_values_are_named_with_their_place(override, words):
     text = refusal(override)
     for word in words:
         assert word in text
 
 
-def test_a_bundle_and_parts_do_not_go_together() -> None:
+def test_a_bundle_and_parts_do_not_go_together():
     assert "give the bundle alone" in refusal("weights.bundle=a", "weights.dit=b")
 
 
-def test_paths_start_where_they_were_written() -> None:
+def test_paths_start_where_they_were_written():
     settings = fixer_settings(
         "onefixer-dit-tiny", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"]
     )
@@ -76,9 +76,7 @@ def test_paths_start_where_they_were_written() -> None:
     assert settings.weights.vae == "/b.safetensors"
 
 
-def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path, monkeypatch):
     shipped = tmp_path / "shipped.yaml"
     plain = Path(str(resources.files("configs.fixers"))) / "onefixer-dit-tiny.yaml"
     shipped.write_text(
@@ -98,36 +96,36 @@ def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(
         weights("dit.width=24")
 
 
-def test_the_large_fixer_does_not_go_without_weights() -> None:
+def test_the_large_fixer_does_not_go_without_weights():
     with pytest.raises(InputError):
         make_fixer("onefixer-2b", scene_id="scene")
 
 
-def test_widths_of_an_untrained_tiny_autoencoder() -> None:
+def test_widths_of_an_untrained_tiny_autoencoder():
     vae = load_networks(small_settings("vae.widths=[8,16,12,10,6]")).vae
     assert vae.sizes == TinySizes(8, 16, 12, 10, 6)
     assert load_networks(small_settings()).vae.sizes == TinySizes(32, 48, 48, 32, 16)
     assert "vae.widths" in refusal("vae.widths=[8,16]")
 
 
-def test_an_untrained_wan_autoencoder_is_no_identity() -> None:
+def test_an_untrained_wan_autoencoder_is_no_identity():
     with pytest.raises(InputError):
         load_networks(small_settings("vae.kind=wan", "decoder.kind=latent"))
 
 
-def test_a_device_that_does_not_work_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_does_not_work_is_named(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(InfrastructureError):
         load_networks(small_settings(), "cuda")
 
 
-def test_how_the_loop_uses_a_fixer_does_not_load_its_networks_again() -> None:
+def test_how_the_loop_uses_a_fixer_does_not_load_its_networks_again():
     one, other = small_settings("mode=chunk"), small_settings("tolerance_m=0.5")
     assert load_networks(one) is load_networks(other)
     assert load_networks(one) is not load_networks(small_settings("window=4"))
 
 
-def test_identity_passes_frames_on_and_checks_blocks() -> None:
+def test_identity_passes_frames_on_and_checks_blocks():
     from tests.fixers.clip_cases import moving_picture
 
     session = make_fixer("identity", scene_id="scene")
@@ -143,7 +141,7 @@ def test_identity_passes_frames_on_and_checks_blocks() -> None:
 
 
 @pytest.mark.parametrize("scale", ["0", "half", "1.5", "true"])
-def test_a_scale_is_auto_or_a_whole_number(scale: str) -> None:
+def test_a_scale_is_auto_or_a_whole_number(scale):
     with pytest.raises(InputError):
         fixer_settings("onefixer", [f"scale={scale}"])
     assert fixer_settings("onefixer", ["scale=3"]).scale_of(288, 512) == 3  # type: ignore[attr-defined]

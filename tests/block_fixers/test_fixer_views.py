@@ -12,7 +12,7 @@ from alpasim_plugin.fixers.views import group_views
 from tests.fixers.clip_cases import maps_of, moving_picture
 
 
-def test_every_grey_level_survives_the_way_to_tensors_and_back() -> None:
+def test_every_grey_level_survives_the_way_to_tensors_and_back():
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
     (views,) = group_views([Frame(0, "front", levels)], [], 1)
     clip = to_clip(views, 1)
@@ -21,7 +21,7 @@ def test_every_grey_level_survives_the_way_to_tensors_and_back() -> None:
     assert float(clip.rgb.max()) == 1
 
 
-def test_filling_up_repeats_edges_and_the_last_frame() -> None:
+def test_filling_up_repeats_edges_and_the_last_frame():
     frames = moving_picture(2, size=(17, 30))
     (views,) = group_views(frames, maps_of(frames), 5)
     clip = to_clip(views, 5)
@@ -37,7 +37,7 @@ def test_filling_up_repeats_edges_and_the_last_frame() -> None:
     assert to_images(clip.rgb, views.size).shape == (1, 2, 17, 30, 3)
 
 
-def test_an_opacity_of_one_everywhere_is_none() -> None:
+def test_an_opacity_of_one_everywhere_is_none():
     opaque = moving_picture(2, holes=False)
     (views,) = group_views(opaque, [], 5)
     assert views.alpha is None
@@ -50,7 +50,7 @@ def test_an_opacity_of_one_everywhere_is_none() -> None:
     assert views.alpha[0, 1, 0, 0] == np.float32(0.999)
 
 
-def test_equal_blocks_are_told_from_others() -> None:
+def test_equal_blocks_are_told_from_others():
     frames = moving_picture(3)
     maps = maps_of(frames)
     (views,) = group_views(frames, maps, 5)
@@ -64,7 +64,7 @@ def test_equal_blocks_are_told_from_others() -> None:
     assert not views.equals(group_views([replace(f, t_us=f.t_us + 1) for f in frames], maps, 5)[0])
 
 
-def test_pixels_are_copied_so_that_a_renderer_may_reuse_its_buffers() -> None:
+def test_pixels_are_copied_so_that_a_renderer_may_reuse_its_buffers():
     frames = moving_picture(2)
     (views,) = group_views(frames, [], 5)
     before = views.rgb.copy()

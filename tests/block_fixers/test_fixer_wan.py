@@ -23,7 +23,7 @@ MAPS = maps_of(FRAMES)
 
 
 @pytest.fixture
-def paths(shared_data: Path, tmp_path: Path) -> list[str]:
+def paths(shared_data, tmp_path):
     """Name the weights of the original networks at small sizes, and a prompt for them."""
     folder = shared_data / "golden-nets"
     prompt = tmp_path / "prompt.safetensors"
@@ -52,7 +52,7 @@ def settings_of(*overrides: str) -> OneFixerSettings:
 
 
 @pytest.mark.parametrize("decoder", first_of(["taehv", "latent"]))
-def test_blocks_equal_the_whole_clip(paths: list[str], shared_data: Path, decoder: str) -> None:
+def test_blocks_equal_the_whole_clip(paths, shared_data, decoder):
     taehv = f"weights.decoder={shared_data / 'golden-nets' / 'taehv.weights.safetensors'}"
     settings = settings_of(
         *paths, f"decoder.kind={decoder}", *([taehv] if decoder == "taehv" else [])
@@ -68,7 +68,7 @@ def test_blocks_equal_the_whole_clip(paths: list[str], shared_data: Path, decode
     assert np.abs(out.astype(int) - pixels(FRAMES)).mean() > 1
 
 
-def test_parts_that_are_missing_are_named(paths: list[str]) -> None:
+def test_parts_that_are_missing_are_named(paths):
     for missing, _part in (
         (paths[:2], "prompt"),
         (paths[1:], "dit"),
@@ -79,7 +79,7 @@ def test_parts_that_are_missing_are_named(paths: list[str]) -> None:
             load_networks(settings_of(*missing))
 
 
-def test_random_weights_stand_in_for_timing() -> None:
+def test_random_weights_stand_in_for_timing():
     sizes = [
         "width=24",
         "blocks=1",

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
 from tests.block_fixers.fixer_cases import (
     busy_settings,
@@ -30,17 +27,17 @@ MAPS = maps_of(FRAMES)
 
 
 @pytest.fixture(scope="module")
-def busy(weights: Path) -> OneFixerSettings:
+def busy(weights):
     return busy_settings(weights)
 
 
 @pytest.fixture(scope="module")
-def alone(busy) -> np.ndarray:
+def alone(busy):
     """What a rollout of its own makes of the clip."""
     return pixels(run_blocks(fixer(busy), FRAMES, MAPS))
 
 
-def test_a_session_keeps_both_contracts(busy) -> None:
+def test_a_session_keeps_both_contracts(busy):
     session = fixer(busy)
     assert isinstance(session, Fixer)
     assert isinstance(session, Fixer)
@@ -53,7 +50,7 @@ def test_a_session_keeps_both_contracts(busy) -> None:
     )  # these weights do something
 
 
-def test_reset_reproduces_a_rollout_bit_by_bit(busy, alone: np.ndarray) -> None:
+def test_reset_reproduces_a_rollout_bit_by_bit(busy, alone):
     session = fixer(busy, seed=3)
     other_seed = pixels(run_blocks(session, FRAMES, MAPS))
     session.reset(0)
@@ -61,7 +58,7 @@ def test_reset_reproduces_a_rollout_bit_by_bit(busy, alone: np.ndarray) -> None:
     assert not np.array_equal(other_seed, alone)
 
 
-def test_noise_follows_scene_seed_and_camera_and_nothing_else(busy, alone: np.ndarray) -> None:
+def test_noise_follows_scene_seed_and_camera_and_nothing_else(busy, alone):
     assert np.array_equal(pixels(run_blocks(fixer(busy), FRAMES, MAPS)), alone)
     assert not np.array_equal(
         pixels(run_blocks(fixer(busy, scene_id="elsewhere"), FRAMES, MAPS)), alone
@@ -70,13 +67,13 @@ def test_noise_follows_scene_seed_and_camera_and_nothing_else(busy, alone: np.nd
     assert not np.array_equal(pixels(run_blocks(fixer(busy), renamed, MAPS)), alone)
 
 
-def test_two_rollouts_interleaved_never_mix(busy, alone: np.ndarray) -> None:
+def test_two_rollouts_interleaved_never_mix(busy, alone):
     frames = moving_picture(29, key="other")
     maps = maps_of(frames)
     other = pixels(run_blocks(fixer(busy, seed=1), frames, maps))
     first, second = fixer(busy), fixer(busy, seed=1)
-    a: list[Frame] = []
-    b: list[Frame] = []
+    a = []
+    b = []
     for start, end in ((0, 5), (5, 13), (13, 21), (21, 29)):
         a += first.step(FRAMES[start:end], MAPS[start:end])
         second.preview(frames[start:end], maps[start:end])
@@ -86,12 +83,12 @@ def test_two_rollouts_interleaved_never_mix(busy, alone: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("history", ["last-forward", "finalise"])
-def test_previews_of_guessed_frames_leave_no_trace(weights: Path, history: str) -> None:
+def test_previews_of_guessed_frames_leave_no_trace(weights, history):
     settings = busy_settings(weights, f"history={history}", "window=4")
     alone = pixels(run_blocks(fixer(settings), FRAMES, MAPS))
     guesses = moving_picture(29, key="guess")
     session = fixer(settings)
-    out: list[Frame] = []
+    out = []
     for start, end in ((0, 5), (5, 13), (13, 21), (21, 29)):
         for shown in (1, 3):  # poses known so far, then poses guessed
             known = [*FRAMES[start : start + shown], *guesses[start + shown : end]]
@@ -101,10 +98,10 @@ def test_previews_of_guessed_frames_leave_no_trace(weights: Path, history: str) 
     assert np.array_equal(pixels(out), alone)
 
 
-def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone: np.ndarray) -> None:
+def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone):
     session = fixer(busy)
     videos = record_videos(session)
-    out: list[Frame] = []
+    out = []
     for start, end in ((0, 5), (5, 13)):
         previewed = session.preview(FRAMES[start:end], MAPS[start:end])
         repeated = session.preview(FRAMES[start:end], MAPS[start:end])
@@ -119,11 +116,11 @@ def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone: np.
     assert len(videos) == 4, "an opacity alone makes another block"
 
 
-def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
+def test_cameras_in_one_batch_come_out_as_each_alone(busy):
     left = moving_picture(21, key="left", camera="left")
     right = moving_picture(21, key="right", camera="right", holes=False)
     maps = {"left": maps_of(left), "right": maps_of(right)}
-    videos: dict[str, torch.Tensor] = {}
+    videos = {}
     images = {}
     for name, frames in (("left", left), ("right", right)):
         session = fixer(busy)
@@ -132,7 +129,7 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
         videos[name] = torch.cat(seen, dim=2)
     session = fixer(busy)
     seen = record_videos(session)
-    out: list[Frame] = []
+    out = []
     for start, end in ((0, 5), (5, 13), (13, 21)):
         mixed = [
             frame for pair in zip(right[start:end], left[start:end], strict=True) for frame in pair
@@ -155,7 +152,7 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
         assert np.abs(mine.astype(int) - images[name]).max() <= 1
 
 
-def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
+def test_map_is_seen_only_where_the_settings_use_it(weights):
     seen, unseen = busy_settings(weights), busy_settings(weights, "uses_map=false")
     black = [np.zeros_like(m) for m in MAPS[:5]]
 
@@ -172,7 +169,7 @@ def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
 # --- untrained
 
 
-def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through() -> None:
+def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through():
     session = make_fixer("onefixer-dit-tiny", small_settings(), scene_id="scene")
     assert not session.trained
     assert session.label == "onefixer-dit-tiny, untrained (identity)"
@@ -189,7 +186,7 @@ def refused(session, block, maps) -> None:
         session.step(block, maps)
 
 
-def test_blocks_that_do_not_continue_the_rollout_are_refused(busy) -> None:
+def test_blocks_that_do_not_continue_the_rollout_are_refused(busy):
     session = fixer(busy)
     first = pixels(list(session.step(FRAMES[:5], MAPS[:5])))
     refused(session, FRAMES[:8], MAPS[:8])
@@ -207,7 +204,7 @@ def test_blocks_that_do_not_continue_the_rollout_are_refused(busy) -> None:
     )
 
 
-def test_blocks_that_are_none_are_refused(busy) -> None:
+def test_blocks_that_are_none_are_refused(busy):
     session = fixer(busy)
     refused(session, [], [])
     refused(session, FRAMES[:5], MAPS[:4])
@@ -219,7 +216,7 @@ def test_blocks_that_are_none_are_refused(busy) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, 1.2, -0.1, np.inf])
-def test_an_opacity_that_is_none_is_the_renderers_fault(busy, value: float) -> None:
+def test_an_opacity_that_is_none_is_the_renderers_fault(busy, value):
     alpha = np.ones(SIZE, np.float32)
     alpha[3, 4] = value
     with pytest.raises(RendererError):

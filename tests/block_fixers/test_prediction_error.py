@@ -27,31 +27,31 @@ def at_depth(z: float, x: float = 0.0) -> F64:
     return se3([x, 0.0, z], [1.0, 0.0, 0.0, 0.0])
 
 
-def test_equal_requests_do_not_deviate_and_are_the_same_view() -> None:
+def test_equal_requests_do_not_deviate_and_are_the_same_view():
     one = facing_z(3.0, {"car": at_depth(20.0)})
     assert deviation(one, one) == deviation(one, facing_z(3.0, {"car": at_depth(20.0)}))
     assert deviation(one, one).within(0.0, 0.0)
     assert same_view(one, facing_z(3.0, {"car": at_depth(20.0)}))
 
 
-def test_the_last_bit_makes_another_view_within_any_tolerance() -> None:
+def test_the_last_bit_makes_another_view_within_any_tolerance():
     near = facing_z(np.nextafter(3.0, 4.0))
     assert not same_view(facing_z(3.0), near)
     assert deviation(facing_z(3.0), near).within(1e-12, 1e-6)
 
 
-def test_the_pose_at_shutter_start_counts_as_well() -> None:
+def test_the_pose_at_shutter_start_counts_as_well():
     assert deviation(
         facing_z(0.0, start_x=-0.5), facing_z(0.0, start_x=-0.1)
     ).camera_m == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0, math.pi])
-def test_small_and_large_rotations_are_measured_exactly(angle: float) -> None:
+def test_small_and_large_rotations_are_measured_exactly(angle):
     assert rotation_rad(se2(0, 0, 0.3), se2(5, 5, 0.3 + angle)) == pytest.approx(angle, rel=1e-6)
 
 
-def test_an_actors_displacement_counts_less_the_further_away_it_is() -> None:
+def test_an_actors_displacement_counts_less_the_further_away_it_is():
     def off(depth: float) -> float:
         return deviation(
             facing_z(actors={"a": at_depth(depth)}), facing_z(actors={"a": at_depth(depth, 0.1)})
@@ -61,7 +61,7 @@ def test_an_actors_displacement_counts_less_the_further_away_it_is() -> None:
     assert off(40.0) == pytest.approx(0.025, rel=1e-3)
 
 
-def test_an_actor_that_turns_on_the_spot_counts() -> None:
+def test_an_actor_that_turns_on_the_spot_counts():
     turned = se3([0.0, 0.0, 10.0], [math.cos(0.02), 0.0, 0.0, math.sin(0.02)])
     assert deviation(
         facing_z(actors={"a": at_depth(10.0)}), facing_z(actors={"a": turned})
@@ -69,7 +69,7 @@ def test_an_actor_that_turns_on_the_spot_counts() -> None:
 
 
 @pytest.mark.parametrize("swap", [False, True])
-def test_an_actor_that_came_or_left_is_beyond_any_tolerance_unless_behind(swap: bool) -> None:
+def test_an_actor_that_came_or_left_is_beyond_any_tolerance_unless_behind(swap):
     def off(depth: float) -> float:
         pair = [facing_z(actors={"a": at_depth(depth)}), facing_z()]
         return deviation(*(reversed(pair) if swap else pair)).actor_m

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_last, run_layers
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
@@ -18,15 +14,13 @@ CASES = ["latent_n1_t1_4x6", "latent_n1_t3_4x6", "latent_n1_t5_3x5"]
 
 
 @pytest.fixture(scope="module")
-def numbers(shared_data: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+def numbers(shared_data):
     return golden(shared_data, "taehv")
 
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
 @pytest.mark.parametrize("name", CASES)
-def test_latents_decode_to_the_original_frames(
-    numbers: Any, name: str, latents_per_pass: int | None
-) -> None:
+def test_latents_decode_to_the_original_frames(numbers, name, latents_per_pass):
     decoder = TinyDecoder.from_state_dict(numbers[0])
     decoder.latents_per_pass = latents_per_pass
     video = decoder(numbers[1][f"in.{name}"].transpose(1, 2))
@@ -35,7 +29,7 @@ def test_latents_decode_to_the_original_frames(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_frames_that_are_dropped_are_the_original_ones_too(numbers: Any, name: str) -> None:
+def test_frames_that_are_dropped_are_the_original_ones_too(numbers, name):
     decoder = TinyDecoder.from_state_dict(numbers[0])
     frames = run_layers(
         decoder.decoder,
@@ -46,7 +40,7 @@ def test_frames_that_are_dropped_are_the_original_ones_too(numbers: Any, name: s
     torch.testing.assert_close(frames, expected, atol=TOLERANCE, rtol=0)
 
 
-def test_lighttae_convention_takes_the_denormalised_latent(numbers: Any) -> None:
+def test_lighttae_convention_takes_the_denormalised_latent(numbers):
     z, expected = (
         numbers[1]["in.latent_n1_t3_4x6"].transpose(1, 2),
         numbers[1]["out.latent_n1_t3_4x6.lighttae_decode_BCTHW_minus1_1"],
@@ -57,7 +51,7 @@ def test_lighttae_convention_takes_the_denormalised_latent(numbers: Any) -> None
     assert (TinyDecoder.from_state_dict(numbers[0])(z) - expected).abs().max() > 0.05
 
 
-def test_a_stream_returns_one_frame_then_four(numbers: Any) -> None:
+def test_a_stream_returns_one_frame_then_four(numbers):
     decoder = TinyDecoder.from_state_dict(numbers[0])
     stream = decoder_stream(decoder)
     z = numbers[1]["in.latent_n1_t5_3x5"].transpose(1, 2)

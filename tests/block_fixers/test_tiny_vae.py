@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -39,21 +38,21 @@ def trained_like(seed: int = 0) -> TinyVAE:
 
 
 @pytest.fixture(scope="module")
-def vae() -> TinyVAE:
+def vae():
     return trained_like()
 
 
 # Transform
 
 
-def test_components_are_orthonormal() -> None:
+def test_components_are_orthonormal():
     kernel = CosineTransform().kernel.flatten(1).double()
     torch.testing.assert_close(
         kernel @ kernel.T, torch.eye(len(COMPONENTS), dtype=torch.float64), atol=1e-6, rtol=0
     )
 
 
-def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest() -> None:
+def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest():
     transform, z = CosineTransform(), noise(2, 3, 2, 3, 16)
     torch.testing.assert_close(transform.analyse(transform.synthesise(z)), z, atol=1e-5, rtol=0)
     grid = to_grid(clip(8, 16, 24))
@@ -75,14 +74,14 @@ def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest() -> None:
 # Round trips
 
 
-def test_untrained_decoding_with_its_own_render_returns_the_render() -> None:
+def test_untrained_decoding_with_its_own_render_returns_the_render():
     untrained, video = TinyVAE.random(SIZES), clip(9, 16, 24)
     torch.testing.assert_close(
         untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0
     )
 
 
-def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred() -> None:
+def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred():
     untrained = TinyVAE.random()
     rows, columns = torch.linspace(-0.5, 0.5, 32).view(-1, 1), torch.linspace(-0.4, 0.4, 48)
     smooth = (rows + columns).expand(1, 3, 5, 32, 48).clone()
@@ -91,7 +90,7 @@ def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred(
     assert (untrained.decode(untrained.encode(rough)) - rough).abs().mean() > 0.3
 
 
-def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail() -> None:
+def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail():
     untrained, video = TinyVAE.random(SIZES), clip(5, 16, 16)
     z, cover = untrained.encode(video), torch.ones(1, 1, 5, 16, 16)
     torch.testing.assert_close(
@@ -105,7 +104,7 @@ def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail() -> None:
     )
 
 
-def test_a_hole_in_the_render_is_filled_by_the_latent_alone() -> None:
+def test_a_hole_in_the_render_is_filled_by_the_latent_alone():
     untrained, truth = TinyVAE.random(SIZES), clip(5, 16, 32)
     cover = torch.ones(1, 1, 5, 16, 32)
     cover[..., 16:] = 0
@@ -119,9 +118,7 @@ def test_a_hole_in_the_render_is_filled_by_the_latent_alone() -> None:
 
 
 @pytest.mark.parametrize("counts", [[1, 4, 4, 4], [5, 8], [13], [9, 4]])
-def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
-    vae: TinyVAE, counts: list[int]
-) -> None:
+def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
     video, stream = clip(13, 16, 24, batch=2), encoder_stream(vae)
     assert torch.equal(
         torch.cat([stream.push(part) for part in video.split(counts, dim=2)], dim=2),
@@ -131,9 +128,7 @@ def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
 
 @pytest.mark.parametrize("seen", ["nothing", "render", "render and opacity"])
 @pytest.mark.parametrize("counts", [[1, 1, 1, 1], [2, 2], [1, 3]])
-def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
-    vae: TinyVAE, counts: list[int], seen: str
-) -> None:
+def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts, seen):
     z = noise(2, 16, 4, 2, 3)
     stream = decoder_stream(vae)
     start = 0
@@ -148,14 +143,14 @@ def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
     assert torch.equal(torch.cat(parts, dim=2), vae.decode(z, **given))
 
 
-def test_the_latent_before_is_remembered(vae: TinyVAE) -> None:
+def test_the_latent_before_is_remembered(vae):
     video = clip(9, 16, 16)
     other = torch.cat([-video[:, :, :5], video[:, :, 5:]], dim=2)
     assert not torch.equal(vae.encode(video)[:, :, 2], vae.encode(other)[:, :, 2])
 
 
 @pytest.mark.slow
-def test_900_frames_stream_in_constant_memory_and_stay_finite() -> None:
+def test_900_frames_stream_in_constant_memory_and_stay_finite():
     vae = trained_like()
     encoder = encoder_stream(vae)
     decoder = decoder_stream(vae)
@@ -178,15 +173,13 @@ def test_900_frames_stream_in_constant_memory_and_stay_finite() -> None:
 
 
 @pytest.mark.parametrize(("frames", "latents"), [(1, 1), (5, 2)])
-def test_one_and_five_frames_give_one_and_two_latents(
-    vae: TinyVAE, frames: int, latents: int
-) -> None:
+def test_one_and_five_frames_give_one_and_two_latents(vae, frames, latents):
     z = vae.encode(clip(frames, 16, 24))
     assert z.shape == (1, 16, latents, 2, 3)
     assert vae.decode(z).shape == (1, 3, frames, 16, 24)
 
 
-def test_six_frames_are_refused_and_padded_ones_crop_back(vae: TinyVAE) -> None:
+def test_six_frames_are_refused_and_padded_ones_crop_back(vae):
     video = clip(6, 15, 17)
     with pytest.raises(InputError):
         vae.encode(video)
@@ -197,14 +190,14 @@ def test_six_frames_are_refused_and_padded_ones_crop_back(vae: TinyVAE) -> None:
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, 1.0, 1e4])
-def test_constant_and_saturated_clips_stay_finite(vae: TinyVAE, value: float) -> None:
+def test_constant_and_saturated_clips_stay_finite(vae, value):
     video = torch.full((1, 3, 5, 16, 16), value)
     out = vae.decode(vae.encode(video), render=video)
     assert out.isfinite().all()
     assert out.abs().max() <= 1
 
 
-def test_a_render_of_another_length_is_refused(vae: TinyVAE) -> None:
+def test_a_render_of_another_length_is_refused(vae):
     with pytest.raises(InputError):
         vae.decode(noise(1, 16, 2, 2, 2), render=clip(8, 16, 16))
     with pytest.raises(InputError):
@@ -212,7 +205,7 @@ def test_a_render_of_another_length_is_refused(vae: TinyVAE) -> None:
 
 
 @pytest.mark.parametrize("way", ["loaded", "converted"])
-def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae: TinyVAE, way: str) -> None:
+def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae, way):
     if way == "loaded":
         half = TinyVAE.from_state_dict(vae.state_dict(), dtype=torch.bfloat16)
     else:
@@ -228,7 +221,7 @@ def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae: TinyVAE,
 # Weights
 
 
-def test_random_weights_depend_on_the_seed_alone() -> None:
+def test_random_weights_depend_on_the_seed_alone():
     before = torch.get_rng_state()
     a = TinyVAE.random(SIZES, 1).state_dict()
     b = TinyVAE.random(SIZES, 1).state_dict()
@@ -238,7 +231,7 @@ def test_random_weights_depend_on_the_seed_alone() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_saving_and_loading_gives_bit_equal_results(vae: TinyVAE, tmp_path: Path) -> None:
+def test_saving_and_loading_gives_bit_equal_results(vae, tmp_path):
     path = tmp_path / "tiny.safetensors"
     vae.save(path, {"trained": "no"})
     loaded, video = TinyVAE.load(path), clip(5, 16, 16)
@@ -263,7 +256,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
 
 
 @pytest.mark.parametrize("name", SPOILED)
-def test_a_spoiled_file_is_named_in_four_parts(vae: TinyVAE, name: str) -> None:
+def test_a_spoiled_file_is_named_in_four_parts(vae, name):
     spoil, _text = SPOILED[name]
     sd = vae.state_dict()
     spoil(sd)

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def vae() -> WanVAE:
+def vae():
     return WanVAE.random(SMALL)
 
 
@@ -49,23 +49,19 @@ def push_all(stream, x: Tensor, counts: list[int]) -> Tensor:
 @pytest.mark.parametrize(
     "counts", first_of([[1, 4, 4, 4], [5, 8], [5, 4, 4], [13], [1, 12], [9, 4]], 2)
 )
-def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
-    vae: WanVAE, counts: list[int]
-) -> None:
+def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
     video = clip(13, 16, 24, batch=2)
     assert torch.equal(push_all(encoder_stream(vae), video, counts), vae.encode(video))
 
 
 @pytest.mark.parametrize("counts", first_of([[1, 1, 1, 1, 1], [2, 2, 1], [5], [1, 4], [3, 2]], 2))
-def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
-    vae: WanVAE, counts: list[int]
-) -> None:
+def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
     z = noise(2, 16, 5, 2, 3)
     assert torch.equal(push_all(decoder_stream(vae), z, counts), vae.decode(z))
 
 
 @pytest.mark.parametrize("layout", first_of([UNEVEN, SMALL]), ids=["uneven", "small"])
-def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout: WanLayout) -> None:
+def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout):
     whole, steps = WanVAE.random(layout), WanVAE.random(layout)
     whole.latents_per_pass = None
     video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
@@ -75,7 +71,7 @@ def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout: WanL
     )
 
 
-def test_a_state_holds_no_more_than_its_own_frames(vae: WanVAE) -> None:
+def test_a_state_holds_no_more_than_its_own_frames(vae):
     stream = encoder_stream(vae)
     push_all(stream, clip(9, 32, 32), [5, 4])
     assert len(stream.state) == 24
@@ -88,7 +84,7 @@ def test_a_state_holds_no_more_than_its_own_frames(vae: WanVAE) -> None:
 # Sizes and hard inputs
 
 
-def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
+def test_one_and_five_frames_give_one_and_two_latents(vae):
     one, five = vae.encode(clip(1, 16, 24)), vae.encode(clip(5, 16, 24))
     assert one.shape == (1, 16, 1, 2, 3)
     assert five.shape == (1, 16, 2, 2, 3)
@@ -96,7 +92,7 @@ def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
     assert vae.decode(five).shape == (1, 3, 5, 16, 24)
 
 
-def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
+def test_six_frames_padded_encode_as_nine_and_crop_back(vae):
     video = clip(6, 18, 23)
     padded, size = pad_clip(video)
     assert padded.shape == (1, 3, 9, 24, 24)
@@ -109,9 +105,7 @@ def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
     ("frames", "text"),
     [(5, "5 frames in the middle"), (1, "1 frames in the middle"), (0, "0 frames in the middle")],
 )
-def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(
-    vae: WanVAE, frames: int, text: str
-) -> None:
+def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(vae, frames, text):
     stream = encoder_stream(vae)
     stream.push(clip(1, 16, 16))
     before = stream.state
@@ -123,14 +117,12 @@ def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(
 @pytest.mark.parametrize(
     ("height", "width", "good"), [(17, 24, "24 x 24"), (16, 30, "16 x 32"), (4, 8, "8 x 8")]
 )
-def test_sides_that_are_no_multiple_of_eight_are_refused(
-    vae: WanVAE, height: int, width: int, good: str
-) -> None:
+def test_sides_that_are_no_multiple_of_eight_are_refused(vae, height, width, good):
     with pytest.raises(InputError):
         vae.encode(clip(1, height, width))
 
 
-def test_a_stream_whose_frame_size_changes_is_refused(vae: WanVAE) -> None:
+def test_a_stream_whose_frame_size_changes_is_refused(vae):
     stream = encoder_stream(vae)
     stream.push(clip(1, 16, 16))
     with pytest.raises(InputError):
@@ -146,18 +138,18 @@ def test_a_stream_whose_frame_size_changes_is_refused(vae: WanVAE) -> None:
     ],
     ids=["uint8", "4d", "rgba"],
 )
-def test_what_is_no_video_is_refused(vae: WanVAE, bad: Tensor) -> None:
+def test_what_is_no_video_is_refused(vae, bad):
     with pytest.raises(InputError):
         vae.encode(bad)
 
 
-def test_latents_of_another_width_are_refused(vae: WanVAE) -> None:
+def test_latents_of_another_width_are_refused(vae):
     with pytest.raises(InputError):
         vae.decode(torch.zeros(1, 8, 1, 2, 2))
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, 1.0, 1e4])
-def test_constant_and_saturated_clips_stay_finite(vae: WanVAE, value: float) -> None:
+def test_constant_and_saturated_clips_stay_finite(vae, value):
     video = torch.full((1, 3, 9, 16, 16), value)
     z = vae.encode(video)
     out = vae.decode(z)
@@ -166,7 +158,7 @@ def test_constant_and_saturated_clips_stay_finite(vae: WanVAE, value: float) -> 
     assert out.abs().max() <= 1
 
 
-def test_one_bad_pixel_does_not_reach_earlier_frames(vae: WanVAE) -> None:
+def test_one_bad_pixel_does_not_reach_earlier_frames(vae):
     video = clip(9, 16, 16)
     video[0, 0, 5, 3, 3] = torch.nan
     z = vae.encode(video)
@@ -185,9 +177,7 @@ def test_one_bad_pixel_does_not_reach_earlier_frames(vae: WanVAE) -> None:
     outputs=st.integers(1, 5),
     side=st.sampled_from([1, 3]),
 )
-def test_summed_2d_convolutions_equal_the_3d_one(
-    past: int, frames: int, inputs: int, outputs: int, side: int
-) -> None:
+def test_summed_2d_convolutions_equal_the_3d_one(past, frames, inputs, outputs, side):
     joined = noise(2, past + frames, 4, 5, inputs, seed=past)
     weight, bias = noise(outputs, inputs, 3, side, side), noise(outputs)
     past_and_padding = F.pad(joined, (0, 0, 0, 0, 0, 0, 2 - past, 0)).permute(0, 4, 1, 2, 3)
@@ -204,7 +194,7 @@ def test_summed_2d_convolutions_equal_the_3d_one(
 
 
 @pytest.mark.parametrize("layout", [SMALL, UNEVEN, DEEPER], ids=["small", "uneven", "deeper"])
-def test_sizes_are_read_off_the_tensors(layout: WanLayout) -> None:
+def test_sizes_are_read_off_the_tensors(layout):
     sd = WanVAE.random(layout).state_dict()
     assert read_layout(sd) == layout
     video = clip(5, 16, 16)
@@ -214,13 +204,13 @@ def test_sizes_are_read_off_the_tensors(layout: WanLayout) -> None:
 
 
 @pytest.mark.parametrize(("base", "millions"), [(96, 126.9), (24, 8.04)])
-def test_published_widths_have_the_published_number_of_weights(base: int, millions: float) -> None:
+def test_published_widths_have_the_published_number_of_weights(base, millions):
     with torch.device("meta"):
         count = sum(p.numel() for p in WanVAE(WanLayout.of_base(base)).parameters())
     assert count / 1e6 == pytest.approx(millions, abs=0.06)
 
 
-def test_the_keys_are_those_of_the_published_file(vae: WanVAE) -> None:
+def test_the_keys_are_those_of_the_published_file(vae):
     keys = set(vae.state_dict())
     assert len(keys) == 194
     assert {
@@ -238,9 +228,7 @@ def test_the_keys_are_those_of_the_published_file(vae: WanVAE) -> None:
 
 
 @pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float64])
-def test_half_and_double_precision_tensors_load_into_single(
-    vae: WanVAE, stored: torch.dtype
-) -> None:
+def test_half_and_double_precision_tensors_load_into_single(vae, stored):
     sd = {key: value.to(stored) for key, value in vae.state_dict().items()}
     loaded = WanVAE.from_state_dict(sd)
     assert loaded.dtype == torch.float32
@@ -254,7 +242,7 @@ def test_half_and_double_precision_tensors_load_into_single(
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_running_in_half_precision_stays_close(vae: WanVAE, dtype: torch.dtype) -> None:
+def test_running_in_half_precision_stays_close(vae, dtype):
     half = WanVAE.from_state_dict(vae.state_dict(), dtype=dtype)
     video = clip(9, 16, 16)
     z = half.encode(video)
@@ -318,7 +306,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
 
 
 @pytest.mark.parametrize("name", SPOILED)
-def test_a_spoiled_checkpoint_is_named_in_four_parts(vae: WanVAE, name: str) -> None:
+def test_a_spoiled_checkpoint_is_named_in_four_parts(vae, name):
     spoil, _text = SPOILED[name]
     sd = dict(vae.state_dict())
     spoil(sd)

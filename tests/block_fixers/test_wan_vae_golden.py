@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_first, channels_last
@@ -19,20 +15,18 @@ CLIPS = ["clip_b1_t1_32x48", "clip_b1_t9_32x48", "clip_b1_t17_40x64"]
 
 
 @pytest.fixture(scope="module")
-def numbers(shared_data: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+def numbers(shared_data):
     return golden(shared_data, "wan_vae")
 
 
 @pytest.fixture(scope="module")
-def vae(numbers: Any) -> WanVAE:
+def vae(numbers):
     return WanVAE.from_state_dict(numbers[0])
 
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
 @pytest.mark.parametrize("name", CLIPS)
-def test_clip_encodes_to_the_original_latents(
-    vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None
-) -> None:
+def test_clip_encodes_to_the_original_latents(vae, numbers, name, latents_per_pass):
     vae.latents_per_pass = latents_per_pass
     z = vae.encode(numbers[1][f"in.{name}"])
     torch.testing.assert_close(
@@ -42,9 +36,7 @@ def test_clip_encodes_to_the_original_latents(
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
 @pytest.mark.parametrize("name", CLIPS)
-def test_latents_decode_to_the_original_frames(
-    vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None
-) -> None:
+def test_latents_decode_to_the_original_frames(vae, numbers, name, latents_per_pass):
     vae.latents_per_pass = latents_per_pass
     video = vae.decode(numbers[1][f"out.{name}.latent_normalised"], clamp=False)
     torch.testing.assert_close(
@@ -53,25 +45,21 @@ def test_latents_decode_to_the_original_frames(
 
 
 @pytest.mark.parametrize(("clamp", "what"), [(True, "decode_clamped"), (False, "decode_unclamped")])
-def test_random_latents_decode_to_the_original_frames(
-    vae: WanVAE, numbers: Any, clamp: bool, what: str
-) -> None:
+def test_random_latents_decode_to_the_original_frames(vae, numbers, clamp, what):
     video = vae.decode(numbers[1]["in.latent_b1_t4_4x6"], clamp=clamp)
     torch.testing.assert_close(
         video, numbers[1][f"out.latent_b1_t4_4x6.{what}"], atol=TOLERANCE, rtol=0
     )
 
 
-def test_unnormalised_means_are_the_original_ones(vae: WanVAE, numbers: Any) -> None:
+def test_unnormalised_means_are_the_original_ones(vae, numbers):
     mu = vae.stats.denormalise(vae.encode(numbers[1]["in.clip_b1_t9_32x48"]))
     torch.testing.assert_close(
         mu, numbers[1]["out.clip_b1_t9_32x48.latent_raw_mu"], atol=TOLERANCE, rtol=0
     )
 
 
-def test_every_chunk_leaves_the_original_encoder_output_and_state(
-    vae: WanVAE, numbers: Any
-) -> None:
+def test_every_chunk_leaves_the_original_encoder_output_and_state(vae, numbers):
     _, io, config = numbers
     name = "clip_b1_t17_40x64"
     video = io[f"in.{name}"]
@@ -94,6 +82,6 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(
         state, start = streaming.state, start + count
 
 
-def test_statistics_are_the_published_ones(numbers: Any) -> None:
+def test_statistics_are_the_published_ones(numbers):
     assert list(WAN_MEAN) == numbers[2]["mean"]
     assert list(WAN_STD) == numbers[2]["std"]

@@ -12,9 +12,7 @@ from scenarios.load import load_scenario
 
 
 @pytest.mark.parametrize(("times_lost", "outcomes"), [(1, ()), (2, None)])
-def test_a_scene_in_which_the_driver_is_lost_is_driven_once_more(
-    times_lost: int, outcomes: tuple[str, ...] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_in_which_the_driver_is_lost_is_driven_once_more(times_lost, outcomes, monkeypatch):
     losses = iter([InfrastructureError("a driver: UNAVAILABLE", "start it")] * times_lost)
     waited = []
 

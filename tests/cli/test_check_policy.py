@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -54,15 +53,13 @@ class Fails(Talks):
 
 
 @pytest.fixture
-def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def parts(tmp_path, monkeypatch):
     (tmp_path / "talking_policies.py").write_text(TALKS)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_a_policy_that_prints_leaves_one_document_on_stdout(
-    parts: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_policy_that_prints_leaves_one_document_on_stdout(parts, capsys):
     assert run_command(["check", "policy", "talking_policies.py:Talks", "--json"]) == 0
     printed = capsys.readouterr()
     document = json.loads(printed.out)
@@ -82,8 +79,8 @@ def test_a_policy_that_prints_leaves_one_document_on_stdout(
 
 
 def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_error(
-    parts: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    parts, capsys
+):
     assert run_command(["check", "policy", "talking_policies.py:Fails"]) == 1
     out = capsys.readouterr().out
     assert out.startswith("FAIL made: ")
@@ -102,9 +99,7 @@ SHORT = [
 GREY = ["--renderer", "tests.runs.grey_renderer:Grey"]
 
 
-def test_a_run_with_a_policy_that_prints_gives_one_document(
-    parts: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_with_a_policy_that_prints_gives_one_document(parts, capsys):
     assert (
         run_command(
             [*GREY, "--policy", "talking_policies.py:Talks", "--out", "run", "--json", *SHORT]
@@ -122,9 +117,7 @@ def test_a_run_with_a_policy_that_prints_gives_one_document(
         ("NoSensors", "sensors is 'front'"),
     ],
 )
-def test_in_a_run_the_faults_of_a_policy_are_its_own(
-    parts: Path, name: str, found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_in_a_run_the_faults_of_a_policy_are_its_own(parts, name, found, capsys):
     assert (
         run_command([*GREY, "--policy", f"talking_policies.py:{name}", "--out", "run", *SHORT]) == 2
     )

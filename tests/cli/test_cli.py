@@ -100,9 +100,7 @@ SITUATIONS = (
 
 
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_bad_input_is_an_error_with_exit_code_2(
-    situation: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_an_error_with_exit_code_2(situation, tmp_path, capsys):
     command, mention = bad_inputs(tmp_path)[situation]
     assert run_command([*command, "--out", str(tmp_path / "out")]) == 2
     captured = capsys.readouterr()
@@ -112,16 +110,14 @@ def test_bad_input_is_an_error_with_exit_code_2(
     assert not (tmp_path / "out" / "run.json").exists()
 
 
-def test_json_errors_are_one_document_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_errors_are_one_document_on_stdout(capsys):
     assert run_command(["--renderer", "nope", "--json", "smoke/straight"]) == 2
     document = json.loads(capsys.readouterr().out)
     assert set(document["error"]) == {"message", "hint", "failure_class"}
     assert document["exit_code"] == 2
 
 
-def test_a_dry_run_counts_without_running(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_counts_without_running(tmp_path, capsys):
     command = [
         "--renderer",
         "clean,3dgs",
@@ -140,9 +136,7 @@ def test_a_dry_run_counts_without_running(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_prints_its_table_and_writes_the_contracted_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path, capsys):
     command = [
         *GOOD,
         "--workers",
@@ -184,17 +178,13 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(
     assert (tmp_path / "report.html").exists()
 
 
-def test_a_run_folder_that_cannot_be_made_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_folder_that_cannot_be_made_is_an_error(tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert run_command([*GOOD, "--out", str(tmp_path / "file"), "--quiet", "smoke/straight"]) == 4
     assert str(tmp_path / "file") in two_parts(capsys.readouterr().err)[0]
 
 
-def test_policy_of_the_working_directory_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_policy_of_the_working_directory_is_found(tmp_path, monkeypatch, capsys):
     (tmp_path / "policy_of_this_folder.py").write_text(
         "from policies.simple import ConstantVelocity as Mine\n"
     )
@@ -220,7 +210,7 @@ def test_policy_of_the_working_directory_is_found(
 
 
 @pytest.mark.parametrize("kind", ["renderers", "policies", "scenarios", "metrics"])
-def test_lists_name_every_part_with_help(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lists_name_every_part_with_help(kind, capsys):
     assert run_command(["list", kind, "--json"]) == 0
     known = json.loads(capsys.readouterr().out)
     assert known
@@ -228,8 +218,8 @@ def test_lists_name_every_part_with_help(kind: str, capsys: pytest.CaptureFixtur
 
 
 def test_every_preset_is_listed_with_what_it_is_the_default_first_and_with_the_contacts_that_it_misses(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    capsys,
+):
     assert run_command(["list", "presets", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert next(iter(listed)) == "strict"
@@ -242,7 +232,7 @@ def test_every_preset_is_listed_with_what_it_is_the_default_first_and_with_the_c
     }
 
 
-def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_tries_the_parts(capsys):
     assert run_command(["doctor", "--json"]) == 0
     checks = {row["check"]: row for row in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["rasteriser (cpu)"]["ok"]
@@ -252,11 +242,11 @@ def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("text", "seeds"), [("1", [0]), ("3", [0, 1, 2]), ("4,7", [4, 7]), ("0,", [0])]
 )
-def test_seeds_are_a_count_or_a_list(text: str, seeds: list[int]) -> None:
+def test_seeds_are_a_count_or_a_list(text, seeds):
     assert parse_seeds(text) == seeds
 
 
 @pytest.mark.parametrize("text", ["-1", "", "x", "1,-2", "1.5", f"0,{2**63}"])
-def test_other_seeds_are_refused(text: str) -> None:
+def test_other_seeds_are_refused(text):
     with pytest.raises(InputError):
         parse_seeds(text)

@@ -76,7 +76,7 @@ VERBS = {
 
 
 @pytest.fixture(scope="module")
-def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packages(tmp_path_factory):
     """Give a folder of the import path in which a package with verbs is installed."""
     folder = tmp_path_factory.mktemp("packages")
     (folder / "greeting.py").write_text(PLUGIN)
@@ -118,8 +118,8 @@ def two_parts(text: str) -> tuple[str, str]:
 
 
 def test_a_verb_of_an_installed_package_runs_and_is_listed_without_being_imported(
-    packages: Path,
-) -> None:
+    packages,
+):
     done = simrun(packages, "greet", "--name", "Ada")
     assert (done.stdout, done.returncode) == ("hello Ada\n", 0)
     assert simrun(packages, "several", "two").stdout == "two done\n"
@@ -133,16 +133,14 @@ def test_a_verb_of_an_installed_package_runs_and_is_listed_without_being_importe
     assert "--debug" in own
 
 
-def test_a_package_that_claims_a_verb_of_ours_is_refused(tmp_path: Path) -> None:
+def test_a_package_that_claims_a_verb_of_ours_is_refused(tmp_path):
     install(tmp_path, {"gate": "greeting:greet"})
     done = simrun(tmp_path, "list", "renderers")
     assert done.returncode == 2
     assert "alpasim_plugin.cli.gate:gate" in two_parts(done.stderr)[0]
 
 
-def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(monkeypatch, capsys):
     monkeypatch.setattr(main, "verbs", lambda: {"run": "alpasim_plugin.cli.run:run"})
     assert run_command(["train", "fixer"]) == 2
     assert "alpasim_plugin/lab" in two_parts(capsys.readouterr().err)[1]
@@ -152,8 +150,8 @@ def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(
 
 
 def test_an_exception_that_is_not_ours_has_a_place_and_an_exit_code_of_its_own(
-    packages: Path,
-) -> None:
+    packages,
+):
     done = simrun(packages, "fails")
     assert done.returncode == InternalError.exit_code == 70
     message, hint = two_parts(done.stderr)
@@ -166,9 +164,7 @@ def test_an_exception_that_is_not_ours_has_a_place_and_an_exit_code_of_its_own(
     assert 'raise ValueError("seven")' in traced.stderr
 
 
-def test_with_json_it_is_one_document(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_with_json_it_is_one_document(monkeypatch, capsys):
     def broken(args: list[str]) -> int:
         raise RecursionError("too deep")
 
@@ -184,9 +180,7 @@ def test_with_json_it_is_one_document(
     ("verb", "found"),
     [("hungry", "out of memory: of 1 TB"), ("full", "No space left on device: /somewhere/file")],
 )
-def test_too_little_memory_or_disk_is_a_failure_of_the_machine(
-    packages: Path, verb: str, found: str
-) -> None:
+def test_too_little_memory_or_disk_is_a_failure_of_the_machine(packages, verb, found):
     done = simrun(packages, verb)
     assert done.returncode == 4
     assert found in two_parts(done.stderr)[0]
@@ -199,9 +193,7 @@ def test_too_little_memory_or_disk_is_a_failure_of_the_machine(
     "words",
     first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]]),
 )
-def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(
-    packages: Path, words: list[str]
-) -> None:
+def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages, words):
     with Path("/dev/full").open("w") as full:
         done = simrun(packages, *words, stdout=full)
     assert done.returncode == 4
@@ -215,7 +207,7 @@ def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(
         [["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]]
     ),
 )
-def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[str]) -> None:
+def test_a_reader_that_has_gone_is_no_failed_gate(packages, words):
     reader, writer = os.pipe()
     os.close(reader)
     done = simrun(packages, *words, stdout=writer)
@@ -223,7 +215,7 @@ def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[st
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_an_interrupt_during_imports_leaves_without_a_traceback(packages: Path) -> None:
+def test_an_interrupt_during_imports_leaves_without_a_traceback(packages):
     # A process that a shell put into the background ignores the signal, and so would its children;
     # a function that subprocess calls after a fork would have gRPC, where a test before has loaded
     # it, write to stderr.
@@ -243,9 +235,7 @@ def test_an_interrupt_during_imports_leaves_without_a_traceback(packages: Path) 
         (["list", "--workers"], "--workers"),
     ],
 )
-def test_an_error_of_usage_says_what_helps(
-    words: list[str], found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_of_usage_says_what_helps(words, found, capsys):
     assert run_command(words) == 2
     message, hint = two_parts(capsys.readouterr().err)
     assert found in message
@@ -288,7 +278,5 @@ def offered(packages: Path, *words: str) -> list[str]:
         ]
     ),
 )
-def test_a_tab_offers_verbs_options_and_names(
-    packages: Path, words: list[str], among: list[str]
-) -> None:
+def test_a_tab_offers_verbs_options_and_names(packages, words, among):
     assert set(among) <= set(offered(packages, *words))

@@ -29,7 +29,7 @@ class Straight(ConstantVelocity):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """Two policies, two seeds, in a scene without other road users: an infinite distance to the
     nearest one.
     """
@@ -59,13 +59,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def exported(run: Path) -> Path:
+def exported(run):
     out = run.parent / "exported"
     assert run_command(["export", str(run), "--alpasim", str(out)]) == 0
     return out
 
 
-def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run: Path) -> None:
+def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run):
     info = read_run_json(run)
     assert info["asked"] == ["smoke/straight"]
     assert info["outcome"] == {"n_rollouts": 4, "n_failed": 0}
@@ -79,7 +79,7 @@ def logs(exported: Path, policy: str) -> list[Path]:
     return sorted((exported / "clean" / slug(policy) / "rollouts").glob("*/*/rollout.asl"))
 
 
-def test_each_renderer_and_policy_has_a_run_folder_of_alpasims_form(exported: Path) -> None:
+def test_each_renderer_and_policy_has_a_run_folder_of_alpasims_form(exported):
     for policy in POLICIES:
         folder = exported / "clean" / slug(policy)
         found = logs(exported, policy)
@@ -105,7 +105,7 @@ def test_each_renderer_and_policy_has_a_run_folder_of_alpasims_form(exported: Pa
     assert len(names) == 2
 
 
-def test_session_ids_sort_as_seeds_and_cameras_have_alpasims_name(exported: Path) -> None:
+def test_session_ids_sort_as_seeds_and_cameras_have_alpasims_name(exported):
     for policy in POLICIES:
         read = [read_asl(log) for log in logs(exported, policy)]
         assert [one.seed for one in read] == [0, 1]
@@ -120,9 +120,7 @@ def test_session_ids_sort_as_seeds_and_cameras_have_alpasims_name(exported: Path
             assert [camera.name for camera in one.info["cameras"]] == [FRONT]
 
 
-def test_scores_of_the_export_are_those_of_the_run(
-    run: Path, exported: Path, tmp_path: Path
-) -> None:
+def test_scores_of_the_export_are_those_of_the_run(run, exported, tmp_path):
     before = pq.read_table(run / "rollouts.parquet").to_pylist()
     wanted = {(row["policy"], row["seed"]): row for row in before}
     command = ["score", str(exported), "--preset", "alpasim"]
@@ -155,9 +153,7 @@ def test_scores_of_the_export_are_those_of_the_run(
         assert (out / "aggregate" / "results-summary.json").is_file()
 
 
-def test_refusals_say_what_to_do(
-    run: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refusals_say_what_to_do(run, exported, tmp_path, capsys):
     assert run_command(["export", str(run), "--alpasim", str(exported)]) == 2
     assert "not empty" in capsys.readouterr().err
     assert (

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from alpasim_plugin.cli.main import run_command
 
 
-def test_a_part_of_the_users_own_drives_again_only_if_it_is_named_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_of_the_users_own_drives_again_only_if_it_is_named_too(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     base = "from policies.simple import ConstantVelocity\n\n\n"
     Path("own.py").write_text(f"{base}class Own(ConstantVelocity):\n    pass\n")

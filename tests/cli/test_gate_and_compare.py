@@ -36,7 +36,7 @@ def plan(**fields) -> Plan:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def runs(tmp_path_factory):
     """Make a good run, a bad one, one with a failed rollout, one with few scenes, one of other
     scene content.
     """
@@ -76,7 +76,7 @@ def _set_failure_class(folder: Path, name: str) -> None:
 
 
 @pytest.fixture
-def gate_file(tmp_path: Path) -> str:
+def gate_file(tmp_path):
     path = tmp_path / "gate.yaml"
     path.write_text(EASY)
     return str(path)

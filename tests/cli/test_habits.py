@@ -4,8 +4,6 @@ value that is wrong.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command, usual
@@ -38,7 +36,7 @@ class Raises(Channels):
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     """Work in a folder with some files of a newcomer's."""
     (tmp_path / "parts.py").write_text(PARTS)
     (tmp_path / "relative.py").write_text("from .helper import x\nclass One: pass\n")
@@ -61,14 +59,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("--renderer clean ,3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
     ],
 )
-def test_other_spellings_are_understood(typed: str, meant: str) -> None:
+def test_other_spellings_are_understood(typed, meant):
     assert usual(typed.split()) == meant.split()
 
 
 @pytest.mark.parametrize(
     "line", ["-v", "version -j", "help", "help why", "list", "-j list presets"]
 )
-def test_what_asks_for_help_ends_well(line: str) -> None:
+def test_what_asks_for_help_ends_well(line):
     assert run_command(line.split()) == 0
 
 
@@ -104,16 +102,14 @@ def test_what_asks_for_help_ends_well(line: str) -> None:
         ("check renderer parts.py:Raises", "parts.py:24"),
     ],
 )
-def test_a_mistake_is_answered_by_what_is_wrong(
-    line: str, named: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_answered_by_what_is_wrong(line, named, here, capsys):
     assert run_command(line.split()) == 2
     said = capsys.readouterr().err
     assert named in said
     assert "simrun_file_" not in said
 
 
-def test_a_renderer_of_the_users_own_is_at_fault_in_a_run_as_a_policy_is(here: Path) -> None:
+def test_a_renderer_of_the_users_own_is_at_fault_in_a_run_as_a_policy_is(here):
     line = "--renderer parts.py:Channels --workers 1 --out run --set timing.duration_us=1000000"
     assert run_command([*line.split(), "smoke/straight"]) == 2
     assert run_command(["why", "run"]) == 0

@@ -25,9 +25,7 @@ def run_tests_of(file: Path) -> int:
 
 
 @pytest.mark.parametrize("kind", ["policy", "scenario", "renderer", "fixer", "metric"])
-def test_a_template_works_as_it_is_written(
-    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_template_works_as_it_is_written(kind, tmp_path, capsys):
     assert run_command(["new", kind, "my_own", "--folder", str(tmp_path), "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     main, test = (Path(name) for name in made["files"])
@@ -42,9 +40,7 @@ def test_a_template_works_as_it_is_written(
 
 
 @pytest.mark.parametrize("name", ["MyPolicy", "my-policy", "class", "../up", ""])
-def test_a_name_that_is_no_file_of_python_is_refused(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_is_no_file_of_python_is_refused(name, tmp_path, capsys):
     assert run_command(["new", "policy", name, "--folder", str(tmp_path)]) == 2
     assert "not a name of a Python file" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

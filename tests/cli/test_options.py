@@ -24,7 +24,7 @@ class Reached(Exception):
 
 
 @pytest.fixture
-def called(monkeypatch: pytest.MonkeyPatch) -> Any:
+def called(monkeypatch):
     """Give a function that puts something in a job's place and returns what it was called with."""
 
     def watch(module: Any, name: str, *words: str) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> Any:
     return watch
 
 
-def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> None:
+def test_a_run_gets_its_cluster_and_its_limit(called, tmp_path):
     words = ["--executor", "ray?cores=2&gpus=0.5&memory=7.5", "--time-limit", "90", "--no-report"]
     words += [
         "--shard",
@@ -59,8 +59,8 @@ def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> No
 
 
 def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    capsys,
+):
     assert (
         run_command(
             ["--renderer", "clean", "--executor", "local?cores=1", "--dry-run", "smoke/straight"]
@@ -70,7 +70,7 @@ def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
     assert "--executor local?cores=1" in capsys.readouterr().err
 
 
-def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path) -> None:
+def test_a_server_gets_its_bounds_and_whom_it_trusts(called, tmp_path):
     (tmp_path / "token").write_text(" secret \n")
     bounds = ("--history-mb", "16", "--shutter", "rolling")
     upstream = ("--upstream", f"host:1?ca=ca.pem&token_file={tmp_path / 'token'}&image=as-asked")
@@ -87,9 +87,7 @@ def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path
         ("serve", "--policy", "lane-camera"),
     ],
 )
-def test_callers_of_every_server_are_let_in_as_asked(
-    called: Any, tmp_path: Path, words: tuple[str, ...]
-) -> None:
+def test_callers_of_every_server_are_let_in_as_asked(called, tmp_path, words):
     files = (
         "--tls-cert",
         "cert.pem",
@@ -129,7 +127,7 @@ def call(function: Any, *words: str) -> Any:
     return app(list(words), standalone_mode=False)
 
 
-def test_a_dataclass_becomes_options_and_comes_back_whole() -> None:
+def test_a_dataclass_becomes_options_and_comes_back_whole():
     found = []
 
     def work(job: Job, as_json: Json = False) -> None:

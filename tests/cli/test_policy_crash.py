@@ -4,8 +4,6 @@ the check finds it.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command
@@ -31,21 +29,19 @@ class Late(ConstantVelocity):
 
 
 @pytest.fixture
-def late(tmp_path: Path) -> str:
+def late(tmp_path):
     path = tmp_path / "late.py"
     path.write_text(LATE)
     return f"{path}:Late"
 
 
-def test_the_check_drives_long_enough_to_find_a_policy_that_raises_after_a_while(late: str) -> None:
+def test_the_check_drives_long_enough_to_find_a_policy_that_raises_after_a_while(late):
     fault, *_ = check_policy(late).failures
     assert "in query 19: IndexError: list index out of range" in fault
     assert "late.py:16" in fault
 
 
-def test_the_terminal_has_file_line_and_the_end_of_the_traceback(
-    late: str, tmp_path: Path, capfd
-) -> None:
+def test_the_terminal_has_file_line_and_the_end_of_the_traceback(late, tmp_path, capfd):
     drive = [
         "--renderer",
         "clean",

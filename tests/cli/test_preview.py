@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,9 +28,7 @@ def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
 
 
 @pytest.mark.slow
-def test_a_preview_shows_the_ego_the_others_and_the_camera(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path, capsys):
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.png"
     assert run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out), "--json"]) == 0
@@ -44,9 +41,7 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(
     assert run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out)]) == 2
 
 
-def test_a_background_is_named_with_what_it_covers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_background_is_named_with_what_it_covers(tmp_path, capsys):
     n = 400
     means = np.stack([np.linspace(0.0, 40.0, n), np.full(n, -1.8), np.full(n, 0.2)], axis=1)
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))

@@ -15,7 +15,7 @@ from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
+def source(tmp_path):
     path = tmp_path / "in.mp4"
     with VideoWriter(path, Fraction(1001, 30000), Fraction(30000, 1001)) as video:
         for i in range(7):
@@ -23,9 +23,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_video_is_refined_and_the_summary_says_what_was_done(
-    source: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_is_refined_and_the_summary_says_what_was_done(source, capsys):
     out, side = source.with_name("out.mp4"), source.with_name("side.mp4")
     assert (
         run_command(
@@ -44,9 +42,7 @@ def test_a_video_is_refined_and_the_summary_says_what_was_done(
         assert (video.format.width, video.format.height) == (128, 36)
 
 
-def test_json_is_one_document_with_every_number(
-    source: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_one_document_with_every_number(source, capsys):
     command = [
         "refine",
         str(source),
@@ -79,9 +75,7 @@ def test_json_is_one_document_with_every_number(
         (["--fixer", "identity", "--opacity", "none.mp4"], "none.mp4"),
     ],
 )
-def test_bad_options_are_four_part_errors(
-    source: Path, options: list[str], mention: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_options_are_four_part_errors(source, options, mention, capsys):
     assert (
         run_command(["refine", str(source), "-o", str(source.with_name("out.mp4")), *options]) == 2
     )
@@ -100,9 +94,7 @@ def pictures(folder: Path, count: int = 3, height: int = 36, channels: int = 3) 
     return folder
 
 
-def test_folders_of_pictures_pass_without_a_codec(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_of_pictures_pass_without_a_codec(tmp_path, capsys):
     source, alpha = pictures(tmp_path / "in"), pictures(tmp_path / "alpha", channels=1)
     out, side = tmp_path / "out", tmp_path / "side"
     command = [
@@ -131,9 +123,7 @@ def test_folders_of_pictures_pass_without_a_codec(
     assert run_command([*command, "--overwrite"]) == 0
 
 
-def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path
-) -> None:
+def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(tmp_path, capsys, source):
     good = pictures(tmp_path / "good")
     mixed = pictures(tmp_path / "mixed")
     empty = tmp_path / "empty"
@@ -176,9 +166,7 @@ class Inverts:
 """
 
 
-def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_path, capsys):
     (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
     source, out = pictures(tmp_path / "in", count=5), tmp_path / "out"
     command = [

@@ -17,12 +17,12 @@ GOLDEN_SCENE = "synthetic-cut-in-a"
 
 
 @pytest.fixture(scope="module")
-def golden(request: pytest.FixtureRequest) -> Path:
+def golden(request):
     return request.getfixturevalue("shared_data") / "alpasim-golden"
 
 
 @pytest.fixture(scope="module")
-def our_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def our_run(tmp_path_factory):
     """A run of ours: one scene, one policy, two seeds, without pictures."""
     root = tmp_path_factory.mktemp("runs") / "own"
     command = [

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -15,7 +14,7 @@ from alpasim_plugin.cli.signals import Stopped, stoppable
 
 
 @pytest.fixture
-def nothing_ignored() -> Iterator[None]:
+def nothing_ignored():
     """Default handlers, also where the tests were started under nohup, which ignores SIGHUP."""
     before = {
         one: signal.signal(one, signal.SIG_DFL)
@@ -30,9 +29,7 @@ def nothing_ignored() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
-def test_a_signal_unwinds_the_block_and_names_the_exit_code(
-    number: signal.Signals, code: int
-) -> None:
+def test_a_signal_unwinds_the_block_and_names_the_exit_code(number, code):
     before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     unwound = False
     with pytest.raises(Stopped) as caught, stoppable():  # noqa: PT012 - the block is what is stopped
@@ -47,7 +44,7 @@ def test_a_signal_unwinds_the_block_and_names_the_exit_code(
     assert {one: signal.getsignal(one) for one in before} == before
 
 
-def test_a_signal_that_was_ignored_stays_ignored() -> None:
+def test_a_signal_that_was_ignored_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
     try:
         with stoppable():
@@ -56,7 +53,7 @@ def test_a_signal_that_was_ignored_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_second_signal_ends_a_process_that_hangs_while_it_unwinds() -> None:
+def test_a_second_signal_ends_a_process_that_hangs_while_it_unwinds():
     code = (
         "import os, signal\n"
         "from alpasim_plugin.cli.signals import stoppable\n"

@@ -15,9 +15,7 @@ LOOK = "import alpasim_plugin.cli, os; print(os.environ.get('GOMP_SPINCOUNT'))"
     ("given", "spins"),
     [({}, "10000"), ({"GOMP_SPINCOUNT": "5"}, "5"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")],
 )
-def test_short_spins_are_the_default_and_the_users_choice_stands(
-    given: dict[str, str], spins: str
-) -> None:
+def test_short_spins_are_the_default_and_the_users_choice_stands(given, spins):
     bare = {
         key: value
         for key, value in os.environ.items()

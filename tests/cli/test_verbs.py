@@ -43,7 +43,7 @@ def options_of(command: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("path", sorted(CORE), ids=" ".join)
-def test_every_verb_takes_json_and_debug_and_shows_an_example(path: tuple[str, ...]) -> None:
+def test_every_verb_takes_json_and_debug_and_shows_an_example(path):
     assert {"--json", "--debug"} <= set(options_of(CORE[path]))
     assert (
         f"simrun {' '.join(path)}" in (CORE[path].epilog or "")
@@ -52,7 +52,7 @@ def test_every_verb_takes_json_and_debug_and_shows_an_example(path: tuple[str, .
     )
 
 
-def test_the_core_has_few_verbs_and_options() -> None:
+def test_the_core_has_few_verbs_and_options():
     assert len(OWN) <= MOST_VERBS
     assert sum(len(options_of(command)) for command in CORE.values()) <= MOST_OPTIONS
 
@@ -68,7 +68,7 @@ def written(folder: str, ending: str) -> str:
 
 
 @pytest.mark.parametrize(("folder", "ending"), [("tests", ".py"), ("docs", ".md")])
-def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder: str, ending: str) -> None:
+def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder, ending):
     named = sorted({option for command in CORE.values() for option in options_of(command)})
     absent = [
         option
@@ -78,7 +78,7 @@ def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder: str, ending
     assert absent == []
 
 
-def test_a_listing_loads_no_numerical_library() -> None:
+def test_a_listing_loads_no_numerical_library():
     code = "import sys; from alpasim_plugin.cli.main import run_command; run_command(['--help']); print('numpy' in sys.modules)"
     assert (
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -87,7 +87,7 @@ def test_a_listing_loads_no_numerical_library() -> None:
     )
 
 
-def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels() -> None:
+def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels():
     """Its workers load what drives; while they are started, nothing else is to load here."""
     code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'torch', 'av'} & sys.modules.keys())"
     assert (

@@ -18,20 +18,18 @@ PLAN = Plan(
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     root = make_watched(tmp_path_factory.mktemp("run") / "run", PLAN)
     unfinished(root, ["rollouts/3dgs/lane-camera/urban-left_turn/0"])
     return root
 
 
 @pytest.fixture
-def run(made: Path, tmp_path: Path) -> Path:
+def run(made, tmp_path):
     return Path(shutil.copytree(made, tmp_path / "run"))
 
 
-def test_an_unfinished_run_is_shown_as_far_as_it_has_got(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unfinished_run_is_shown_as_far_as_it_has_got(run, capsys):
     assert run_command(["view", str(run), "--json"]) == 0
     printed = capsys.readouterr()
     facts = json.loads(printed.out)
@@ -42,9 +40,7 @@ def test_an_unfinished_run_is_shown_as_far_as_it_has_got(
     assert run_command(["view", str(run)]) == 0  # its own page is replaced
 
 
-def test_a_rollout_is_shown_beside_the_others_of_its_cell(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rollout_is_shown_beside_the_others_of_its_cell(run, tmp_path, capsys):
     folder, out = run / "rollouts/3dgs/lane-camera/smoke-straight/0", tmp_path / "one.html"
     assert run_command(["view", str(folder), "--out", str(out), "--max-mb", "8"]) == 0
     assert "1 of 1 cells" in capsys.readouterr().out
@@ -55,7 +51,7 @@ def test_a_rollout_is_shown_beside_the_others_of_its_cell(
     assert run_command(["view", str(folder), "--seed", "0"]) == 2
 
 
-def test_what_cannot_be_shown_is_refused(run: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_shown_is_refused(run, tmp_path):
     for arguments in (
         [str(tmp_path / "nowhere")],
         [str(tmp_path)],

@@ -42,7 +42,7 @@ def error_m(a: BicycleState, b: BicycleState) -> float:
     return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m)
 
 
-def test_error_against_the_exact_circle_falls_with_the_fourth_power_of_the_step() -> None:
+def test_error_against_the_exact_circle_falls_with_the_fourth_power_of_the_step():
     start = BicycleState(3.0, -2.0, 0.4, 20.0, 0.5)
     exact = exact_arc(start, -3.0, 4.0, VEHICLE.wheelbase_m)
     steps = [0.2, 0.1, 0.05, 0.025]
@@ -51,9 +51,7 @@ def test_error_against_the_exact_circle_falls_with_the_fourth_power_of_the_step(
     assert np.all((orders > 3.8) & (orders < 4.2)), (errors, orders)
 
 
-def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circle_for_a_minute() -> (
-    None
-):
+def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circle_for_a_minute():
     start = BicycleState(0.0, 0.0, 0.0, 5.0, VEHICLE.max_steer_rad)
     end = step(start, Command(VEHICLE.max_steer_rad), 60.0, VEHICLE)
     assert error_m(end, exact_arc(start, 0.0, 60.0, VEHICLE.wheelbase_m)) < 1e-4
@@ -67,9 +65,7 @@ def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circl
     drive=st.floats(-3, 3),
     seconds=st.floats(0.001, 2.0),
 )
-def test_any_held_command_matches_the_closed_solution(
-    speed: float, steer: float, yaw: float, drive: float, seconds: float
-) -> None:
+def test_any_held_command_matches_the_closed_solution(speed, steer, yaw, drive, seconds):
     start = BicycleState(1e5, -2e5, yaw, speed, steer)
     end = step(start, Command(steer, drive), seconds, VEHICLE)
     exact = exact_arc(start, drive, seconds, VEHICLE.wheelbase_m)
@@ -78,7 +74,7 @@ def test_any_held_command_matches_the_closed_solution(
     assert end.speed_mps == pytest.approx(exact.speed_mps, abs=1e-9)
 
 
-def test_turning_wheel_follows_the_integral_of_the_heading() -> None:
+def test_turning_wheel_follows_the_integral_of_the_heading():
     """With a steer that grows linearly, yaw is the integral of v tan(steer) / L = -v ln(cos(steer))
     / (L rate).
     """
@@ -92,7 +88,7 @@ def test_turning_wheel_follows_the_integral_of_the_heading() -> None:
     assert end.yaw_rad == pytest.approx(expected, abs=1e-9)
 
 
-def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_within_one() -> None:
+def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_within_one():
     """The command of every 50 ms is reached after a part of it, at another instant each time; the
     finest step is the truth.
     """
@@ -116,7 +112,7 @@ def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_w
     assert errors[2] < errors[1] / 20
 
 
-def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can() -> None:
+def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can():
     state, last = BicycleState(0.0, 0.0, 0.0, 8.0, -0.2), -0.2
     for _ in range(150):
         state = step(state, Command(5.0), 0.01, VEHICLE)
@@ -125,27 +121,27 @@ def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can() -> None:
     assert state.steer_rad == pytest.approx(VEHICLE.max_steer_rad)
 
 
-def test_standing_vehicle_stays_where_it_is_while_its_wheel_turns() -> None:
+def test_standing_vehicle_stays_where_it_is_while_its_wheel_turns():
     end = step(BicycleState(5.0, 6.0, 1.0, 0.0, 0.0), Command(0.6, 0.0, 3.0), 10.0, VEHICLE)
     assert (end.x_m, end.y_m, end.yaw_rad, end.speed_mps) == (5.0, 6.0, 1.0, 0.0)
     assert end.steer_rad == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("speed", [12.3, -4.56])
-def test_brake_ends_at_exactly_zero_speed_after_the_textbook_distance(speed: float) -> None:
+def test_brake_ends_at_exactly_zero_speed_after_the_textbook_distance(speed):
     end = step(BicycleState(0.0, 0.0, 0.0, speed, 0.0), Command(0.0, 0.0, 5.0), 10.0, VEHICLE)
     assert end.speed_mps == 0.0
     assert end.x_m == pytest.approx(math.copysign(speed**2 / 10.0, speed), abs=1e-9)
 
 
-def test_brake_holds_against_a_weaker_drive_and_yields_to_a_stronger_one() -> None:
+def test_brake_holds_against_a_weaker_drive_and_yields_to_a_stronger_one():
     standing = BicycleState(0.0, 0.0, 0.0, 0.0, 0.0)
     assert step(standing, Command(0.0, 1.0, 1.5), 3.0, VEHICLE).speed_mps == 0.0
     assert step(standing, Command(0.0, 2.0, 1.5), 3.0, VEHICLE).speed_mps == pytest.approx(1.5)
     assert step(standing, Command(0.0, -2.0, 1.5), 3.0, VEHICLE).speed_mps == pytest.approx(-1.5)
 
 
-def test_reversing_retraces_the_forward_path() -> None:
+def test_reversing_retraces_the_forward_path():
     start = BicycleState(0.0, 0.0, 0.3, 7.0, 0.4)
     there = step(start, Command(0.4), 5.0, VEHICLE)
     back = step(
@@ -154,7 +150,7 @@ def test_reversing_retraces_the_forward_path() -> None:
     assert error_m(back, start) < 1e-7
 
 
-def test_accelerations_are_cut_to_what_the_vehicle_can() -> None:
+def test_accelerations_are_cut_to_what_the_vehicle_can():
     start = BicycleState(0.0, 0.0, 0.0, 20.0, 0.0)
     assert step(start, Command(0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(
         20.0 + VEHICLE.max_accel_mps2
@@ -168,6 +164,6 @@ def test_accelerations_are_cut_to_what_the_vehicle_can() -> None:
     ("command", "seconds"),
     [(Command(math.nan), 0.1), (Command(0.0, math.inf), 0.1), (Command(0.0), -0.1)],
 )
-def test_senseless_input_is_refused(command: Command, seconds: float) -> None:
+def test_senseless_input_is_refused(command, seconds):
     with pytest.raises(InputError):
         step(BicycleState(0.0, 0.0, 0.0, 1.0, 0.0), command, seconds, VEHICLE)

@@ -5,8 +5,6 @@ missing.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,12 +36,12 @@ class NoCamera(Renderer):
 
 
 @pytest.fixture
-def codec() -> Codec:
+def codec():
     return open_codec(*load_map("example"))
 
 
 @pytest.fixture
-def wires(request: pytest.FixtureRequest) -> Iterator[tuple[can.BusABC, can.BusABC]]:
+def wires(request):
     """Two ends of a virtual bus."""
     address = Address.parse(f"test-{request.node.name}")
     with open_bus(address) as one, open_bus(address) as other:
@@ -71,13 +69,13 @@ NOTHING = quantities(BicycleState(0, 0, 0, 10.0, 0.0), 0.0, 0.0, np.zeros((0, 3)
 # --- frames
 
 
-def test_checksums_by_hand() -> None:
+def test_checksums_by_hand():
     # CRC-8 SAE J1850 of the text 123456789 is 4B in the published catalogue; here identifier 0x3231
     # is its first two bytes.
     assert checksum_of(0x3231, b"3456789\0", 7) == 0x4B
 
 
-def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> None:
+def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec):
     message = codec.message("EGO_MOTION")
     step = float(message.get_signal_by_name("SPEED").scale)
     for speed_kph in np.linspace(0.1, 120.0, 50):
@@ -87,7 +85,7 @@ def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> No
     assert message.decode(data)["SPEED"] < 1000.0
 
 
-def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path) -> None:
+def test_databases_that_do_not_fit_are_refused(shared_data, tmp_path):
     folder = shared_data / "opendbc"
     # The second has a pseudo message with an impossible identifier.
     for name in ("comma_body.dbc", "toyota_2017_ref_pt.dbc"):
@@ -105,7 +103,7 @@ def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path
 # --- commands
 
 
-def test_commands_that_answer_are_fresh(codec: Codec, wires: tuple[can.BusABC, can.BusABC]) -> None:
+def test_commands_that_answer_are_fresh(codec, wires):
     bus, unit = wires
     one = exchange(codec, bus)
     sent = open_codec(*load_map("example"))
@@ -118,9 +116,7 @@ def test_commands_that_answer_are_fresh(codec: Codec, wires: tuple[can.BusABC, c
     assert one.counts["lost"] == one.counts["malformed"] == 0
 
 
-def test_a_missing_command_is_held_and_then_the_brake_grows(
-    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
-) -> None:
+def test_a_missing_command_is_held_and_then_the_brake_grows(codec, wires):
     bus, unit = wires
     one = exchange(codec, bus)
     for frame in commands(open_codec(*load_map("example")), 5.0, 1.0):
@@ -137,9 +133,7 @@ def test_a_missing_command_is_held_and_then_the_brake_grows(
     assert one.counts["held"] == held
 
 
-def test_without_any_command_the_vehicle_brakes(
-    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
-) -> None:
+def test_without_any_command_the_vehicle_brakes(codec, wires):
     one = exchange(codec, wires[0])
     got = [one.step(t, NOTHING) for t in (0, 1_000_000, 3_000_000)]
     assert [(g.mark, round(g.accel_mps2, 6)) for g in got] == [
@@ -149,9 +143,7 @@ def test_without_any_command_the_vehicle_brakes(
     ]
 
 
-def test_every_fault_is_counted_by_cause(
-    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
-) -> None:
+def test_every_fault_is_counted_by_cause(codec, wires):
     bus, unit = wires
     one, other = exchange(codec, bus), open_codec(*load_map("example"))
     frames = [commands(other, 1.0, 0.5) for _ in range(6)]
@@ -182,7 +174,7 @@ def test_every_fault_is_counted_by_cause(
     assert (got.wheel_deg, got.accel_mps2) == (pytest.approx(1.0), pytest.approx(0.5))
 
 
-def test_a_frame_of_random_bytes_never_becomes_a_command(codec: Codec) -> None:
+def test_a_frame_of_random_bytes_never_becomes_a_command(codec):
     rng = np.random.Generator(np.random.Philox(7))
     accepted = 0
     for _ in range(2000):
@@ -200,7 +192,7 @@ def test_a_frame_of_random_bytes_never_becomes_a_command(codec: Codec) -> None:
 # --- driving
 
 
-def test_the_path_is_the_routes_cubic() -> None:
+def test_the_path_is_the_routes_cubic():
     x = np.linspace(0.0, 60.0, 40)
     y = 0.4 + 0.03 * x + 0.004 * x**2 / 2 - 1e-5 * x**3 / 6
     path = np.column_stack([x, y, np.zeros(40)])
@@ -210,7 +202,7 @@ def test_the_path_is_the_routes_cubic() -> None:
 
 
 @pytest.fixture
-def curve() -> Scenario:
+def curve():
     return load_scenario("smoke/curve", overrides=("timing.duration_us=4000000",))
 
 
@@ -231,7 +223,7 @@ def drive(scenario: Scenario, name: str) -> tuple[np.ndarray, dict]:
     return log, policy.facts()
 
 
-def test_a_control_unit_drives_a_curve_and_twice_the_same(curve: Scenario) -> None:
+def test_a_control_unit_drives_a_curve_and_twice_the_same(curve):
     log, facts = drive(curve, "test-drive-one")
     assert facts["frames"]["fresh"] == 400  # every 10 ms of 4 s
     assert set(facts["frames"]) == {"sent", "fresh", "lost"}
@@ -246,7 +238,7 @@ def test_a_control_unit_drives_a_curve_and_twice_the_same(curve: Scenario) -> No
     np.testing.assert_array_equal(log.ego.xyz, again.ego.xyz)
 
 
-def test_without_a_control_unit_the_ego_stops_and_the_facts_say_so() -> None:
+def test_without_a_control_unit_the_ego_stops_and_the_facts_say_so():
     scenario = load_scenario(
         "smoke/straight", overrides=("timing.duration_us=3000000", "timing.warmup_us=200000")
     )

@@ -64,8 +64,8 @@ def xy(states: list[EgoState]) -> npt.NDArray[np.float64]:
 
 @pytest.mark.parametrize("speed", first_of([1.0, 35.0, 3.0, 5.0, 10.0, 20.0], 2))
 def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
-    speed: float,
-) -> None:
+    speed,
+):
     t = np.arange(0, 40, 0.1)
     states = drive(plan_of(t, speed * t, 0, 0), at(y=0.5, speed=speed), max(6.0, 30.0 / speed))
     y = xy(states)[:, 1]
@@ -81,7 +81,7 @@ def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
     ("speed", "radius"),
     first_rows_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2),
 )
-def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
+def test_circle_is_held_to_a_centimetre(speed, radius):
     t = np.arange(0, 30, 0.1)
     a = speed * t / radius
     states = drive(
@@ -94,7 +94,7 @@ def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
 
 
 @pytest.mark.parametrize("speed", first_of([35.0, 5.0, 10.0, 20.0]))
-def test_lane_change_is_followed_within_ten_centimetres(speed: float) -> None:
+def test_lane_change_is_followed_within_ten_centimetres(speed):
     t = np.arange(0, 20, 0.1)
     x = speed * t
     u = np.clip((x - 10) / (4 * speed), 0, 1)
@@ -105,7 +105,7 @@ def test_lane_change_is_followed_within_ten_centimetres(speed: float) -> None:
     assert np.abs(went[:, 0] - speed * 0.1 * np.arange(len(went))).max() < 0.1
 
 
-def test_mirrored_plan_gives_the_mirrored_drive() -> None:
+def test_mirrored_plan_gives_the_mirrored_drive():
     t = np.arange(0, 10, 0.1)
     a = 8 * t / 15
     left = drive(plan_of(t, 15 * np.sin(a), 15 * (1 - np.cos(a)), a), at(speed=8.0), 5.0)
@@ -113,7 +113,7 @@ def test_mirrored_plan_gives_the_mirrored_drive() -> None:
     assert np.allclose(xy(left) * [1, -1], xy(right), atol=1e-9)
 
 
-def test_drive_does_not_depend_on_where_in_the_world_it_happens() -> None:
+def test_drive_does_not_depend_on_where_in_the_world_it_happens():
     t = np.arange(
         0, 10, 0.0937
     )  # the preview's nodes, 0.8 m apart, do not lie on the path's knots: there its direction has two values
@@ -128,7 +128,7 @@ def test_drive_does_not_depend_on_where_in_the_world_it_happens() -> None:
 
 
 @pytest.mark.parametrize("speed", [2.0, 10.0, 25.0])
-def test_noisy_plan_that_stops_is_left_standing_without_creeping_or_reversing(speed: float) -> None:
+def test_noisy_plan_that_stops_is_left_standing_without_creeping_or_reversing(speed):
     stop_s = speed / 3
     t = np.arange(0, stop_s + 8, 0.1)
     x = np.where(t < stop_s, speed * t - 1.5 * t * t, speed**2 / 6)
@@ -150,21 +150,21 @@ def test_noisy_plan_that_stops_is_left_standing_without_creeping_or_reversing(sp
     assert np.ptp([s.steer_rad for s in standing]) == 0.0, "the wheel does not hunt either"
 
 
-def test_short_plan_is_held_at_its_last_pose_so_the_car_brakes_and_stays() -> None:
+def test_short_plan_is_held_at_its_last_pose_so_the_car_brakes_and_stays():
     states = drive(plan_of([0.0, 0.1, 0.2, 0.5], [0, 1, 2, 5], 0, 0), at(speed=10.0), 6.0)
     assert states[-1].speed_mps == 0.0
     assert states[-1].T_world_rig[0, 3] < 10.0**2 / 2 / VEHICLE.max_brake_mps2 + 4.0
     assert abs(states[-1].T_world_rig[1, 3]) < 1e-6
 
 
-def test_standing_start_reaches_the_planned_acceleration_and_place() -> None:
+def test_standing_start_reaches_the_planned_acceleration_and_place():
     t = np.arange(0, 10, 0.1)
     states = drive(plan_of(t, t * t, 0, 0), at(), 5.0)
     assert states[-1].speed_mps == pytest.approx(10.0, abs=0.05)
     assert states[-1].T_world_rig[0, 3] == pytest.approx(25.0, abs=0.1)
 
 
-def test_plan_that_drives_backwards_is_reversed_along() -> None:
+def test_plan_that_drives_backwards_is_reversed_along():
     t = np.arange(0, 12, 0.1)
     a = 2 * t / 20
     states = drive(plan_of(t, -20 * np.sin(a), 20 * (1 - np.cos(a)), -a), at(), 6.0)
@@ -173,7 +173,7 @@ def test_plan_that_drives_backwards_is_reversed_along() -> None:
     assert np.abs(off).max() < 0.15
 
 
-def test_kinked_plan_is_rounded_within_the_limits_and_met_again() -> None:
+def test_kinked_plan_is_rounded_within_the_limits_and_met_again():
     t = np.arange(0, 10, 0.1)
     d = 8 * t
     x = np.where(d < 20, d, 20 + (d - 20) * np.cos(1.0))
@@ -186,7 +186,7 @@ def test_kinked_plan_is_rounded_within_the_limits_and_met_again() -> None:
     assert steps.max() <= VEHICLE.max_steer_rate_radps * 0.1 + 1e-9
 
 
-def test_plan_beside_a_fast_car_is_not_met_with_more_grip_than_tyres_have() -> None:
+def test_plan_beside_a_fast_car_is_not_met_with_more_grip_than_tyres_have():
     t = np.arange(0, 10, 0.1)
     states = drive(plan_of(t, 35 * t, 30.0, 0), at(speed=35.0), 4.0)
     assert max(abs(s.yaw_rate_radps * s.speed_mps) for s in states) <= MAX_LATERAL_MPS2 * 1.02
@@ -194,7 +194,7 @@ def test_plan_beside_a_fast_car_is_not_met_with_more_grip_than_tyres_have() -> N
 
 @settings(deadline=None, max_examples=examples(40))
 @given(data=st.data())
-def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data: st.DataObject) -> None:
+def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data):
     n = data.draw(st.integers(1, 12))
     coordinate = st.floats(-60, 60)
     x, y, yaw = (data.draw(st.lists(coordinate, min_size=n, max_size=n)) for _ in range(3))
@@ -214,7 +214,7 @@ def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data: st.DataO
         )
 
 
-def test_advancing_twice_from_the_same_state_gives_the_same_and_leaves_the_input_alone() -> None:
+def test_advancing_twice_from_the_same_state_gives_the_same_and_leaves_the_input_alone():
     t = np.arange(0, 5, 0.1)
     plan, state = plan_of(t, 9 * t, 0.1 * t, 0.01), at(y=0.2, speed=9.0)
     before = state.T_world_rig.copy()
@@ -226,7 +226,7 @@ def test_advancing_twice_from_the_same_state_gives_the_same_and_leaves_the_input
     assert np.array_equal(before, state.T_world_rig)
 
 
-def test_no_plan_brakes_gently_to_a_stop() -> None:
+def test_no_plan_brakes_gently_to_a_stop():
     states = [at(speed=6.0, steer=0.1)]
     for _ in range(40):
         states.append(TRACKER.advance(states[-1], None, states[-1].t_us + 100_000))
@@ -235,12 +235,12 @@ def test_no_plan_brakes_gently_to_a_stop() -> None:
 
 
 @pytest.mark.parametrize("name", ["bicycle", "perfect"])
-def test_time_that_does_not_advance_is_refused(name: str) -> None:
+def test_time_that_does_not_advance_is_refused(name):
     with pytest.raises(InputError, match="not later"):
         make_controller(name, VEHICLE).advance(at(), plan_of([0.0], [0.0], 0, 0), 0)
 
 
-def test_perfect_controller_stands_on_the_plan_and_holds_its_last_pose() -> None:
+def test_perfect_controller_stands_on_the_plan_and_holds_its_last_pose():
     perfect = make_controller("perfect", VEHICLE)
     t = np.arange(0, 2.01, 0.1)
     a = 5 * t / 10

@@ -43,9 +43,7 @@ def full(fd: int) -> None:
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_full_disk_leaves_the_old_file_and_no_litter(
-    write: Callable[[Path, int], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_the_old_file_and_no_litter(write, tmp_path, monkeypatch):
     path = tmp_path / "out"
     write(path, 1)
     before = path.read_bytes()
@@ -62,7 +60,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_litter(
     assert path.read_bytes() != before
 
 
-def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_what_is_read(tmp_path):
     for name, write in WRITERS.items():
         write(tmp_path / name, 3)
     assert (tmp_path / "bytes").read_bytes() == b"\3\3\3\3"
@@ -72,7 +70,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert load_file(tmp_path / "safetensors")["n"].tolist() == [3, 3, 3, 3]
 
 
-def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path: Path) -> None:
+def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"run": 1})
     code = (
@@ -87,7 +85,7 @@ def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), KeyboardInterrupt()])
-def test_a_block_that_raises_leaves_the_old_file(error: BaseException, tmp_path: Path) -> None:
+def test_a_block_that_raises_leaves_the_old_file(error, tmp_path):
     path = tmp_path / "a.txt"
     write_text(path, "old")
     with pytest.raises(type(error)), atomic_file(path) as partial:  # noqa: PT012 - the block is what fails
@@ -97,7 +95,7 @@ def test_a_block_that_raises_leaves_the_old_file(error: BaseException, tmp_path:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_a_block_that_fails_leaves_the_old_folder(tmp_path: Path) -> None:
+def test_a_block_that_fails_leaves_the_old_folder(tmp_path):
     folder = tmp_path / "deep" / "a"
     with atomic_folder(folder, "writing") as partial:
         (partial / "x").write_text("old")
@@ -115,9 +113,7 @@ def test_a_block_that_fails_leaves_the_old_folder(tmp_path: Path) -> None:
     assert [path.name for path in folder.parent.iterdir()] == ["a"]
 
 
-def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path, monkeypatch):
     folder = tmp_path / "a"
     folder.mkdir()
     (folder / "x").write_text("old")
@@ -136,22 +132,20 @@ def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(
 
 
 @pytest.mark.parametrize("name", ["array", "safetensors"])
-def test_a_missing_folder_is_named_with_advice(name: str, tmp_path: Path) -> None:
+def test_a_missing_folder_is_named_with_advice(name, tmp_path):
     with pytest.raises(InfrastructureError, match="No such file or directory") as caught:
         WRITERS[name](tmp_path / "absent" / "a", 1)
     assert "exists" in caught.value.hint
 
 
-def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
+def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path):
     write_bytes(tmp_path / "new" / "a", b"x")
     with pytest.raises(InfrastructureError, match="writable, or name another"):
         write_bytes(tmp_path / "new" / "a" / "b", b"x")
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_read_only_folder_is_an_error_with_four_parts(
-    write: Callable[[Path, int], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_read_only_folder_is_an_error_with_four_parts(write, tmp_path, monkeypatch):
     def refuse(self: Path, *rest: object, **more: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 

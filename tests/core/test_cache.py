@@ -16,7 +16,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -28,8 +28,8 @@ def read(folder: Path) -> str:
     return text
 
 
-def test_is_made_at_the_first_call_and_read_at_the_second(own_cache: Path) -> None:
-    made: list[Path] = []
+def test_is_made_at_the_first_call_and_read_at_the_second(own_cache):
+    made = []
 
     def make(folder: Path) -> None:
         made.append(folder)
@@ -41,9 +41,7 @@ def test_is_made_at_the_first_call_and_read_at_the_second(own_cache: Path) -> No
     assert sorted(p.name for p in (own_cache / "texts").iterdir()) == ["k", "k.lock"]
 
 
-def test_damaged_folder_is_made_again_with_a_warning(
-    own_cache: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_folder_is_made_again_with_a_warning(own_cache, capfd):
     def make(folder: Path) -> None:
         (folder / "text").write_text("good 2")
 
@@ -57,7 +55,7 @@ def test_damaged_folder_is_made_again_with_a_warning(
     assert "making it again" in said
 
 
-def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_cache: Path) -> None:
+def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_cache):
     def fails(folder: Path) -> None:
         (folder / "text").write_text("good but unfinished")
         raise RuntimeError("fell over")
@@ -77,16 +75,14 @@ def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_c
     )  # type: ignore[misc]
 
 
-def test_folder_that_cannot_be_written_names_the_variable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folder_that_cannot_be_written_names_the_variable(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(InfrastructureError, match="SIMRUN_CACHE"):
         cached("texts", "k", lambda folder: None, read, "a text")
 
 
-def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache: Path) -> None:
+def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache):
     script = textwrap.dedent(
         """
         import sys, time

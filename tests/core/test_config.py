@@ -58,7 +58,7 @@ def error_of(tmp_path: Path, text: str, model: type[BaseModel] = Car) -> InputEr
     return e.value
 
 
-def test_numbers_and_words_follow_yaml_1_2(tmp_path: Path) -> None:
+def test_numbers_and_words_follow_yaml_1_2(tmp_path):
     data = load_yaml(
         write(
             tmp_path,
@@ -79,7 +79,7 @@ def test_numbers_and_words_follow_yaml_1_2(tmp_path: Path) -> None:
     }
 
 
-def test_every_key_knows_its_line_and_column(tmp_path: Path) -> None:
+def test_every_key_knows_its_line_and_column(tmp_path):
     document = load_yaml(write(tmp_path, "a: 1\nb:\n  - c: 2\n    d: 3\n"))
     assert (document.mark(("b", 0, "d")).line, document.mark(("b", 0, "d")).column) == (4, 5)
     assert document.mark(("b", 0, "missing")).line == 3
@@ -101,9 +101,7 @@ def test_every_key_knows_its_line_and_column(tmp_path: Path) -> None:
         ("a: 1\n---\nb: 2\n", ":2:", "not valid YAML"),
     ],
 )
-def test_bad_yaml_is_refused_where_it_stands(
-    tmp_path: Path, text: str, where: str, found: str
-) -> None:
+def test_bad_yaml_is_refused_where_it_stands(tmp_path, text, where, found):
     path = write(tmp_path, text)
     with pytest.raises(InputError) as e:
         load_yaml(path)
@@ -112,12 +110,12 @@ def test_bad_yaml_is_refused_where_it_stands(
     assert e.value.hint
 
 
-def test_object_tags_are_never_constructed(tmp_path: Path) -> None:
+def test_object_tags_are_never_constructed(tmp_path):
     with pytest.raises(InputError, match="tag"):
         load_yaml(write(tmp_path, "a: !!python/name:os.system x\n"))
 
 
-def test_alias_bomb_is_stopped(tmp_path: Path) -> None:
+def test_alias_bomb_is_stopped(tmp_path):
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
     with pytest.raises(InputError, match="once aliases are expanded"):
@@ -128,13 +126,13 @@ def test_alias_bomb_is_stopped(tmp_path: Path) -> None:
     "levels", [60, 900, 5_000]
 )  # 5000: the compiled parser's own bound, where it has one, is met first
 @pytest.mark.parametrize(("before", "after"), [("[", "]"), ("{a: ", "}"), ("- ", "")])
-def test_deep_nesting_is_stopped(tmp_path: Path, before: str, after: str, levels: int) -> None:
+def test_deep_nesting_is_stopped(tmp_path, before, after, levels):
     with pytest.raises(InputError, match="nested deeper") as caught:
         load_yaml(write(tmp_path, before * levels + after * levels))
     assert "flatten the file" in caught.value.hint
 
 
-def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
+def test_missing_folder_and_binary_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_yaml(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="a folder, not a file"):
@@ -144,7 +142,7 @@ def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
         load_yaml(tmp_path / "b.yaml")
 
 
-def test_extends_merges_first_to_last_and_keeps_positions(tmp_path: Path) -> None:
+def test_extends_merges_first_to_last_and_keeps_positions(tmp_path):
     write(tmp_path, "version: 1\nlength_m: 3\nsize_m: [1, 2]\n", "one.yaml")
     write(tmp_path, "length_m: 4\ndoors: 2\n", "two.yaml")
     document = load_yaml(write(tmp_path, "extends: [one.yaml, two.yaml]\nsize_m: [5, 6]\n"))
@@ -154,7 +152,7 @@ def test_extends_merges_first_to_last_and_keeps_positions(tmp_path: Path) -> Non
     assert document.mark(("version",)).line == 1
 
 
-def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path: Path) -> None:
+def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path):
     write(tmp_path, "extends: a.yaml\n", "b.yaml")
     with pytest.raises(InputError, match="through extends"):
         load_yaml(write(tmp_path, "extends: [b.yaml]\n"))
@@ -191,16 +189,14 @@ def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path: Path) -> None:
         ("", "", "the file = None", "object"),
     ],
 )
-def test_wrong_content_is_named_with_position_and_hint(
-    tmp_path: Path, text: str, line: str, found: str, hint: str
-) -> None:
+def test_wrong_content_is_named_with_position_and_hint(tmp_path, text, line, found, hint):
     e = error_of(tmp_path, text)
     assert line in e.message
     assert found in e.message
     assert hint in e.hint
 
 
-def test_tagged_unions_name_the_nearest_kind_and_the_keys_of_that_kind(tmp_path: Path) -> None:
+def test_tagged_unions_name_the_nearest_kind_and_the_keys_of_that_kind(tmp_path):
     e = error_of(tmp_path, "parts:\n  - {kind: wheeel, radius_m: 1}\n", Tagged)
     assert "parts[0].kind is 'wheeel'" in e.message
     assert "did you mean 'wheel'?" in e.hint
@@ -213,7 +209,7 @@ def test_tagged_unions_name_the_nearest_kind_and_the_keys_of_that_kind(tmp_path:
     assert "wheel" in e.hint
 
 
-def test_overrides_set_values_by_key_index_and_id(tmp_path: Path) -> None:
+def test_overrides_set_values_by_key_index_and_id(tmp_path):
     document = load_yaml(
         write(tmp_path, "a: {b: 1}\nc:\n  - {id: lead, v: 1}\n  - {id: rear, v: 2}\n")
     )
@@ -239,7 +235,7 @@ def test_overrides_set_values_by_key_index_and_id(tmp_path: Path) -> None:
         ("a=[1", "not valid YAML"),
     ],
 )
-def test_bad_overrides_are_refused(tmp_path: Path, text: str, found: str) -> None:
+def test_bad_overrides_are_refused(tmp_path, text, found):
     document = load_yaml(write(tmp_path, "length_m: 3\nc: [{id: lead}]\n"))
     with pytest.raises(InputError) as e:
         apply_overrides(document, [text])
@@ -249,7 +245,7 @@ def test_bad_overrides_are_refused(tmp_path: Path, text: str, found: str) -> Non
 
 @settings(deadline=None, max_examples=examples(80))
 @given(st.text(max_size=60))
-def test_any_text_gives_data_or_a_clear_error(text: str) -> None:
+def test_any_text_gives_data_or_a_clear_error(text):
     error = None
     try:
         parse(text, "text")

@@ -19,7 +19,7 @@ from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.core.types import Rates
 
 
-def test_clock_ticks_in_whole_periods_and_marks_the_last() -> None:
+def test_clock_ticks_in_whole_periods_and_marks_the_last():
     ticks = list(Clock(7, 1_000_007, Rates(100_000, 200_000, 500_000)).ticks())
     assert [t.t_us for t in ticks] == [7 + 100_000 * i for i in range(11)]
     assert [t.step for t in ticks if t.camera_due] == [0, 2, 4, 6, 8, 10]
@@ -30,12 +30,12 @@ def test_clock_ticks_in_whole_periods_and_marks_the_last() -> None:
 @pytest.mark.parametrize(
     "rates", [Rates(0), Rates(100_000, 150_000), Rates(100_000, 100_000, 50_000), Rates(-1)]
 )
-def test_periods_that_are_no_multiple_are_refused(rates: Rates) -> None:
+def test_periods_that_are_no_multiple_are_refused(rates):
     with pytest.raises(InputError, match=r"multiple of rates\.control_us"):
         Clock(0, 1_000_000, rates)
 
 
-def test_streams_depend_on_their_key_alone() -> None:
+def test_streams_depend_on_their_key_alone():
     first = stream("scene", 3, "policy", 7).normal(size=4)
     stream("other", 3, "policy", 7).normal(size=100)
     np.testing.assert_array_equal(first, stream("scene", 3, "policy", 7).normal(size=4))
@@ -48,7 +48,7 @@ def test_streams_depend_on_their_key_alone() -> None:
         assert not np.array_equal(first, stream(*other).normal(size=4))
 
 
-def test_streams_are_the_same_on_every_platform() -> None:
+def test_streams_are_the_same_on_every_platform():
     assert derive_seed("scene", 0, "policy", 0) == 0x3CB2424955DFCEC0
     np.testing.assert_allclose(
         stream("scene", 0, "policy").random(2), [0.54300724, 0.97485974], atol=1e-8
@@ -56,12 +56,12 @@ def test_streams_are_the_same_on_every_platform() -> None:
 
 
 @given(st.text(max_size=8), st.text(max_size=8))
-def test_fields_of_a_key_cannot_run_into_each_other(a: str, b: str) -> None:
+def test_fields_of_a_key_cannot_run_into_each_other(a, b):
     if "\x1f" not in a + b and b:
         assert derive_seed(a + b, 0, "c") != derive_seed(a, 0, b + "c")
 
 
-def test_exit_codes_tell_the_cause() -> None:
+def test_exit_codes_tell_the_cause():
     assert [
         e.exit_code
         for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)

@@ -31,7 +31,7 @@ SHORT = ("--set", "timing.duration_us=1000000", "--set", "timing.warmup_us=20000
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     root = tmp_path_factory.mktemp("finished") / "run"
     parts = ["--renderer", ",".join(RENDERERS), "--policy", ",".join(POLICIES)]
     how = ["--images", "none", "--workers", "1", "--quiet", "--out", str(root)]
@@ -58,7 +58,7 @@ class Listener:
 
 
 @pytest.fixture
-def listener() -> Iterator[Listener]:
+def listener():
     one = Listener()
     yield one
     one.socket.close()
@@ -196,13 +196,13 @@ CASES: dict[str, tuple[bool, Change]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_nothing_in_a_run_folder_runs_and_reading_writes_nothing(
-    case: str,
-    finished: Path,
-    listener: Listener,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+    case,
+    finished,
+    listener,
+    tmp_path,
+    monkeypatch,
+    capfd,
+):
     folder = tmp_path / "stranger"
     folder.mkdir()
     is_all, change = CASES[case]

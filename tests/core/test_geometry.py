@@ -37,7 +37,7 @@ unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(
 
 @settings(deadline=None)
 @given(unit_quats)
-def test_rotation_matrix_agrees_with_scipy_and_survives_the_way_back(quat: np.ndarray) -> None:
+def test_rotation_matrix_agrees_with_scipy_and_survives_the_way_back(quat):
     matrix = matrix_from_quat(quat)
     np.testing.assert_allclose(
         matrix, Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), atol=1e-12
@@ -48,21 +48,21 @@ def test_rotation_matrix_agrees_with_scipy_and_survives_the_way_back(quat: np.nd
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_half_turn_about_each_axis_has_a_stable_quaternion(axis: int) -> None:
+def test_half_turn_about_each_axis_has_a_stable_quaternion(axis):
     quat = np.zeros(4)
     quat[1 + axis] = 1.0
     back = quat_from_matrix(matrix_from_quat(quat))
     np.testing.assert_allclose(np.abs(back), np.abs(quat), atol=1e-15)
 
 
-def test_heading_of_180_degrees_wraps_to_the_lower_end() -> None:
+def test_heading_of_180_degrees_wraps_to_the_lower_end():
     assert float(wrap_angle(np.pi)) == -np.pi
     np.testing.assert_allclose(yaw_from_quat(quat_from_yaw(np.array([3.0, -3.0]))), [3.0, -3.0])
 
 
 @settings(deadline=None, max_examples=examples(50))
 @given(unit_quats, unit_quats, st.floats(0, 1))
-def test_slerp_agrees_with_scipy(q0: np.ndarray, q1: np.ndarray, fraction: float) -> None:
+def test_slerp_agrees_with_scipy(q0, q1, fraction):
     ours = slerp(q0[None], q1[None], np.array([fraction]))[0]
     if abs(q0 @ q1) < 1e-6:
         return  # opposite rotations: the shorter arc is not unique
@@ -72,7 +72,7 @@ def test_slerp_agrees_with_scipy(q0: np.ndarray, q1: np.ndarray, fraction: float
     assert abs(abs(ours @ theirs) - 1) < 1e-9
 
 
-def test_interpolation_at_epoch_microseconds_keeps_every_microsecond() -> None:
+def test_interpolation_at_epoch_microseconds_keeps_every_microsecond():
     line = Trajectory(
         EPOCH_US + np.array([0, 100_000]),
         np.array([[0.0, 0, 0], [1.0, 0, 0]]),
@@ -82,26 +82,26 @@ def test_interpolation_at_epoch_microseconds_keeps_every_microsecond() -> None:
         assert interpolate(line, EPOCH_US + dt)[0, 3] == pytest.approx(dt / 100_000, abs=1e-15)
 
 
-def test_interpolation_outside_the_trajectory_is_refused() -> None:
+def test_interpolation_outside_the_trajectory_is_refused():
     line = Trajectory(np.array([0, 10]), np.zeros((2, 3)), quat_from_yaw(np.zeros(2)))
     with pytest.raises(InputError, match=r"covers 0\.\.10 us"):
         interpolate(line, 11)
 
 
-def test_offset_trajectory_turns_the_offset_with_the_body() -> None:
+def test_offset_trajectory_turns_the_offset_with_the_body():
     left_turn = trajectory_from_poses([0, 1], [se2(0, 0, 0), se2(0, 0, np.pi / 2)])
     moved = offset_trajectory(left_turn, se2(2.0, 0.0, 0.0))
     np.testing.assert_allclose(moved.xyz, [[2, 0, 0], [0, 2, 0]], atol=1e-12)
 
 
-def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends() -> None:
+def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends():
     line = np.array([[0.0, 0, 0], [10.0, 0, 0]])
     assert project(line, np.array([4.0, 1.5])) == (4.0, 1.5)
     assert project(line, np.array([4.0, -1.5])) == (4.0, -1.5)
     assert project(line, np.array([13.0, 4.0])) == (10.0, 5.0)
 
 
-def test_one_quaternion_is_that_of_many_to_the_last_bit() -> None:
+def test_one_quaternion_is_that_of_many_to_the_last_bit():
     random = np.random.default_rng(0)
     turned = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()  # 180 degrees about each axis
     noisy = Rotation.random(200, random_state=1).as_matrix() * (

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -56,7 +55,7 @@ BASE = "from policies.simple import ConstantVelocity as Base\n"
 
 
 @pytest.fixture
-def hostile(tmp_path: Path) -> Path:
+def hostile(tmp_path):
     """Give a folder in which everything that is imported or loaded leaves its name in ``ran``."""
     tmp_path = tmp_path / "work"
     tmp_path.mkdir()
@@ -123,9 +122,7 @@ MORE = (
 
 @pytest.mark.slow  # `test_ways_to_run_code` tries the same folder in a few seconds
 @pytest.mark.parametrize("commands", [QUICK, MORE], ids=["quick", "more"])
-def test_no_command_runs_what_lies_in_the_working_directory(
-    hostile: Path, commands: Sequence[list[str]]
-) -> None:
+def test_no_command_runs_what_lies_in_the_working_directory(hostile, commands):
     first = simrun(hostile, *DRIVE, "--workers", "2", "--out", "one", "smoke/straight")
     assert first.returncode == 0, first.stderr
     assert ran(hostile) == ""
@@ -147,8 +144,8 @@ NAMES = (
 @pytest.mark.parametrize("name", first_of(NAMES))
 @pytest.mark.slow
 def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(
-    hostile: Path, name: str
-) -> None:
+    hostile, name
+):
     (hostile / "my_policy.py").write_text(POLICY)
     (hostile / "with_me.py").write_text(BASE)
     inner = hostile / "pack" / "inner"
@@ -177,7 +174,7 @@ def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also
     assert ran(hostile) == ""
 
 
-def test_only_what_a_named_file_imports_can_be_imported_beside_it(tmp_path: Path) -> None:
+def test_only_what_a_named_file_imports_can_be_imported_beside_it(tmp_path):
     (tmp_path / "asks.py").write_text("import beside_asks\nfound = beside_asks.found\n")
     (tmp_path / "beside_asks.py").write_text("found = 3\n")
     (tmp_path / "not_asked.py").write_text("")
@@ -188,7 +185,7 @@ def test_only_what_a_named_file_imports_can_be_imported_beside_it(tmp_path: Path
         __import__("not_asked")
 
 
-def test_a_file_never_stands_in_for_an_installed_module(tmp_path: Path) -> None:
+def test_a_file_never_stands_in_for_an_installed_module(tmp_path):
     (tmp_path / "calls.py").write_text("import shapely\nfound = shapely.__version__\n")
     (tmp_path / "shapely.py").write_text("import numexpr_of_nobody\n")
     (tmp_path / "numexpr_of_nobody.py").write_text("")
@@ -198,8 +195,8 @@ def test_a_file_never_stands_in_for_an_installed_module(tmp_path: Path) -> None:
 
 
 def test_a_worker_on_a_cluster_has_no_working_directory_on_its_path_unless_the_user_put_it_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path])
     monkeypatch.setenv(SAFE_PATH, OURS)

@@ -59,7 +59,7 @@ def by_equations(spec: CameraSpec, ray: F64) -> F64:
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE, FTHETA, BACKWARD])
-def test_the_ray_of_a_pixel_is_shown_at_that_pixel(lens: LensModel) -> None:
+def test_the_ray_of_a_pixel_is_shown_at_that_pixel(lens):
     spec = camera(lens)
     rays = rays_of(spec)
     pixel = np.stack(np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5), axis=-1).reshape(-1, 2)
@@ -72,7 +72,7 @@ def test_the_ray_of_a_pixel_is_shown_at_that_pixel(lens: LensModel) -> None:
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE, FTHETA, BACKWARD])
-def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens: LensModel) -> None:
+def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
     spec = camera(lens)
     sides = sides_of(spec)
     frames = []
@@ -105,6 +105,6 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens: LensModel
     ],
     ids=["fisheye", "ftheta", "backward", "opencv", "falls", "none", "many", "nan", "wide"],
 )
-def test_a_lens_that_cannot_be_drawn_whole_is_refused(lens: LensModel) -> None:
+def test_a_lens_that_cannot_be_drawn_whole_is_refused(lens):
     with pytest.raises(InputError):
         check_lens(camera(lens))

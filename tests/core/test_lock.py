@@ -33,7 +33,7 @@ def holder(path: Path, seconds: float, repo: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path: Path, repo: Path) -> None:
+def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path, repo):
     path = tmp_path / "new" / ".lock"
     first = holder(path, 60.0, repo)
     assert is_locked(path)

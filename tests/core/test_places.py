@@ -33,7 +33,7 @@ print(kept, places.kernels(), kept.is_dir() and oct(kept.stat().st_mode & 0o777)
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def home(tmp_path, monkeypatch):
     for name in VARIABLES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -52,8 +52,8 @@ def chosen_by_nobody(home: Path, **variables: str) -> list[str]:
 
 
 def test_a_named_cache_goes_before_the_standard_folders_and_those_before_the_home(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    home, monkeypatch
+):
     assert places.cache() == home / ".cache" / "simrun"
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "xdg"))
     assert places.cache() == home / "xdg" / "simrun"
@@ -62,7 +62,7 @@ def test_a_named_cache_goes_before_the_standard_folders_and_those_before_the_hom
 
 
 @as_root
-def test_without_a_writable_home_a_private_folder_is_made_and_goes_with_the_process() -> None:
+def test_without_a_writable_home_a_private_folder_is_made_and_goes_with_the_process():
     with shared_folder() as temporary:
         kept, kernels, mode = chosen_by_nobody(Path("/nonexistent"), TMPDIR=str(temporary))
         assert Path(kept).parent == temporary
@@ -72,7 +72,7 @@ def test_without_a_writable_home_a_private_folder_is_made_and_goes_with_the_proc
 
 
 @as_root
-def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache() -> None:
+def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache():
     with shared_folder() as own:
         os.chown(own, NOBODY, NOBODY)
         own.chmod(0o700)
@@ -82,9 +82,7 @@ def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache() -> None:
         assert chosen[1] == f"{kept}/numba", "a named folder that cannot be written"
 
 
-def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(home, monkeypatch):
     def refuse(prefix: str) -> str:
         raise FileNotFoundError
 
@@ -114,7 +112,7 @@ except SimrunError as error:
 """
 
 
-def test_compiled_kernels_that_are_damaged_are_no_fault_of_a_part(tmp_path: Path) -> None:
+def test_compiled_kernels_that_are_damaged_are_no_fault_of_a_part(tmp_path):
     script, kept = tmp_path / "uses.py", tmp_path / "kept"
     script.write_text(USES_A_KERNEL.format(repo=str(REPO)))
     kept.mkdir()

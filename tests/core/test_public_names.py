@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import simrun
 
 
-def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:
+def test_every_public_name_is_there_and_has_one_home(repo):
     listed = {name for names in simrun.HOMES.values() for name in names}
     assert listed | {"__version__"} == set(simrun.__all__)
     code = "import sys, simrun; [getattr(simrun, n) for n in ('Plan', 'InputError', 'plan_times')]; print({'torch', 'numba'} & {*sys.modules})"

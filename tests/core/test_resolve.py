@@ -14,7 +14,7 @@ from alpasim_plugin.core.parts.spec import KINDS
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> None:
+def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind):
     for name, text in names(kind).items():  # type: ignore[arg-type]
         behind = {"/": "127.0.0.1:1", ":": "sh serve.sh"}.get(name[-1], "")
         spec = resolve(kind, name + behind)  # type: ignore[arg-type]
@@ -25,7 +25,7 @@ def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> Non
         assert "\n" not in text
 
 
-def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Path) -> None:
+def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path):
     file = tmp_path / "own.py"
     file.write_text(
         "class Shows:\n    def render(self, request): ...\n"
@@ -36,14 +36,14 @@ def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Pat
     assert str(resolve_renderer(f"{file}:Fixes+{file}:Shows")) == f"{file}:Fixes+{file}:Shows"
 
 
-def test_a_module_that_raises_is_told_with_what_it_raised(tmp_path: Path) -> None:
+def test_a_module_that_raises_is_told_with_what_it_raised(tmp_path):
     file = tmp_path / "raises.py"
     file.write_text("raise RuntimeError('no licence')\n")
     with pytest.raises(InputError, match="RuntimeError: no licence"):
         resolve("policy", f"{file}:Mine")
 
 
-def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
+def test_the_digest_follows_imports_wherever_they_stand(tmp_path):
     package = tmp_path / "pack"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -63,7 +63,7 @@ def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
     assert code_digest(part) != before
 
 
-def test_an_installed_part_does_not_reach_other_distributions(tmp_path: Path) -> None:
+def test_an_installed_part_does_not_reach_other_distributions(tmp_path):
     site = tmp_path / "site-packages"
     site.mkdir()
     (site / "mine.py").write_text("import theirs\nimport alpasim_plugin.core.types\n")
@@ -72,7 +72,7 @@ def test_an_installed_part_does_not_reach_other_distributions(tmp_path: Path) ->
     assert found == {"mine.py"}
 
 
-def test_optional_members_get_their_defaults_and_required_ones_are_named() -> None:
+def test_optional_members_get_their_defaults_and_required_ones_are_named():
     class Bare:
         def render(self, request: object) -> object:
             return request
@@ -89,7 +89,7 @@ def test_optional_members_get_their_defaults_and_required_ones_are_named() -> No
         complete(Bare(), Fixer)
 
 
-def test_a_fixer_without_preview_previews_on_a_copy_of_itself() -> None:
+def test_a_fixer_without_preview_previews_on_a_copy_of_itself():
     class Counts:
         blocks = BlockRule(2, 2)
         seen = 0
@@ -107,7 +107,7 @@ def test_a_fixer_without_preview_previews_on_a_copy_of_itself() -> None:
     assert fixer.step([1, 2], []) == [2, 2]
 
 
-def test_a_module_edited_after_its_import_is_refused(tmp_path: Path) -> None:
+def test_a_module_edited_after_its_import_is_refused(tmp_path):
     file = tmp_path / "edited.py"
     file.write_text("class Mine:\n    controller = 'perfect'\n")
     assert resolve("policy", f"{file}:Mine").controller == "perfect"
@@ -118,8 +118,8 @@ def test_a_module_edited_after_its_import_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     home = "policies/simple.py"
     digest = resolve("policy", "policies:ConstantVelocity").digest
     whole = spec.code_digest
@@ -131,7 +131,7 @@ def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
     assert resolve("policy", "policies:ConstantVelocity").digest != digest
 
 
-def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
+def test_settings_in_brackets_make_another_arm_of_one_fixer():
     plain, without = (
         resolve_renderer("identity"),
         resolve_renderer("identity[references=0,tolerance_m=0.5]+clean"),
@@ -147,6 +147,6 @@ def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
 @pytest.mark.parametrize(
     "name", ["clean[a=1]", "identity[]", "identity[a]", "identity[a=1", "identity[a=1][b=2]"]
 )
-def test_brackets_without_settings_are_refused(name: str) -> None:
+def test_brackets_without_settings_are_refused(name):
     with pytest.raises(InputError, match="bracket"):
         resolve_renderer(name)

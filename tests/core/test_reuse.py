@@ -38,7 +38,7 @@ SHORT = (*QUICK, "--set", "timing.duration_us=1200000")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     (tmp_path / "parts_of_a_user.py").write_text(PARTS)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -61,9 +61,7 @@ def made(folder: Path, renderer: str, *more: str) -> int:
     return next(folder.glob("run/rollouts/*/*/*/0/rollout.asl")).stat().st_mtime_ns
 
 
-def test_a_remote_part_is_never_reused_unasked(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_remote_part_is_never_reused_unasked(folder, capsys):
     first, second = made(folder, "Remote"), made(folder, "Remote")
     assert second != first
     assert made(folder, "Remote", "--resume") == second
@@ -82,9 +80,7 @@ def test_a_remote_part_is_never_reused_unasked(
     assert plan["never_reused"] == ["renderer parts_of_a_user.py:Remote"]
 
 
-def test_a_factory_that_asks_for_something_else_is_told_what_there_is(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_factory_that_asks_for_something_else_is_told_what_there_is(folder, capsys):
     assert (
         run_command(
             [

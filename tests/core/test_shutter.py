@@ -56,9 +56,7 @@ FAST = asked(se2(0, 0, 0), se2(0.6, 0, 0.05))
     ("along", "back"), [("rows", False), ("rows", True), ("columns", False), ("columns", True)]
 )
 @pytest.mark.parametrize("count", [1, 5, HEIGHT, 3 * WIDTH])
-def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(
-    along: Along, back: bool, count: int
-) -> None:
+def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(along, back, count):
     request = asked(se2(0, 0, 0), se2(0.6, 0, 0.05), along=along, back=back)
     times, seen = np.full((HEIGHT, WIDTH), np.nan), np.zeros((HEIGHT, WIDTH), int)
     for band in bands_of(request, count):
@@ -69,7 +67,7 @@ def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(
     assert np.abs(times - request.exposure.share).max() <= 0.5 / count + 1e-6
 
 
-def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask() -> None:
+def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask():
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     share = np.clip(v / HEIGHT + 0.2 * np.abs(u - 32) / 32, 0, 1).astype(np.float32)
     share[:, :5] = np.nan
@@ -82,7 +80,7 @@ def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask(
     np.testing.assert_array_equal(whole, expected)
 
 
-def test_a_car_that_stands_on_an_empty_road_needs_one_band_and_a_turning_one_many() -> None:
+def test_a_car_that_stands_on_an_empty_road_needs_one_band_and_a_turning_one_many():
     still = se2(3, 1, 0.4)
     assert len(bands(asked(still, still))) == 1
     slow, fast = (len(bands(asked(still, still @ se2(0.3, 0, turn)))) for turn in (0.0, 0.03))
@@ -91,27 +89,27 @@ def test_a_car_that_stands_on_an_empty_road_needs_one_band_and_a_turning_one_man
     assert len(bands(replace(FAST, exposure=None))) == 1
 
 
-def test_a_passing_car_needs_bands_and_one_behind_the_camera_none() -> None:
+def test_a_passing_car_needs_bands_and_one_behind_the_camera_none():
     still = se2(0, 0, 0)
     ahead, behind = ((se2(x, 2, 0, 0.8), se2(x + 0.6, 2, 0, 0.8)) for x in (8.0, -20.0))
     assert len(bands(asked(still, still, {"car": ahead}))) > 5
     assert len(bands(asked(still, still, {"car": behind}))) == 1
 
 
-def test_motion_is_what_a_near_point_moves_by() -> None:
+def test_motion_is_what_a_near_point_moves_by():
     request = asked(se2(0, 0, 0), se2(0, 0, 0.01))
     assert motion_px(request) == pytest.approx(400 * 0.01, rel=0.1)
     assert motion_px(asked(se2(0, 0, 0), se2(0, 0.3, 0))) == pytest.approx(400 * 0.3 / 8, rel=0.1)
 
 
-def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn() -> None:
+def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn():
     start, end = se2(2, 0, 0.2), se2(4, 8, 0.2 + 0.9 * np.pi)
     middle = between(np.stack([start]), np.stack([end]), 0.25)[0]
     np.testing.assert_allclose(middle, se2(2.5, 2, 0.2 + 0.225 * np.pi), atol=1e-12)
     np.testing.assert_array_equal(between(np.stack([start]), np.stack([end]), 1.0)[0], end)
 
 
-def test_road_users_are_where_they_are_at_the_time_of_the_band() -> None:
+def test_road_users_are_where_they_are_at_the_time_of_the_band():
     request = asked(
         se2(0, 0, 0),
         se2(1, 0, 0),

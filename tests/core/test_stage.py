@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from alpasim_plugin.core.stage import announce, shown_in, stages_in
 
 
-def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path: Path) -> None:
+def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path):
     announce("nobody asked", 1, 2)
     with shown_in(tmp_path / "stages"):
         announce("fitting a", 3, 10)

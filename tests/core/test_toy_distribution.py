@@ -95,7 +95,7 @@ class Installed:
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+def installed(tmp_path_factory):
     """Install the toy with pip from a wheel; no index is needed, and the libraries are those of
     this environment.
     """
@@ -138,15 +138,15 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(python, Path(found.stdout.strip()), work)
 
 
-def test_parts_of_a_package_are_listed(installed: Installed) -> None:
+def test_parts_of_a_package_are_listed(installed):
     listed = {kind: installed.simrun("list", kind) for kind in ("renderers", "metrics")}
     assert {"toy-grey", "toy://"} <= set(listed["renderers"])
     assert "toy_wobble_m" in listed["metrics"]
 
 
 def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(
-    installed: Installed,
-) -> None:
+    installed,
+):
     anew = installed.drive("run", *NAMED, workers=2)
     assert len(anew) == 4
     assert all(anew.values())
@@ -164,8 +164,8 @@ def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(
 
 
 def test_parts_named_by_import_path_are_driven_again_where_they_were_edited(
-    installed: Installed,
-) -> None:
+    installed,
+):
     installed.edit(
         "simrun_toy-1.0.dist-info/entry_points.txt", "toy-wobble = toy_parts:Wobble\n", ""
     )  # or the metric is given twice
@@ -197,7 +197,7 @@ def edit_and_drive_again(installed: Installed, out: str, *parts: str) -> None:
 @pytest.mark.parametrize(
     "name", ["policies.mine:Straight", "policies/mine.py:Straight"], ids=["module", "file"]
 )
-def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) -> None:
+def test_an_edited_policy_file_is_driven_again(installed, name):
     mine = installed.work / "policies"
     mine.mkdir(exist_ok=True)
     (mine / "helper.py").write_text("SPEED_MPS = 3.0\n")
@@ -214,7 +214,7 @@ def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) 
     assert all(installed.drive(out, *parts).values()), "the policy imports a file that was edited"
 
 
-def test_folders_named_like_ours_do_not_shadow_them(installed: Installed) -> None:
+def test_folders_named_like_ours_do_not_shadow_them(installed):
     for name in ("policies", "evaluators", "scenarios", "configs"):
         (installed.work / name).mkdir(exist_ok=True)
         (installed.work / name / "__init__.py").write_text(

@@ -250,7 +250,7 @@ WAYS: dict[str, Way] = {
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     assert (
         run_command(
@@ -284,9 +284,7 @@ ALL_AT_ONCE = [
         *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in WAYS),
     ],
 )
-def test_nothing_of_a_strangers_folder_runs(
-    names: tuple[str, ...], finished: Path, tmp_path: Path
-) -> None:
+def test_nothing_of_a_strangers_folder_runs(names, finished, tmp_path):
     folder = tmp_path / "stranger"
     folder.mkdir()
     subprocess.run(["cp", "-r", str(finished), str(folder / "run")], check=True)
@@ -304,7 +302,7 @@ def test_nothing_of_a_strangers_folder_runs(
     )
 
 
-def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
+def test_the_baits_work_where_they_are_run(tmp_path):
     bait = Bait(tmp_path / "x", "bait")
     exec(bait.python)
     subprocess.run(bait.shell, shell=True, check=True)
@@ -322,7 +320,7 @@ def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
         "\u202eevil",
     ],
 )
-def test_text_of_a_stranger_stays_text(text: str) -> None:
+def test_text_of_a_stranger_stays_text(text):
     from alpasim_plugin.core.errors import InputError
     from alpasim_plugin.core.escape import markdown, terminal
 

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import venv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +65,13 @@ def not_understood(some: Sequence[Command]) -> list[str]:
     return refused
 
 
-def test_every_command_of_the_pages_is_understood() -> None:
+def test_every_command_of_the_pages_is_understood():
     assert not_understood(COMMANDS) == []
     assert len(COMMANDS) > 50
     assert len(RUN) > 20
 
 
-def test_every_verb_is_on_a_page() -> None:
+def test_every_verb_is_on_a_page():
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages(REPO))
     own = [verb for group in PANELS.values() for verb in group]
     assert [verb for verb in own if not re.search(rf"simrun {verb}\b", text)] == []
@@ -96,7 +96,7 @@ def needing_the_checkout(some: Sequence[Path]) -> list[str]:
     return needs
 
 
-def test_commands_do_not_need_the_checkout_nor_an_index() -> None:
+def test_commands_do_not_need_the_checkout_nor_an_index():
     """But for the two that set it up, and the records of experiments, which say where they were
     run.
     """
@@ -107,7 +107,7 @@ def test_commands_do_not_need_the_checkout_nor_an_index() -> None:
 
 
 @pytest.fixture(scope="module")
-def simrun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def simrun(tmp_path_factory):
     """Build the wheel and give the command that it installs, in an environment whose libraries are
     those of the tests.
     """
@@ -146,7 +146,7 @@ def simrun(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def empty(tmp_path_factory):
     """Give a folder that is empty but for what the pages call the reader's own."""
     folder = tmp_path_factory.mktemp("elsewhere")
     parts = (REPO / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -221,9 +221,7 @@ def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedPr
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("command", RUN, ids=str)
-def test_the_command_works_from_an_empty_folder_with_the_wheel(
-    simrun: Path, empty: Path, command: Command
-) -> None:
+def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun, empty, command):
     words = shortened(command.words)
     if command.words[0] in ("fork", "compare", "report", "score", "view", "export"):
         prepare(simrun, empty, words)
@@ -253,7 +251,7 @@ def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
         assert made.returncode == 0, made.stderr[-3000:]
 
 
-def test_other_commands_of_the_pages_are_those_of_a_checkout_or_of_pip_or_the_wizard() -> None:
+def test_other_commands_of_the_pages_are_those_of_a_checkout_or_of_pip_or_the_wizard():
     # test_bridge.py runs the wizard
     known = (
         "tests",

@@ -25,7 +25,7 @@ SHORT = ("--set", "timing.duration_us=1200000")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     (tmp_path / "my_parts.py").write_text("\n".join(blocks))
     (tmp_path / "drive.csv").write_text("\n".join(f"{100_000 * i},{0.5 * i},0" for i in range(26)))
@@ -69,9 +69,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
     ids=["renderer and fixer", "policy, controller and metric", "source"],
 )
-def test_parts_of_the_page_drive(
-    folder: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_of_the_page_drive(folder, words, capsys):
     assert run_command([*words, "--out", "run", *REST]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["summary"]["failures"]["n_failed"] == 0

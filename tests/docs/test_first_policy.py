@@ -16,9 +16,7 @@ INSIDE = " " * 8
 
 
 @pytest.mark.slow
-def test_every_step_of_the_page_does_what_it_says(
-    repo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_step_of_the_page_does_what_it_says(repo, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (repo / "docs" / "first-policy.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```(bash|python)\n(.*?)^```", text, re.S | re.M)

@@ -33,7 +33,7 @@ def workflow() -> tuple[list[str], list[str]]:
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def work(tmp_path_factory):
     """Drive every policy as the page does, and store two baselines."""
     folder = tmp_path_factory.mktemp("ci")
     (folder / "gate.yaml").write_text(gate_file())
@@ -62,9 +62,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (NOISY, "log-replay", 3),
     ],
 )
-def test_the_page_s_gate_decides_as_common_sense_does(
-    work: Path, monkeypatch: pytest.MonkeyPatch, policy: str, baseline: str, code: int
-) -> None:
+def test_the_page_s_gate_decides_as_common_sense_does(work, monkeypatch, policy, baseline, code):
     monkeypatch.chdir(work)
     _, gate = workflow()
     change = {"runs/change": f"runs/{policy}", "baseline.json": f"{baseline}.json"}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -40,19 +38,19 @@ RECORD = """
 
 
 @pytest.fixture
-def headline(repo: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def headline(repo, monkeypatch):
     monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
     return importlib.import_module("headline")
 
 
-def test_readme_and_results_say_what_the_record_says(headline: ModuleType) -> None:
+def test_readme_and_results_say_what_the_record_says(headline):
     pages = headline.written(headline.read_record(headline.RECORD.read_text(encoding="utf-8")))
     assert {path.name for path in pages} == {"README.md", "index.md"}
     for path, text in pages.items():
         assert path.read_text(encoding="utf-8") == text, "run python docs/scripts/headline.py"
 
 
-def test_the_sentence_has_the_numbers_of_the_policy(headline: ModuleType) -> None:
+def test_the_sentence_has_the_numbers_of_the_policy(headline):
     text = headline.sentence(headline.read_record(RECORD)).replace("\n", " ")
     assert "12 rollouts of the policy `learned`, 19.8 s each" in text
     assert "two frozen test sets, 3 families, 2 seeds" in text
@@ -60,8 +58,8 @@ def test_the_sentence_has_the_numbers_of_the_policy(headline: ModuleType) -> Non
 
 
 def test_the_interval_over_families_is_t_on_the_sums_of_their_residuals(
-    headline: ModuleType,
-) -> None:
+    headline,
+):
     record = headline.read_record(RECORD)
     # -1, -4 and 0 of 4 rollouts: mean -5/12, residuals 2/3, -7/3 and 5/3, t of 2 degrees 4.3027
     half = 100 * 4.3027 * np.sqrt(3 / 2 * (4 / 9 + 49 / 9 + 25 / 9)) / 12
@@ -74,6 +72,6 @@ def test_the_interval_over_families_is_t_on_the_sums_of_their_residuals(
 @pytest.mark.parametrize(
     "text", ["no tables", RECORD.replace("19.8 s each.", ""), RECORD.replace("learned", "other")]
 )
-def test_a_record_without_what_is_claimed_is_refused(headline: ModuleType, text: str) -> None:
+def test_a_record_without_what_is_claimed_is_refused(headline, text):
     with pytest.raises(AssertionError):
         headline.read_record(text)

@@ -46,7 +46,7 @@ def local_links(page: Path) -> list[tuple[Path, str]]:
 
 
 @pytest.fixture
-def pages(repo: Path) -> list[Path]:
+def pages(repo):
     """Return README, CHANGELOG and every page of docs/ but the laboratory's."""
     return [repo / "CHANGELOG.md", *commands.pages(repo)]
 
@@ -67,11 +67,11 @@ def broken_links(repo: Path, pages: list[Path], to_lab: bool) -> list[str]:
     return broken
 
 
-def test_links_resolve(repo: Path, pages: list[Path]) -> None:
+def test_links_resolve(repo, pages):
     assert broken_links(repo, pages, to_lab=False) == []
 
 
-def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: list[Path]) -> None:
+def test_pages_of_the_docs_that_code_and_pages_name_exist(repo, pages):
     folders = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "tests", "docs")
     code = [
         path
@@ -107,7 +107,7 @@ def reachable(docs: Path) -> set[Path]:
     return seen
 
 
-def test_every_page_is_reachable_from_the_index(repo: Path) -> None:
+def test_every_page_is_reachable_from_the_index(repo):
     assert [
         page.name for page in sorted({*commands.pages(repo)[1:]} - reachable(repo / "docs"))
     ] == []
@@ -123,7 +123,7 @@ def unshown(folder: Path, pages: list[Path]) -> list[str]:
     ]
 
 
-def test_every_picture_is_shown(repo: Path, pages: list[Path]) -> None:
+def test_every_picture_is_shown(repo, pages):
     assert unshown(repo / "docs" / "img", pages) == []
 
 
@@ -149,7 +149,7 @@ def files_not_there(repo: Path, pages: list[Path]) -> list[str]:
     return missing
 
 
-def test_files_that_pages_name_exist(repo: Path, pages: list[Path]) -> None:
+def test_files_that_pages_name_exist(repo, pages):
     assert [line for line in files_not_there(repo, pages) if not OF_LAB.search(line)] == []
 
 
@@ -179,5 +179,5 @@ def imports_of_nothing(repo: Path, pages: list[Path]) -> list[str]:
     return missing
 
 
-def test_python_examples_parse_and_import_what_exists(repo: Path, pages: list[Path]) -> None:
+def test_python_examples_parse_and_import_what_exists(repo, pages):
     assert [line for line in imports_of_nothing(repo, pages) if not OF_LAB.search(line)] == []

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
-
-import pytest
 
 
-def test_the_tables_on_the_pages_are_those_of_the_code(
-    repo: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_tables_on_the_pages_are_those_of_the_code(repo, monkeypatch):
     monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
     pages = importlib.import_module("reference_tables").written()
     assert {path.name for path in pages} == {"cli.md", "metrics.md", "scenario-files.md"}

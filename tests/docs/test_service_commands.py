@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.commands import SHORT, Command, commands, pages
+from tests.docs.commands import SHORT, commands, pages
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = ("docs/alpasim.md", "docs/policies.md", "docs/renderers.md")
@@ -84,7 +84,7 @@ def control_unit(address: str, unit: str) -> Iterator[None]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Give a folder with one scene, `scenes/curve.yaml`, of 1.2 s."""
     (tmp_path / "scenes").mkdir()
     text = (REPO / "scenarios" / "smoke" / "curve.yaml").read_text(encoding="utf-8")
@@ -97,9 +97,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
-def test_the_command_works_beside_what_it_needs(
-    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_works_beside_what_it_needs(folder, command, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     line = " ".join(command.words)
     words = [

@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -17,7 +16,7 @@ from docs.scripts.site import on_page_markdown
 from tests.docs.test_pages import LINK, without_code
 
 
-def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo: Path) -> None:
+def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo):
     text = on_page_markdown("", SimpleNamespace(file=SimpleNamespace(src_uri="index.md")))
     assert text.startswith("# simrun")
     links = [link for link in LINK.findall(without_code(text)) if not re.match(r"[a-z]+:", link)]
@@ -27,7 +26,7 @@ def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", ["report.md", "no-such-page.md", "report.md#no-such-heading"])
-def test_a_dead_link_fails_the_strict_build(repo: Path, tmp_path: Path, link: str) -> None:
+def test_a_dead_link_fails_the_strict_build(repo, tmp_path, link):
     pytest.importorskip("material", reason="needs mkdocs-material")
     for name in ("docs", "README.md", "mkdocs.yml"):
         copy = shutil.copytree if (repo / name).is_dir() else shutil.copy

@@ -4,7 +4,6 @@ takes no time.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,25 +27,25 @@ def at_once(
 
 
 @pytest.fixture
-def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick_fit(monkeypatch):
     """Leave the fit out."""
     monkeypatch.setattr(build, "fitted", at_once)
 
 
 @pytest.fixture(scope="session")
-def kitti_street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kitti_street(tmp_path_factory):
     """Return the street as a KITTI folder, not to be changed."""
     return write_kitti(tmp_path_factory.mktemp("kitti") / "street")
 
 
 @pytest.fixture(scope="session")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def walk(tmp_path_factory):
     """Return the street as a ``transforms.json`` in metres, not to be changed."""
     return write_transforms(tmp_path_factory.mktemp("walk") / "walk", unit="m")
 
 
 @pytest.fixture(scope="session")
-def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def imported(tmp_path_factory):
     """Return an imported KITTI-like drive: 24 photographs with poses and one without, a right
     camera.
     """

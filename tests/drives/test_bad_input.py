@@ -146,8 +146,8 @@ def many_pictures_without_poses(folder: Path) -> None:
     ],
 )
 def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
-    tmp_path: Path, kitti_street: Path, change: Change, quick_fit: None
-) -> None:
+    tmp_path, kitti_street, change, quick_fit
+):
     folder = Path(shutil.copytree(kitti_street, tmp_path / "street"))
     change(folder)
     before = sorted(path.name for path in tmp_path.iterdir())
@@ -156,7 +156,7 @@ def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_axes_that_both_fit_are_asked_for(tmp_path: Path, quick_fit: None) -> None:
+def test_axes_that_both_fit_are_asked_for(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk", say_axes=False)
     blank = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     for path in (folder / "images").iterdir():
@@ -166,7 +166,7 @@ def test_axes_that_both_fit_are_asked_for(tmp_path: Path, quick_fit: None) -> No
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_colmap_model_that_is_cut_off_is_named(tmp_path: Path, name: str) -> None:
+def test_a_colmap_model_that_is_cut_off_is_named(tmp_path, name):
     folder = write_colmap(tmp_path / "a", True)
     path = folder / f"sparse/0/{name}.bin"
     path.write_bytes(path.read_bytes()[:-5])
@@ -174,7 +174,7 @@ def test_a_colmap_model_that_is_cut_off_is_named(tmp_path: Path, name: str) -> N
         import_drive(folder, tmp_path / "out")
 
 
-def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path: Path, walk: Path) -> None:
+def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path, walk):
     folder = Path(shutil.copytree(walk, tmp_path / "walk"))
     document = json.loads((folder / "transforms.json").read_text())
     document["frames"] = [frame for _ in range(30) for frame in document["frames"]]

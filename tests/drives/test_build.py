@@ -26,8 +26,8 @@ pytestmark = pytest.mark.slow
 
 
 def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
-    imported: Path,
-) -> None:
+    imported,
+):
     scenario = load_scenario(imported / "scenario.yaml")
     assert scenario.source == "drive"
     assert scenario.model == str(imported / "model")
@@ -43,7 +43,7 @@ def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
     assert any("the last was dropped (000024.png)" in note for note in scenario.notes)
 
 
-def test_the_wheels_stand_on_the_road_that_bows(imported: Path) -> None:
+def test_the_wheels_stand_on_the_road_that_bows(imported):
     scenario = load_scenario(imported / "scenario.yaml")
     street, x = Street(), np.arange(4.0, 16.0)
     found = height_at(scenario.ground, np.column_stack([x, np.zeros(len(x))]))
@@ -57,9 +57,7 @@ def test_the_wheels_stand_on_the_road_that_bows(imported: Path) -> None:
     assert np.linalg.norm(np.diff(ego, axis=0), axis=1) == pytest.approx(STEP_M, abs=0.02)
 
 
-def test_the_same_command_again_gives_the_same_and_another_import_is_refused(
-    imported: Path, tmp_path: Path
-) -> None:
+def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imported, tmp_path):
     source = imported.parent / "street"
     assert import_drive(source, imported) == json.loads((imported / "quality.json").read_text())
     with pytest.raises(InputError):
@@ -70,9 +68,7 @@ def test_the_same_command_again_gives_the_same_and_another_import_is_refused(
 
 
 @pytest.mark.slow
-def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_fit: None
-) -> None:
+def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path, monkeypatch, quick_fit):
     source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
 
     def stop(*given: object) -> None:
@@ -89,9 +85,7 @@ def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(
 
 
 @pytest.mark.slow
-def test_scale_without_metres_comes_from_the_cameras_height(
-    tmp_path: Path, quick_fit: None
-) -> None:
+def test_scale_without_metres_comes_from_the_cameras_height(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk")
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -104,9 +98,7 @@ def test_scale_without_metres_comes_from_the_cameras_height(
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.03)
 
 
-def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
-    walk: Path, tmp_path: Path
-) -> None:
+def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(walk, tmp_path):
     drive = read_source(walk)
     placed = place(
         replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -116,9 +108,7 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
     assert any("photographs taken along a road" in note for note in placed.notes)
 
 
-def test_the_command_tells_what_it_found(
-    tmp_path: Path, quick_fit: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
     folder = write_transforms(tmp_path / "walk", axes="opengl", say_axes=False, unit="m")
     command = [
         "import",
@@ -145,9 +135,7 @@ XODR = """<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/><ro
 
 
 @pytest.mark.slow
-def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(
-    tmp_path: Path, quick_fit: None
-) -> None:
+def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk", unit="m")
     (tmp_path / "here.xodr").write_text(XODR.format(x=-10, y=1.75))
     (tmp_path / "away.xodr").write_text(XODR.format(x=-10, y=501.75))
@@ -180,9 +168,7 @@ def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(
     )
 
 
-def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(
-    imported: Path, tmp_path: Path
-) -> None:
+def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(imported, tmp_path):
     from scenarios.usdz import read_usdz
     from scenarios.usdz_write import write_usdz
 
@@ -195,9 +181,7 @@ def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(
     assert len(scene.actors) == len(scenario.actors)
 
 
-def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(
-    imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(imported, tmp_path, capsys):
     scenario = str(imported / "scenario.yaml")
     short = [
         "--set",

@@ -34,7 +34,7 @@ def points_on(xy: np.ndarray, lift: np.ndarray | float = 0.0, spread_m: float = 
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.02, 300.0])
-def test_it_follows_a_crest_in_any_unit(unit: float) -> None:
+def test_it_follows_a_crest_in_any_unit(unit):
     xy = stream("ground", 0, "road").uniform([0, -3], [60, 3], (1500, 2))
     scale = np.diag([unit, unit, unit, 1.0])
     strip = fit_ground(points_on(xy).moved(scale), unit * path())
@@ -43,7 +43,7 @@ def test_it_follows_a_crest_in_any_unit(unit: float) -> None:
     assert np.abs(strip.z(unit * wheels) / unit - road(*wheels.T)).max() < 0.03
 
 
-def test_what_stands_on_it_does_not_lift_it() -> None:
+def test_what_stands_on_it_does_not_lift_it():
     rng = stream("ground", 0, "cars")
     xy = rng.uniform([0, -1.4], [60, 1.4], (400, 2))
     cars = rng.uniform([0, -2.2], [60, 2.2], (500, 2))
@@ -52,7 +52,7 @@ def test_what_stands_on_it_does_not_lift_it() -> None:
     assert np.abs(strip.z(wheels) - road(*wheels.T)).max() < 0.05
 
 
-def test_few_points_under_the_path_are_helped_by_those_beside_it() -> None:
+def test_few_points_under_the_path_are_helped_by_those_beside_it():
     rng = stream("ground", 0, "few")
     under, beside = (
         rng.uniform([0, -1.4], [60, 1.4], (20, 2)),
@@ -62,7 +62,7 @@ def test_few_points_under_the_path_are_helped_by_those_beside_it() -> None:
     assert strip.height == pytest.approx(HEIGHT_M, abs=0.1)
 
 
-def test_too_few_points_are_no_ground() -> None:
+def test_too_few_points_are_no_ground():
     assert (
         fit_ground(
             points_on(stream("ground", 0, "none").uniform([0, -1], [60, 1], (12, 2))), path()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ def points_at(xyz: np.ndarray, spread_m: float) -> Points:
     )
 
 
-def test_a_parked_car_stands_where_it_is_seen() -> None:
+def test_a_parked_car_stands_where_it_is_seen():
     body = surface(LOW, HIGH, 4000)
     found = standing_obstacles(
         cloud_at(body), points_at(body[::20], 0.05), flat(), straight(), Vehicle()
@@ -68,7 +67,7 @@ def test_a_parked_car_stands_where_it_is_seen() -> None:
     assert [one.uncertainty_m for one in found] == pytest.approx([0.11] * len(found), abs=0.01)
 
 
-def test_dark_doors_leave_no_hole_to_drive_into_and_what_stands_behind_is_apart() -> None:
+def test_dark_doors_leave_no_hole_to_drive_into_and_what_stands_behind_is_apart():
     body = surface(LOW, HIGH, 4000)
     doors = (body[:, 0] > 13.7) & (body[:, 0] < 14.7) & (body[:, 1] < 3.0)
     hedge = surface(np.array([8.0, 5.2, 0.0]), np.array([20.0, 5.6, 1.2]), 4000)
@@ -87,7 +86,7 @@ def test_dark_doors_leave_no_hole_to_drive_into_and_what_stands_behind_is_apart(
         assert min(near) == pytest.approx(LOW[1], abs=0.3)
 
 
-def test_the_driven_path_is_free_and_what_was_opaque_there_is_counted() -> None:
+def test_the_driven_path_is_free_and_what_was_opaque_there_is_counted():
     body = surface(LOW - np.array([0, 2.5, 0]), HIGH - np.array([0, 2.5, 0]), 4000)  # in the way
     found = standing_obstacles(cloud_at(body), points_at(body, 0.05), flat(), straight(), Vehicle())
     assert found.cleared > 50
@@ -101,9 +100,7 @@ def test_the_driven_path_is_free_and_what_was_opaque_there_is_counted() -> None:
     ("size_m", "opacity", "lift_m"),
     [(0.06, 0.1, 0.0), (1.0, 0.9, 0.0), (0.06, 0.9, 3.0), (0.06, 0.9, -1.4)],
 )
-def test_haze_background_and_what_is_too_high_or_low_do_not_stand(
-    size_m: float, opacity: float, lift_m: float
-) -> None:
+def test_haze_background_and_what_is_too_high_or_low_do_not_stand(size_m, opacity, lift_m):
     body = surface(LOW, HIGH, 3000) + np.array([0, 0, lift_m])
     assert (
         standing_obstacles(
@@ -115,8 +112,8 @@ def test_haze_background_and_what_is_too_high_or_low_do_not_stand(
 
 @pytest.mark.slow
 def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_not_looked_for(
-    imported: Path,
-) -> None:
+    imported,
+):
     from evaluators.metrics.collision import evaluate_collision
     from evaluators.metrics.presets import preset
     from tests.drives.rollouts import rollout_along

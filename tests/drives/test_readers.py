@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,20 +41,20 @@ def assert_is_the_street(placed: PlacedDrive, rel: float = 0.03) -> None:
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])
 @pytest.mark.slow
-def test_transforms_of_both_conventions(tmp_path: Path, axes: str) -> None:
+def test_transforms_of_both_conventions(tmp_path, axes):
     drive, placed = opened(write_transforms(tmp_path / "a", axes=axes))
     assert drive.metric is None
     assert_is_the_street(placed)
 
 
-def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path: Path) -> None:
+def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path):
     for axes in ("opencv", "opengl"):
         drive, _ = opened(write_transforms(tmp_path / axes, axes=axes, say_axes=False))
         assert any(f"axes recognised as {axes}" in note for note in drive.notes)
 
 
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
-def test_a_colmap_model(tmp_path: Path, binary: bool) -> None:
+def test_a_colmap_model(tmp_path, binary):
     drive, placed = opened(write_colmap(tmp_path / "a", binary))
     assert (drive.kind, len(drive.pictures)) == ("colmap", COUNT)
     assert_is_the_street(placed)
@@ -69,9 +68,7 @@ def test_a_colmap_model(tmp_path: Path, binary: bool) -> None:
         ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0)),
     ],
 )
-def test_photographs_are_freed_of_every_lens(
-    tmp_path: Path, model: str, bend: tuple[float, ...]
-) -> None:
+def test_photographs_are_freed_of_every_lens(tmp_path, model, bend):
     drive = read_source(write_colmap(tmp_path / "a", True, model, bend))
     plain = read_source(write_colmap(tmp_path / "b", True))
     bent, straight = drive.pictures[5], plain.pictures[5]
@@ -93,7 +90,7 @@ def test_photographs_are_freed_of_every_lens(
     assert np.abs(straight.rgb()[inner].astype(float) - bent.rgb()[inner]).mean() > 2 * off
 
 
-def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:
+def test_the_facts_of_a_real_street(data_set):
     folder = data_set("kitti-street")
     drive = checked(read_source(folder), folder)
     assert (len(drive.of("left")), len(drive.of("right"))) == (51, 51)
@@ -101,7 +98,7 @@ def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:
     assert across[:3, 3] == pytest.approx([0.5372, 0.0, 0.0], abs=1e-4)
 
 
-def test_times_put_photographs_in_order(tmp_path: Path) -> None:
+def test_times_put_photographs_in_order(tmp_path):
     folder = write_transforms(tmp_path / "a", unit="m")
     document = json.loads((folder / "transforms.json").read_text())
     for i, frame in enumerate(document["frames"]):

@@ -72,7 +72,7 @@ def assert_drives(out: Path) -> None:
     assert scenario.model
 
 
-def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
+def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path):
     turn = np.diag([1.0, -1.0, -1.0])
     write_ply(tmp_path / "street.ply", street_cloud(turn=turn))
     quality = import_splat(
@@ -100,9 +100,7 @@ def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
     assert quality["coverage"][0]["share"] > 0.5
 
 
-def test_a_splat_without_harmonics_with_photographs_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_splat_without_harmonics_with_photographs_is_measured(tmp_path, capsys):
     write_splat(tmp_path / "street.splat", street_cloud())
     poses = poses_of(tmp_path / "poses", photographs=True)
     command = [
@@ -121,7 +119,7 @@ def test_a_splat_without_harmonics_with_photographs_is_measured(
     assert_drives(tmp_path / "out")
 
 
-def test_broken_gaussians_are_left_out_and_said(tmp_path: Path) -> None:
+def test_broken_gaussians_are_left_out_and_said(tmp_path):
     cloud = street_cloud(0.5)
     means = np.array(cloud.means)
     broken = GaussianCloud(means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
@@ -137,7 +135,7 @@ def test_broken_gaussians_are_left_out_and_said(tmp_path: Path) -> None:
     assert_drives(tmp_path / "out")
 
 
-def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path: Path) -> None:
+def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path):
     write_ply(tmp_path / "street.ply", street_cloud())
     poses = poses_of(tmp_path / "poses", scale=30.0)
     before = sorted(path.name for path in tmp_path.iterdir())
@@ -147,7 +145,7 @@ def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path: Path) 
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_model_that_hangs_below_its_road_is_refused(tmp_path: Path) -> None:
+def test_a_model_that_hangs_below_its_road_is_refused(tmp_path):
     cloud = street_cloud()
     flipped = GaussianCloud(
         cloud.means * [1, 1, -1], cloud.quats, cloud.scales, cloud.opacities, cloud.sh

@@ -23,7 +23,7 @@ from tests.examples import examples
 @pytest.mark.parametrize(
     ("k", "n"), [(0, 2), (1, 2), (2, 5), (0, 20), (3, 20), (9, 10), (40, 300), (100, 2000)]
 )
-def test_of_zeros_and_ones_it_is_the_bound_of_clopper_and_pearson(k: int, n: int) -> None:
+def test_of_zeros_and_ones_it_is_the_bound_of_clopper_and_pearson(k, n):
     values = np.repeat([1.0, 0.0], [k, n - k])
     assert upper_bound(values, 1.0) == pytest.approx(stats.beta.ppf(0.975, k + 1, n - k), abs=1e-6)
 
@@ -39,16 +39,14 @@ def by_drawing(values: np.ndarray, most: float) -> float:
 
 @pytest.mark.parametrize("n", [3, 12, 60])
 @pytest.mark.parametrize("spread", [0.02, 0.5])
-def test_of_any_values_it_is_the_quantile_of_drawn_weighted_means(n: int, spread: float) -> None:
+def test_of_any_values_it_is_the_quantile_of_drawn_weighted_means(n, spread):
     values = np.random.Generator(np.random.Philox(n)).normal(0.1, spread, n)
     assert upper_bound(values, 4.0) == pytest.approx(by_drawing(values, 4.0), rel=0.02, abs=0.01)
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=30), st.floats(-1.0, 1.0))
 @settings(max_examples=examples(100), deadline=None)
-def test_bounds_hold_the_mean_and_turn_with_the_sign_and_grow_with_the_worst_value(
-    values: list[float], moved: float
-) -> None:
+def test_bounds_hold_the_mean_and_turn_with_the_sign_and_grow_with_the_worst_value(values, moved):
     x = np.array(values)
     low, high = mean_bounds(x, -1.0, 1.0)
     assert -1.0 <= low <= x.mean() + 1e-9
@@ -60,7 +58,7 @@ def test_bounds_hold_the_mean_and_turn_with_the_sign_and_grow_with_the_worst_val
     )
 
 
-def test_the_chance_agrees_with_the_bound() -> None:
+def test_the_chance_agrees_with_the_bound():
     rows = np.random.Generator(np.random.Philox(6)).uniform(-1.0, 0.5, (5, 40))
     for row in rows:
         values, counts = np.sort(np.append(row, 1.0)), np.ones(41)
@@ -71,7 +69,7 @@ def test_the_chance_agrees_with_the_bound() -> None:
 
 
 @pytest.mark.slow
-def test_many_different_values_in_bins_give_almost_the_same_bound_and_none_that_is_lower() -> None:
+def test_many_different_values_in_bins_give_almost_the_same_bound_and_none_that_is_lower():
     x = np.random.Generator(np.random.Philox(7)).normal(0.0, 0.1, 4 * BINS)
     whole = np.concatenate([x[: BINS - 2], np.full(3 * BINS + 2, 0.0)])
     assert upper_bound(whole, 4.0) == pytest.approx(by_drawing(whole[: len(whole)], 4.0), rel=0.03)
@@ -80,14 +78,14 @@ def test_many_different_values_in_bins_give_almost_the_same_bound_and_none_that_
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e150, 1e307])
-def test_the_unit_does_not_matter_up_to_the_ends_of_the_numbers(scale: float) -> None:
+def test_the_unit_does_not_matter_up_to_the_ends_of_the_numbers(scale):
     values = np.array([-1.0, 0.0, 0.25, 0.25, 0.5])
     assert upper_bound(values * scale, 4.0 * scale) == pytest.approx(
         scale * upper_bound(values, 4.0), rel=1e-6
     )
 
 
-def test_the_fewest_scenes_are_those_at_which_the_bound_reaches_the_margin() -> None:
+def test_the_fewest_scenes_are_those_at_which_the_bound_reaches_the_margin():
     for distance, reach in ((0.05, 1.0), (0.02, 1.0), (0.1, 4.0)):
         n = scenes_without_event(distance, reach)
         assert upper_bound(np.zeros(n), reach) < distance <= upper_bound(np.zeros(n - 1), reach)

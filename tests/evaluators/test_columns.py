@@ -5,7 +5,6 @@ verdicts, and what is missing.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -119,12 +118,12 @@ def by_rows(
     ],
 )
 def test_columns_give_what_rows_give(
-    tmp_path: Path,
-    renderers: tuple[str, ...],
-    policies: tuple[str, ...],
-    scenes: int,
-    seeds: tuple[int, ...],
-) -> None:
+    tmp_path,
+    renderers,
+    policies,
+    scenes,
+    seeds,
+):
     rows = rows_like_a_run(renderers, policies, scenes, seeds, scenes)
     baseline, bases = renderers[-1], {"onefixer": "3dgs"}
     wanted = by_rows(rows, baseline, bases)
@@ -141,7 +140,7 @@ def test_columns_give_what_rows_give(
     assert numbers_by_renderer(RolloutTable.of_files([tmp_path / "rollouts.parquet"])) == wanted
 
 
-def test_several_runs_are_one_table_whatever_metrics_each_has(tmp_path: Path) -> None:
+def test_several_runs_are_one_table_whatever_metrics_each_has(tmp_path):
     first = rows_like_a_run(("clean", "3dgs"), ("p",), 6, (0, 1), 1)
     second = [
         {**row, "scene": f"other-{row['scene']}"}
@@ -164,13 +163,13 @@ def test_several_runs_are_one_table_whatever_metrics_each_has(tmp_path: Path) ->
     assert table.n_rollouts == len(first) + len(second)
 
 
-def test_a_table_without_its_keys_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_table_without_its_keys_is_refused_by_name(tmp_path):
     pq.write_table(pa.table({"renderer": ["clean"]}), tmp_path / "rollouts.parquet")
     with pytest.raises(InputError, match="no column 'policy'"):
         RolloutTable.of_files([tmp_path / "rollouts.parquet"])
 
 
-def test_a_run_without_rollouts_has_no_numbers() -> None:
+def test_a_run_without_rollouts_has_no_numbers():
     table = RolloutTable.of_table(table_of(rows_like_a_run(("a",), ("p",), 1, (0,), 3)).slice(0, 0))
     assert numbers(table) == {
         "metrics": {},

@@ -174,7 +174,7 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
     ("values", "window"), [(5, 5), (8, 8), (9, 8), (40, 8), (40, 15), (3, 3), (4, 4)]
 )
 @pytest.mark.parametrize("times", [0, 1, 2])
-def test_smoothing_is_scipys(values: int, window: int, times: int) -> None:
+def test_smoothing_is_scipys(values, window, times):
     random = np.random.default_rng(values)
     for given in (1e3 * random.normal(size=values), np.zeros(values), np.arange(float(values))):
         ours = savitzky_golay(given, window, 2, times, 0.1)

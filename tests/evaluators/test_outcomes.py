@@ -84,21 +84,21 @@ def slowing(to: float = 0.4, after_s: float = 3.0) -> np.ndarray:
     return np.where(after_s > T, V, np.maximum(V - 3.0 * (T - after_s), to))
 
 
-def test_a_drive_like_the_recording_has_no_outcome() -> None:
+def test_a_drive_like_the_recording_has_no_outcome():
     assert fired(track(V * T)) == set()
 
 
-def test_braking_to_a_crawl_on_an_empty_road_is_braking_without_a_cause() -> None:
+def test_braking_to_a_crawl_on_an_empty_road_is_braking_without_a_cause():
     assert fired(track(travelled(slowing()))) == {"braked_without_cause"}
 
 
-def test_standing_on_an_empty_road_is_a_stall_and_says_more_than_the_braking() -> None:
+def test_standing_on_an_empty_road_is_a_stall_and_says_more_than_the_braking():
     had = fired(track(travelled(slowing(0.0))))
     assert had == {"stalled", "braked_without_cause"}
     assert in_words(had) == "stalled"
 
 
-def test_a_leader_that_stands_is_a_cause() -> None:
+def test_a_leader_that_stands_is_a_cause():
     x = travelled(slowing(0.0))
     leader = {"leader": track(np.full(len(T), x[-1] + 9.0))}
     assert fired(track(x), None, leader) == set()
@@ -106,7 +106,7 @@ def test_a_leader_that_stands_is_a_cause() -> None:
     assert "stalled" in fired(track(x), None, beside)
 
 
-def test_a_road_user_that_is_about_to_cross_is_a_cause() -> None:
+def test_a_road_user_that_is_about_to_cross_is_a_cause():
     v = np.where((T > 3) & (T < 6), 2.0, V)
     x = travelled(v)
     crossing = {"crossing": track(np.full(len(T), x[60] + 6.0), 12.0 - 2.5 * T)}
@@ -114,7 +114,7 @@ def test_a_road_user_that_is_about_to_cross_is_a_cause() -> None:
     assert fired(track(x), None, crossing) == set()
 
 
-def test_a_long_body_across_the_road_is_a_cause_although_no_corner_is_on_the_path() -> None:
+def test_a_long_body_across_the_road_is_a_cause_although_no_corner_is_on_the_path():
     x = travelled(slowing(0.0))
     log, scene = drive(track(x), None, {"bus": track(np.full(len(T), x[-1] + 9.0))})
     bus = log.actors["bus"]
@@ -125,24 +125,24 @@ def test_a_long_body_across_the_road_is_a_cause_although_no_corner_is_on_the_pat
     )
 
 
-def test_a_stop_of_the_recording_excuses_a_stop_there_but_not_a_longer_one() -> None:
+def test_a_stop_of_the_recording_excuses_a_stop_there_but_not_a_longer_one():
     recorded = np.where((T > 3) & (T < 5), 0.0, V)
     assert fired(track(travelled(recorded)), track(travelled(recorded))) == set()
     forever = np.where(T > 3, 0.0, V)
     assert "stalled" in fired(track(travelled(forever)), track(travelled(recorded)))
 
 
-def test_standing_at_the_end_of_the_path_is_no_stall() -> None:
+def test_standing_at_the_end_of_the_path_is_no_stall():
     x = np.minimum(V * T, V * T[-1] / 2)
     assert fired(track(x), track(x)) == set()
 
 
 @pytest.mark.parametrize(("aside_m", "left"), [(3.9, False), (4.1, True)])
-def test_the_route_is_left_at_four_metres(aside_m: float, left: bool) -> None:
+def test_the_route_is_left_at_four_metres(aside_m, left):
     assert ("left_route" in fired(track(V * T, aside_m))) == left
 
 
-def test_a_drive_far_from_the_origin_is_judged_alike() -> None:
+def test_a_drive_far_from_the_origin_is_judged_alike():
     far = np.array([4.5e5, 5.4e6, 0.0])
     log, scene = drive(track(travelled(slowing(0.0))))
     moved = lambda one: Trajectory(one.t_us, one.xyz + far, one.quat)  # noqa: E731
@@ -158,13 +158,13 @@ def test_a_drive_far_from_the_origin_is_judged_alike() -> None:
     }
 
 
-def test_a_recording_without_a_length_gives_no_value() -> None:
+def test_a_recording_without_a_length_gives_no_value():
     for one in evaluate_outcomes(*drive(track(V * T), track(np.zeros(len(T)))), PRESETS["paper"]):
         assert not one.valid.any()
         assert "has no direction" in one.reason
 
 
-def test_the_recorded_speed_is_the_least_from_here_to_fifteen_metres_ahead() -> None:
+def test_the_recorded_speed_is_the_least_from_here_to_fifteen_metres_ahead():
     v = np.where((T > 3) & (T < 5), 1.0, V)
     along = travelled(v)
     usual, pause_s = recorded_speed(along, T, v, along)
@@ -174,7 +174,7 @@ def test_the_recorded_speed_is_the_least_from_here_to_fifteen_metres_ahead() -> 
     assert pause_s.max() == pytest.approx(2.0, abs=2 * DT_S)
 
 
-def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest() -> None:
+def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest():
     assert all(name in METRICS for name in OUTCOMES if name != "policy")
     log, scene = drive(track(travelled(slowing())))
     reduction = reduce_rollout(score(log, scene, "paper"), "paper")
@@ -182,7 +182,7 @@ def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest()
     assert reduction.values["braked_without_cause"].value == 1.0
 
 
-def test_outcomes_are_counted_by_arm_with_place_and_time() -> None:
+def test_outcomes_are_counted_by_arm_with_place_and_time():
     def manifest(policy: str, scene: str, **flags: float) -> dict:
         metrics = {
             name: {"value": value, "valid": True}
@@ -223,12 +223,12 @@ def test_outcomes_are_counted_by_arm_with_place_and_time() -> None:
     ) == (3, 2, 2)
 
 
-def test_a_rollout_that_something_else_broke_has_no_outcome() -> None:
+def test_a_rollout_that_something_else_broke_has_no_outcome():
     assert (
         outcomes_of(Rollout("r", "p", "s", 0, "failed", "renderer", metrics={"offroad": 1.0}))
         == frozenset()
     )
 
 
-def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have() -> None:
+def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have():
     assert evaluate_outcomes(*drive(track(travelled(slowing()))), PRESETS["alpasim"]) == []

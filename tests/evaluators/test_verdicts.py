@@ -221,12 +221,12 @@ def test_a_metric_of_which_nothing_says_how_much_a_scene_can_differ_decides_noth
     assert "nothing says how much a scene can differ" in found["note"]
 
 
-def test_the_correction_is_holms() -> None:
+def test_the_correction_is_holms():
     assert holm([0.01, None, 0.04, 0.03]) == pytest.approx([0.03, None, 0.06, 0.06])
     assert holm([None]) == [None]
 
 
-def test_what_differs_on_these_scenes_is_shown_by_their_signs_whatever_others_may_do() -> None:
+def test_what_differs_on_these_scenes_is_shown_by_their_signs_whatever_others_may_do():
     """Sixty scenes, each 0.2 m worse, are a difference; 1e-15 m of rounding is none."""
     rng = np.random.Generator(np.random.Philox(5))
     base = rng.uniform(1.0, 3.0, (60, 1))
@@ -239,14 +239,14 @@ def test_what_differs_on_these_scenes_is_shown_by_their_signs_whatever_others_ma
 
 
 @pytest.mark.parametrize("scenes", [7, 20, 60])
-def test_variants_that_are_alike_differ_in_one_run_of_twenty_whatever_their_tails(scenes) -> None:
+def test_variants_that_are_alike_differ_in_one_run_of_twenty_whatever_their_tails(scenes):
     rng = np.random.Generator(np.random.Philox(scenes))
     draws = [rng.standard_cauchy(scenes) for _ in range(300)]
     draws += [rng.integers(-1, 2, scenes) * (rng.random(scenes) < 0.5) for _ in range(300)]
     assert np.mean([sign_flip(np.asarray(x, float))[0] <= 0.05 for x in draws]) <= 0.075
 
 
-def test_few_flips_are_counted_and_many_are_drawn_with_almost_the_same_answer() -> None:
+def test_few_flips_are_counted_and_many_are_drawn_with_almost_the_same_answer():
     x = np.random.Generator(np.random.Philox(8)).normal(0.4, 1.0, 16)
     signs = 1 - 2 * (np.arange(2**16)[:, None] >> np.arange(16) & 1)
     whole = np.mean(np.abs(signs @ x) >= abs(x.sum()) - 1e-9)
@@ -256,7 +256,7 @@ def test_few_flips_are_counted_and_many_are_drawn_with_almost_the_same_answer() 
 
 
 @pytest.mark.parametrize("has_event", [True, False])
-def test_a_distance_is_no_worse_only_together_with_what_lies_beyond_its_cap(has_event) -> None:
+def test_a_distance_is_no_worse_only_together_with_what_lies_beyond_its_cap(has_event):
     """One scene in a hundred leaves the route by 15 m: the mean is 0.15 m worse, the margin 0.1."""
     rng = np.random.Generator(np.random.Philox(9))
     passed = 0

@@ -62,14 +62,14 @@ def answered(codec: Codec, *frames: can.Message) -> Exchange:
 EGO, CMD = message(257, "EGO", 4, SPEED), message(512, "CMD", 4, ANGLE, ACCEL)
 
 
-def test_one_message_may_carry_both_commands(tmp_path: Path) -> None:
+def test_one_message_may_carry_both_commands(tmp_path):
     codec, _ = opened(tmp_path, EGO, CMD)
     frame = codec.pack("CMD", {"ANGLE": 12.3, "ACCEL": -0.5}, None, None)
     got = answered(codec, frame).commands
     assert (got.mark, round(got.wheel_deg, 6), round(got.accel_mps2, 6)) == ("held", 12.3, -0.5)
 
 
-def test_multiplexed_commands_come_in_frames_of_their_own(tmp_path: Path) -> None:
+def test_multiplexed_commands_come_in_frames_of_their_own(tmp_path):
     mux = ('KIND M : 0|8@1+ (1,0) [0|3] "" SIM', 'ANGLE m1 : 8|16@1- (0.1,0) [-900|900] "" SIM')
     codec, _ = opened(
         tmp_path,
@@ -85,7 +85,7 @@ def test_multiplexed_commands_come_in_frames_of_their_own(tmp_path: Path) -> Non
     assert exchange.counts["malformed"] == 0
 
 
-def test_nested_multiplexers_are_set(tmp_path: Path) -> None:
+def test_nested_multiplexers_are_set(tmp_path):
     signals = (
         'KIND M : 0|8@1+ (1,0) [0|3] "" ECU',
         'PART m2M : 8|8@1+ (1,0) [0|3] "" ECU',
@@ -97,7 +97,7 @@ def test_nested_multiplexers_are_set(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["0|32@1", "7|32@0"])
-def test_floats_go_out_and_come_in_as_floats(tmp_path: Path, order: str) -> None:
+def test_floats_go_out_and_come_in_as_floats(tmp_path, order):
     signal = f'{{}} : {order}- (1,0) [0|0] "" ECU'
     names = ("EGO", "SPEED"), ("STEER", "ANGLE"), ("ACC", "ACCEL")
     parts = [message(256 + i, m, 4, signal.format(s)) for i, (m, s) in enumerate(names)]
@@ -116,7 +116,7 @@ def test_floats_go_out_and_come_in_as_floats(tmp_path: Path, order: str) -> None
     assert codec.decode(codec.map.steer, bytes(steer.data))[0] == pytest.approx(-12.3456, rel=1e-6)
 
 
-def test_extended_and_standard_frames_of_one_number_are_two(tmp_path: Path) -> None:
+def test_extended_and_standard_frames_of_one_number_are_two(tmp_path):
     codec, _ = opened(
         tmp_path,
         message(257 | EXTENDED, "EGO", 4, SPEED),
@@ -131,7 +131,7 @@ def test_extended_and_standard_frames_of_one_number_are_two(tmp_path: Path) -> N
     assert exchange.counts["other"] == 1
 
 
-def test_messages_longer_than_8_bytes_are_sent_as_can_fd(tmp_path: Path) -> None:
+def test_messages_longer_than_8_bytes_are_sent_as_can_fd(tmp_path):
     codec, _ = opened(tmp_path, message(257, "EGO", 16, SPEED), CMD)
     frame = codec.encode(codec.map.send[0], {"speed_kph": 1.0})
     assert (frame.is_fd, len(frame.data)) == (True, 16)
@@ -160,9 +160,7 @@ TWO = message(
         ((EGO, CMD), {"steer": "{message: CMD, signal: WHEEL}"}, "WHEEL"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_sent_is_refused_when_the_map_is_opened(
-    tmp_path: Path, parts: tuple[str, ...], keys: dict[str, str], found: str
-) -> None:
+def test_what_cannot_be_sent_is_refused_when_the_map_is_opened(tmp_path, parts, keys, found):
     with pytest.raises(InputError, match=found):
         opened(tmp_path, *parts, **keys)
     policy = f"can://virtual:files?map={tmp_path / 'map.yaml'}"

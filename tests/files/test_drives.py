@@ -91,15 +91,13 @@ STRAIGHT = [round(STEP_M * i, 3) for i in range(13)]
         ([f"IMG_{i}.JPG" for i in range(95, 108)], None),
     ],
 )
-def test_photographs_without_times_are_taken_along_the_path(
-    tmp_path: Path, names: list[str], order: list[int] | None
-) -> None:
+def test_photographs_without_times_are_taken_along_the_path(tmp_path, names, order):
     drive = read_source(transforms(tmp_path / "a", names, order, unit="m"), photographs=False)
     assert along(drive) == STRAIGHT
     assert any("no times" in note for note in drive.notes)
 
 
-def test_a_colmap_model_is_read_in_natural_order_with_any_line_of_points(tmp_path: Path) -> None:
+def test_a_colmap_model_is_read_in_natural_order_with_any_line_of_points(tmp_path):
     names = [f"my photo  {i}.png" for i in range(1, 14)]
     for points in (True, False):
         colmap(tmp_path / f"{points}/sparse/0", names, points)
@@ -108,7 +106,7 @@ def test_a_colmap_model_is_read_in_natural_order_with_any_line_of_points(tmp_pat
         assert drive.pictures[2].file.name == "my photo  3.png"
 
 
-def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path: Path) -> None:
+def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path):
     colmap(tmp_path / "sparse/0", ["a.png", "b.png"])
     colmap(tmp_path / "sparse/10", [f"{i}.png" for i in range(13)])
     drive = read_source(tmp_path, photographs=False)
@@ -117,7 +115,7 @@ def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["FOV", "THIN_PRISM_FISHEYE", "NEWEST"])
-def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path: Path, name: str) -> None:
+def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path, name):
     colmap(tmp_path / "sparse", ["a.png"], camera=f"{name} 320 128 180 180 160 54 0.1")
     with pytest.raises(InputError, match=name):
         read_source(tmp_path, photographs=False)
@@ -135,7 +133,7 @@ def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path: Path, name: str) -
         ("projections\n" + row("P2", 180), None),
     ],
 )
-def test_rows_of_kitti_are_found_by_name(tmp_path: Path, calib: str, focal: float | None) -> None:
+def test_rows_of_kitti_are_found_by_name(tmp_path, calib, focal):
     folder = kitti(tmp_path / "a", calib)
     if focal is None:
         with pytest.raises(InputError):
@@ -144,12 +142,12 @@ def test_rows_of_kitti_are_found_by_name(tmp_path: Path, calib: str, focal: floa
         assert read_source(folder).pictures[0].lens.K[0, 0] == focal
 
 
-def test_unknown_rows_of_kitti_are_said(tmp_path: Path) -> None:
+def test_unknown_rows_of_kitti_are_said(tmp_path):
     drive = read_source(kitti(tmp_path / "a", row("P2", 180) + "W_odd: 1 2\n"))
     assert any("W_odd" in note for note in drive.notes)
 
 
-def test_a_header_of_times_is_refused_with_its_line(tmp_path: Path) -> None:
+def test_a_header_of_times_is_refused_with_its_line(tmp_path):
     times = "# seconds\n" + "\n".join(str(0.1 * i) for i in range(8))
     with pytest.raises(InputError, match="line 1"):
         read_source(kitti(tmp_path / "a", row("P2", 180), times=times))
@@ -166,28 +164,26 @@ def test_a_header_of_times_is_refused_with_its_line(tmp_path: Path) -> None:
         ({"axes": "opengll"}, "opengll"),
     ],
 )
-def test_what_transforms_cannot_mean_is_refused_by_name(
-    tmp_path: Path, keys: dict[str, Any], found: str
-) -> None:
+def test_what_transforms_cannot_mean_is_refused_by_name(tmp_path, keys, found):
     with pytest.raises(InputError, match=found):
         read_source(transforms(tmp_path / "a", ["1.png", "2.png"], **keys), photographs=False)
 
 
-def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path: Path) -> None:
+def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"], is_fisheye=True, k1=0.1, wobble=3)
     drive = read_source(folder, photographs=False)
     assert drive.pictures[0].lens.model == "fisheye"
     assert any("wobble" in note for note in drive.notes)
 
 
-def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path: Path) -> None:
+def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"], ply_file_path="gone.ply")
     assert read_source(folder, photographs=False).points is None
     with pytest.raises(InputError):
         read_source(folder)
 
 
-def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path: Path) -> None:
+def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path):
     transforms(tmp_path / "b", ["1.png", "2.png"])
     folder = transforms(tmp_path / "a", ["1.png", "2.png"])
     text = (folder / "transforms.json").read_text()
@@ -198,7 +194,7 @@ def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path: Path) -
         read_source(folder, photographs=False)
 
 
-def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path: Path) -> None:
+def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"])
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -212,7 +208,7 @@ def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path: P
         read_source(folder, photographs=False)
 
 
-def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path: Path) -> None:
+def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path):
     folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)], unit="m")
     document = json.loads((folder / "transforms.json").read_text())
     for i, frame in enumerate(document["frames"]):
@@ -242,9 +238,7 @@ def street_cloud() -> GaussianCloud:
 
 
 @pytest.mark.parametrize("keys", ["none", "stated", "old"])
-def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(
-    tmp_path: Path, keys: str
-) -> None:
+def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(tmp_path, keys):
     before = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
     more = {"applied_transform": before[:3].tolist(), "applied_scale": 2.0}
     names = [f"{i}.png" for i in range(13)]
@@ -277,9 +271,7 @@ def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(
         ("frames.txt", "1 1 one 0 0 0 0 0 0 1 CAMERA 7 1\n", "frames.txt"),
     ],
 )
-def test_what_a_colmap_model_lacks_is_said(
-    tmp_path: Path, file: str, text: str, found: str
-) -> None:
+def test_what_a_colmap_model_lacks_is_said(tmp_path, file, text, found):
     model = tmp_path / "sparse/0"
     colmap(model, [f"{i}.png" for i in range(13)])
     (model / file).write_text(text)
@@ -353,9 +345,7 @@ def as_binary(model: Path) -> None:
 
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
 @pytest.mark.parametrize("folders", [("front/", "left/"), ("a", "b")], ids=["folders", "prefixes"])
-def test_images_of_a_frame_of_a_rig_have_one_time(
-    tmp_path: Path, folders: tuple[str, str], binary: bool
-) -> None:
+def test_images_of_a_frame_of_a_rig_have_one_time(tmp_path, folders, binary):
     rig(tmp_path / "sparse/0", folders, [0, 1, 4, 12], binary)
     drive = read_source(tmp_path, photographs=False)
     names = ["front", "left"] if folders[0] == "front/" else ["camera-7", "camera-9"]
@@ -368,13 +358,13 @@ def test_images_of_a_frame_of_a_rig_have_one_time(
     assert np.allclose(mount, np.linalg.inv(SIDE), atol=1e-9)
 
 
-def test_a_rig_that_its_images_do_not_fit_is_refused(tmp_path: Path) -> None:
+def test_a_rig_that_its_images_do_not_fit_is_refused(tmp_path):
     rig(tmp_path / "sparse/0", ("front/", "left/"), [0, 4], turn=0.9)
     with pytest.raises(InputError, match="left/"):
         read_source(tmp_path, photographs=False)
 
 
-def test_rigs_of_one_camera_change_nothing(tmp_path: Path) -> None:
+def test_rigs_of_one_camera_change_nothing(tmp_path):
     model = tmp_path / "sparse/0"
     colmap(model, [f"{i}.png" for i in range(13)])
     (model / "rigs.txt").write_text("1 1 CAMERA 7\n")
@@ -382,12 +372,12 @@ def test_rigs_of_one_camera_change_nothing(tmp_path: Path) -> None:
     assert along(read_source(tmp_path, photographs=False)) == STRAIGHT
 
 
-def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_frames_is_refused(tmp_path):
     with pytest.raises(InputError, match="no frames"):
         read_source(transforms(tmp_path / "a", []), photographs=False)
 
 
-def test_photographs_that_are_missing_leave_their_time(tmp_path: Path) -> None:
+def test_photographs_that_are_missing_leave_their_time(tmp_path):
     folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)], unit="m")
     (folder / "images").mkdir()
     for i in (0, 1, 5, 6, 7, 8, 9, 10, 11, 12):
@@ -397,7 +387,7 @@ def test_photographs_that_are_missing_leave_their_time(tmp_path: Path) -> None:
     assert any("3 of 13" in note for note in drive.notes)
 
 
-def test_a_walk_around_an_object_without_metres_has_no_speed(tmp_path: Path) -> None:
+def test_a_walk_around_an_object_without_metres_has_no_speed(tmp_path):
     folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)])
     document = json.loads((folder / "transforms.json").read_text())
     for i, frame in enumerate(document["frames"]):

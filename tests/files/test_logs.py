@@ -22,7 +22,7 @@ from tests.scenarios.make_commonroad import lanelet
 
 
 @pytest.mark.parametrize("empty", [False, True])
-def test_an_argoverse_log_of_the_test_split_drives_alone(tmp_path: Path, empty: bool) -> None:
+def test_an_argoverse_log_of_the_test_split_drives_alone(tmp_path, empty):
     none = {key: np.array(value)[:0] for key, value in cuboids(TRACKS).items()}
     folder = write_argoverse(tmp_path / "x", annotations=none)
     if not empty:
@@ -45,9 +45,7 @@ def test_an_argoverse_log_of_the_test_split_drives_alone(tmp_path: Path, empty: 
         ("a/cameras.txt", "import drive"),
     ],
 )
-def test_what_becomes_a_scenario_by_an_import_names_the_command(
-    tmp_path: Path, name: str, advice: str
-) -> None:
+def test_what_becomes_a_scenario_by_an_import_names_the_command(tmp_path, name, advice):
     file = tmp_path / name
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(b"x")
@@ -57,18 +55,18 @@ def test_what_becomes_a_scenario_by_an_import_names_the_command(
     assert advice in caught.value.hint
 
 
-def test_a_policy_that_asks_for_a_camera_instead_of_its_name_is_told_so() -> None:
+def test_a_policy_that_asks_for_a_camera_instead_of_its_name_is_told_so():
     camera = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
     assert "CameraSpec" in sensors_problem((SensorSpec(camera),))  # type: ignore[arg-type]
     assert not sensors_problem((SensorSpec("front"),))
 
 
-def test_a_prompt_that_the_weights_did_not_learn_is_refused_before_anything_runs() -> None:
+def test_a_prompt_that_the_weights_did_not_learn_is_refused_before_anything_runs():
     with pytest.raises(InputError, match="night"):
         resolve_renderer("onefixer-dit-tiny", ("prompt=night",))
 
 
-def test_lanelets_of_an_unknown_type_are_said(tmp_path: Path) -> None:
+def test_lanelets_of_an_unknown_type_are_said(tmp_path):
     types = "".join(f"<laneletType>{name}</laneletType>" for name in ("urban", "restricted"))
     root = ElementTree.fromstring(
         f'<commonRoad timeStepSize="0.1">{lanelet(1, 0, 50, 0, types)}</commonRoad>'

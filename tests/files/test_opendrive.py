@@ -66,7 +66,7 @@ def span(lanes: LaneMap, key: str) -> tuple[float, float]:
     return round(float(x[0]), 6), round(float(x[-1]), 6)
 
 
-def test_a_section_of_one_side_leaves_the_other_side_as_it_was() -> None:
+def test_a_section_of_one_side_leaves_the_other_side_as_it_was():
     lanes, notes = read(
         road(
             "1",
@@ -86,7 +86,7 @@ def test_a_section_of_one_side_leaves_the_other_side_as_it_was() -> None:
     assert not notes
 
 
-def test_sections_of_both_sides_may_begin_at_one_place() -> None:
+def test_sections_of_both_sides_may_begin_at_one_place():
     lanes, notes = read(
         road(
             "1",
@@ -98,12 +98,12 @@ def test_sections_of_both_sides_may_begin_at_one_place() -> None:
     assert not notes
 
 
-def test_lanes_that_cannot_be_placed_are_said() -> None:
+def test_lanes_that_cannot_be_placed_are_said():
     _, notes = read(road("1", section(0, lane(-1)), section(50, lane(-1), lane(-2))))
     assert any("without length" in note and "2" in note for note in notes)
 
 
-def test_a_direct_junction_links_both_ways() -> None:
+def test_a_direct_junction_links_both_ways():
     junction = (
         '<junction id="9" type="direct">'
         '<connection id="0" incomingRoad="1" linkedRoad="2" contactPoint="start">'
@@ -125,7 +125,7 @@ def test_a_direct_junction_links_both_ways() -> None:
 
 
 @pytest.mark.parametrize("contact", ["start", "end"])
-def test_a_connection_without_lanes_links_those_of_one_direction(contact: str) -> None:
+def test_a_connection_without_lanes_links_those_of_one_direction(contact):
     ends = {"before": "road:1:end", "after": "road:3:start"}
     if contact == "end":
         ends = {"before": "road:3:start", "after": "road:1:end"}
@@ -143,7 +143,7 @@ def test_a_connection_without_lanes_links_those_of_one_direction(contact: str) -
     assert any("name no lanes" in note for note in notes)
 
 
-def test_a_link_that_stands_in_the_next_road_alone_counts() -> None:
+def test_a_link_that_stands_in_the_next_road_alone_counts():
     lanes, _ = read(
         road("1", section(0, lane(1), lane(-1)), after="road:2:start"),
         road("2", section(0, lane(1), lane(-1, -1)), x=50, before="road:1:end"),
@@ -151,7 +151,7 @@ def test_a_link_that_stands_in_the_next_road_alone_counts() -> None:
     assert lanes.lanes["1.0.-1"].successors == ("2.0.-1",)
 
 
-def test_a_lane_that_ends_inside_the_map_is_said() -> None:
+def test_a_lane_that_ends_inside_the_map_is_said():
     _, notes = read(
         road("1", section(0, lane(-1, None, -1), lane(-2)), after="road:2:start"),
         road("2", section(0, lane(-1)), x=50, before="road:1:end"),
@@ -159,7 +159,7 @@ def test_a_lane_that_ends_inside_the_map_is_said() -> None:
     assert any("1.0.-2" in note for note in notes)
 
 
-def test_links_of_a_road_between_two_junctions_stay_apart() -> None:
+def test_links_of_a_road_between_two_junctions_stay_apart():
     def junction(i: int, incoming: str, connecting: str, a: int, b: int) -> str:
         link = f'<laneLink from="{a}" to="{b}"/>'
         ends = f'incomingRoad="{incoming}" connectingRoad="{connecting}" contactPoint="start"'
@@ -175,7 +175,7 @@ def test_links_of_a_road_between_two_junctions_stay_apart() -> None:
     assert lanes.lanes["1.0.-1"].successors == ("2.0.-1",)
 
 
-def test_records_out_of_order_are_put_in_order() -> None:
+def test_records_out_of_order_are_put_in_order():
     line = '<geometry s="0" x="0" y="0" hdg="0" length="50"><line/></geometry>'
     arc = '<geometry s="50" x="50" y="0" hdg="0" length="50"><arc curvature="0.02"/></geometry>'
     lanes, notes = read(road("1", section(0, lane(-1)), length=100, view=arc + line))
@@ -188,7 +188,7 @@ def test_records_out_of_order_are_put_in_order() -> None:
     assert any("7 (1.00 m)" in note for note in notes)
 
 
-def test_a_reversed_lane_runs_and_sees_the_other_way() -> None:
+def test_a_reversed_lane_runs_and_sees_the_other_way():
     lanes, _ = read(road("1", section(0, lane(-1), lane(-2, more='direction="reversed"'))))
     assert span(lanes, "1.0.-1") == (0.0, 50.0)
     assert span(lanes, "1.0.-2") == (50.0, 0.0)
@@ -196,7 +196,7 @@ def test_a_reversed_lane_runs_and_sees_the_other_way() -> None:
     assert lanes.lanes["1.0.-1"].right_neighbour is None
 
 
-def test_what_is_not_read_of_a_map_is_said() -> None:
+def test_what_is_not_read_of_a_map_is_said():
     _, notes = read(
         '<header><offset x="1" y="2" z="0" hdg="0"/></header>',
         road("1", section(0, lane(-1))),

@@ -63,9 +63,7 @@ def bright(image: np.ndarray) -> tuple[bool, bool, tuple[int, int]]:
         ((0, -ONE, -ONE, 0), True, True, True),
     ],
 )
-def test_quarter_turns_and_mirrors_are_applied(
-    tmp_path: Path, matrix: tuple[int, int, int, int], below: bool, right: bool, turned: bool
-) -> None:
+def test_quarter_turns_and_mirrors_are_applied(tmp_path, matrix, below, right, turned):
     with VideoReader(video(tmp_path / "a.mp4", matrix)) as reader:
         image = next(iter(reader)).image
         assert (reader.format.height, reader.format.width) == image.shape[:2]
@@ -74,14 +72,12 @@ def test_quarter_turns_and_mirrors_are_applied(
 
 
 @pytest.mark.parametrize("matrix", [(46341, 46341, -46341, 46341), (ONE, 0, 0, ONE // 2)])
-def test_other_display_matrices_are_refused(
-    tmp_path: Path, matrix: tuple[int, int, int, int]
-) -> None:
+def test_other_display_matrices_are_refused(tmp_path, matrix):
     with pytest.raises(InputError, match="matrix"):
         VideoReader(video(tmp_path / "a.mp4", matrix))
 
 
-def test_a_second_video_track_is_said(tmp_path: Path) -> None:
+def test_a_second_video_track_is_said(tmp_path):
     with VideoReader(video(tmp_path / "a.mp4", tracks=2)) as reader:
         assert reader.format.left_out == (f"video track 1 ({WIDTH}x{HEIGHT})",)
     with VideoReader(video(tmp_path / "b.mp4")) as reader:

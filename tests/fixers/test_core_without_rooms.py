@@ -48,5 +48,5 @@ def alone(*code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_without_the_rooms_core_modules_import_onefixer_repairs() -> None:
+def test_without_the_rooms_core_modules_import_onefixer_repairs():
     alone(IMPORT_ALL, REPAIR)  # in one process: most of the time goes by while torch is imported

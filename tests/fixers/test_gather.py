@@ -43,9 +43,7 @@ def recordings(batch: int, references: int, height: int, width: int) -> Tensor:
     ("batch", "height", "width", "hidden"), [(1, 16, 16, 16), (3, 32, 48, 16), (2, 16, 80, 0)]
 )
 @pytest.mark.parametrize("noisy", [True, False])
-def test_one_pass_gathers_the_same_bits(
-    batch: int, height: int, width: int, hidden: int, noisy: bool
-) -> None:
+def test_one_pass_gathers_the_same_bits(batch, height, width, hidden, noisy):
     render, opacity, sdmap, state = images(batch, height, width, hidden)
     source = render * 0.25 if noisy else render
     given = render, opacity, sdmap, state, source
@@ -54,7 +52,7 @@ def test_one_pass_gathers_the_same_bits(
     assert torch.equal(fast.fine, plain.fine)
 
 
-def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -> None:
+def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through():
     render, opacity, sdmap, state = images(2, 32, 64, 16)
     render[0, 3, 5, 1], opacity[1, 0, 0, 0] = float("nan"), float("inf")
     half = slice(None), slice(0, 16), slice(16, 48)
@@ -82,9 +80,7 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
         (1, 2, 32, 64, 8),
     ],
 )
-def test_one_pass_mixes_as_the_operations_one_by_one(
-    batch: int, references: int, height: int, width: int, scale: int
-) -> None:
+def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, width, scale):
     draw = torch.Generator().manual_seed(height + references)
     repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
     images = recordings(batch, references, height, width)
@@ -127,8 +123,8 @@ def test_one_pass_mixes_as_the_operations_one_by_one(
     [(1, 1, 1, 1, 16), (2, 3, 9, 16, 16), (1, 2, 4, 20, 5)],
 )
 def test_features_are_compared_as_the_operations_one_by_one_do(
-    batch: int, references: int, height: int, width: int, channels: int
-) -> None:
+    batch, references, height, width, channels
+):
     draw = torch.Generator().manual_seed(width)
     sought = torch.randn(batch, height, width, channels, generator=draw)
     shown = torch.randn(batch * references, height, width, channels, generator=draw)
@@ -142,9 +138,7 @@ def test_features_are_compared_as_the_operations_one_by_one_do(
 
 
 @pytest.mark.parametrize(("images", "height", "width"), [(1, 2, 2), (3, 8, 16), (2, 6, 22)])
-def test_offsets_are_joined_as_the_operations_one_by_one_do(
-    images: int, height: int, width: int
-) -> None:
+def test_offsets_are_joined_as_the_operations_one_by_one_do(images, height, width):
     draw = torch.Generator().manual_seed(width)
     at2 = torch.randn(images, height, width, 2, generator=draw) * 3
     at4 = torch.randn(images, height // 2, width // 2, 2, generator=draw)
@@ -154,7 +148,7 @@ def test_offsets_are_joined_as_the_operations_one_by_one_do(
         assert torch.allclose(CPU.offsets(*said), TORCH.offsets(*said), atol=2e-5)
 
 
-def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
+def test_weights_over_all_magnitudes_blend_as_in_float64():
     weight = torch.linspace(-100, 59, 8 * 8 * 4).view(1, 1, 8, 8, 4)
     draw = torch.Generator().manual_seed(5)
     repaired, images = torch.rand(1, 16, 16, 3, generator=draw), recordings(1, 1, 16, 16)

@@ -93,7 +93,7 @@ def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
 
 
 @pytest.mark.parametrize("fog_m", [0.0, 30.0], ids=["a hole", "mist behind the road"])
-def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
+def test_the_road_is_seen_where_the_render_has(fog_m):
     T, depth, truth = street(10.0)
     road = (slice(22, 40), slice(8, 56))
     depth[road] = fog_m
@@ -108,7 +108,7 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
     assert off(warp(pictures[0], view), truth, road) > 20
 
 
-def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth() -> None:
+def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth():
     T, depth, truth = street(10.0, wall_m=20.0)
     wall = (slice(18, 23), slice(8, 56))  # the ground of these pixels lies up to four times as far
     view, pictures = WarpTarget(K, T, depth, NOBODY, {}), [recorded(7.0, 20.0), recorded(5.0, 20.0)]
@@ -118,7 +118,7 @@ def test_a_wall_beyond_which_the_plane_goes_on_keeps_its_own_depth() -> None:
         assert off(image, truth, wall) < off(own, truth, wall) + 3
 
 
-def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
+def test_what_lies_in_the_box_of_a_road_user_is_never_ground():
     T, depth, _ = street(0.0)
     car, box = se2(8.0, 0.0, 0.0, 0.75), {"car": Box(4.0, 2.0, 1.5)}
     rear = (slice(18, 24), slice(30, 34))
@@ -132,7 +132,7 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground() -> None:
     np.testing.assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
 
 
-def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
+def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road():
     box, then = {"car": Box(4.0, 2.0, 1.5)}, se2(17.0, 0.0, 0.0, 0.75)
     T, depth, rgb = street(9.0)
     rear = (slice(18, 26), slice(25, 39))
@@ -152,7 +152,7 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed: int) -> None:
+def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed):
     rng = np.random.default_rng(seed)
     actors = {
         f"{i}": se2(*rng.uniform(-12, 12, 2), rng.uniform(-3, 3), 0.8)
@@ -173,7 +173,7 @@ def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed: int) -> None:
 @pytest.mark.parametrize(
     "height_m", [-1.0, 0.0, 1e-9, 1.5, 400.0]
 )  # below the ground, on it, and of a helicopter
-def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float) -> None:
+def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m):
     T_world_rig = se2(3.0, -2.0, 0.7) @ np.array(
         [[1.0, 0, 0, 0], [0, 0.99, -0.14, 0], [0, 0.14, 0.99, 0], [0, 0, 0, 1]]
     )  # rolled
@@ -191,9 +191,7 @@ def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float
 @pytest.mark.parametrize(
     ("roll", "height_m"), [(0.0, 1.5), (0.3, 0.4), (np.pi, 1.5), (0.0, -1.0), (0.0, 0.0)]
 )
-def test_the_ground_of_a_camera_that_leans_is_what_plain_arithmetic_says(
-    roll: float, height_m: float
-) -> None:
+def test_the_ground_of_a_camera_that_leans_is_what_plain_arithmetic_says(roll, height_m):
     T = street(0.0)[0].copy()
     T[:3, :3] = T[:3, :3] @ np.array(
         [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]

@@ -19,7 +19,7 @@ def reference(grey: int, holds: list[int]) -> np.ndarray:
     return image
 
 
-def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown() -> None:
+def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown():
     fixer = make_fixer("nearest", scene_id="s")
     references = (
         reference(1, [VALID, 0, 0, INCONSISTENT]),
@@ -32,7 +32,7 @@ def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown() -> None:
     assert out.references == ()
 
 
-def test_it_has_no_blocks_and_needs_a_reference() -> None:
+def test_it_has_no_blocks_and_needs_a_reference():
     for wrong in ("mode=chunk", "references=0"):
         with pytest.raises(InputError):
             fixer_settings("nearest", [wrong])

@@ -21,7 +21,7 @@ COMMONROAD = Path(str(resources.files("scenarios"))) / "data" / "USA_US101-3_3_T
 
 
 @pytest.mark.parametrize("name", ["smoke/curve", "smoke/straight", str(COMMONROAD)])
-def test_every_stroke_of_paint_lies_on_a_line_of_the_map(name: str) -> None:
+def test_every_stroke_of_paint_lies_on_a_line_of_the_map(name):
     scenario = load_scenario(name)
     site = make_site(scenario, lambda xy: height_at(scenario.ground, xy))
     strokes = paint_strokes(site)

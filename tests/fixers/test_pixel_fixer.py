@@ -40,7 +40,7 @@ def generator() -> PixelGenerator:
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(tmp_path_factory):
     return write_bundle(tmp_path_factory.mktemp("pixel") / "small.safetensors")
 
 
@@ -69,7 +69,7 @@ def run(fixer: PixelFixer, frames: Sequence[Frame], maps: Sequence[U8] = ()) -> 
     return [out for i, frame in enumerate(frames) for out in fixer.step([frame], maps[i : i + 1])]
 
 
-def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle: Path) -> None:
+def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle):
     fixer = session(bundle)
     assert fixer.blocks == BlockRule(1, 1)
     assert fixer.trained
@@ -84,7 +84,7 @@ def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle: Pat
     assert out.alpha is FRAMES[0].alpha
 
 
-def test_cameras_are_alike_alone_together_and_at_different_rates(bundle: Path) -> None:
+def test_cameras_are_alike_alone_together_and_at_different_rates(bundle):
     left = moving_picture(8, key="left", camera="left")
     right = moving_picture(8, key="right", camera="right")
     small = moving_picture(8, (16, 32), key="small", camera="small")
@@ -94,7 +94,7 @@ def test_cameras_are_alike_alone_together_and_at_different_rates(bundle: Path) -
     }
     slow = pixels(run(session(bundle), right[::2]))
     fixer = session(bundle)
-    out: dict[str, list[Frame]] = {"left": [], "right": [], "small": []}
+    out = {"left": [], "right": [], "small": []}
     for i in range(8):
         frames = [small[i], left[i], *([right[i]] if i % 2 == 0 else [])]
         for frame in fixer.step(frames, ()):
@@ -103,7 +103,7 @@ def test_cameras_are_alike_alone_together_and_at_different_rates(bundle: Path) -
         assert np.abs(pixels(out[name]).astype(int) - expected).max() <= 1, name
 
 
-def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle: Path) -> None:
+def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle):
     fixer = session(bundle)
     first = pixels(run(fixer, FRAMES))
     fixer.reset(0)
@@ -118,13 +118,13 @@ def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle: Path) ->
 
 
 @pytest.mark.parametrize("size", [(17, 33), (30, 50), (16, 16)])
-def test_odd_sizes_are_padded_and_cropped(bundle: Path, size: tuple[int, int]) -> None:
+def test_odd_sizes_are_padded_and_cropped(bundle, size):
     out = run(session(bundle), moving_picture(3, size), maps_of(moving_picture(3, size)))
     assert [frame.rgb.shape for frame in out] == [(*size, 3)] * 3
     assert not any(frame.events for frame in out)
 
 
-def test_a_missing_map_is_a_black_one(bundle: Path) -> None:
+def test_a_missing_map_is_a_black_one(bundle):
     black = [np.zeros((*SIZE, 3), np.uint8)] * len(FRAMES)
     without = pixels(run(session(bundle), FRAMES))
     assert np.array_equal(pixels(run(session(bundle), FRAMES, black)), without)
@@ -132,7 +132,7 @@ def test_a_missing_map_is_a_black_one(bundle: Path) -> None:
     assert not np.array_equal(pixels(run(session(bundle), FRAMES, MAPS)), without)
 
 
-def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
+def test_a_refused_step_leaves_the_history(bundle):
     expected = run(session(bundle), FRAMES[:3])
     fixer = session(bundle)
     run(fixer, FRAMES[:2])
@@ -149,7 +149,7 @@ def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
     assert np.array_equal(fixer.step(FRAMES[2:3], ())[0].rgb, expected[2].rgb)
 
 
-def test_a_frame_that_is_not_finite_is_passed_raw_and_forgotten(bundle: Path) -> None:
+def test_a_frame_that_is_not_finite_is_passed_raw_and_forgotten(bundle):
     fixer = session(bundle)
     run(fixer, FRAMES[:2])
     past = fixer._history["front"]
@@ -161,7 +161,7 @@ def test_a_frame_that_is_not_finite_is_passed_raw_and_forgotten(bundle: Path) ->
     assert not any(frame.events for frame in out[1:])
 
 
-def test_bundles_of_the_two_kinds_are_told_apart(bundle: Path, tmp_path: Path) -> None:
+def test_bundles_of_the_two_kinds_are_told_apart(bundle, tmp_path):
     assert bundle_fixer(bundle)[0] == "onefixer"
     with pytest.raises(InputError):
         read_bundle(bundle, small_settings())
@@ -173,7 +173,7 @@ def test_bundles_of_the_two_kinds_are_told_apart(bundle: Path, tmp_path: Path) -
         fixer_settings("onefixer", ["weights.bundle=null", "weights.dit=a"])
 
 
-def test_an_untrained_generator_returns_the_render(bundle: Path) -> None:
+def test_an_untrained_generator_returns_the_render(bundle):
     settings = fixer_settings(
         "onefixer", ["weights.bundle=null", "generator.widths=[8,8,8]", "untrained=identity"]
     )
@@ -209,13 +209,13 @@ def invented(level: float = 0.9) -> Tensor:
     return out
 
 
-def test_an_invention_on_an_opaque_road_is_taken_back() -> None:
+def test_an_invention_on_an_opaque_road_is_taken_back():
     kept = share(invented())
     assert float(kept[0, 32, 32]) > 0.9
     assert float(kept[0, :8].max()) == 0
 
 
-def test_a_change_with_support_stays() -> None:
+def test_a_change_with_support_stays():
     assert not share(invented(), opacity=0.4).any()  # the render is a hole
     assert not share(invented(), sdmap=0.5).any()  # the map shows something there
     assert not share(invented(), before=invented().roll(8, 2)).any()  # it was there before, nearby
@@ -223,7 +223,7 @@ def test_a_change_with_support_stays() -> None:
 
 
 @pytest.fixture(scope="module")
-def reading(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reading(tmp_path_factory):
     """Write weights that read references and give them most of the picture."""
     torch.manual_seed(5)
     net = PixelGenerator(replace(SIZES, blend=8))
@@ -244,7 +244,7 @@ def with_reference(frame: Frame, grey: int, holds: int = 255) -> Frame:
     return replace(frame, references=(image,))
 
 
-def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading: Path) -> None:
+def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading):
     fixer = session(reading, "holes=render", "keep_render=false")
     (out,) = fixer.step([with_reference(FRAMES[0], 200)], MAPS[:1])
     assert np.abs(out.rgb.astype(int) - 200).mean() < 12
@@ -255,7 +255,7 @@ def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading: Path) -> 
     assert 0 <= none.facts["guessed_share"] <= 1
 
 
-def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading: Path) -> None:
+def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading):
     front, side = (
         with_reference(FRAMES[0], 90),
         replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us),
@@ -266,7 +266,7 @@ def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(rea
         assert np.abs(both[i].rgb.astype(int) - alone.rgb).max() <= 1
 
 
-def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading: Path) -> None:
+def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading):
     grey = replace(
         FRAMES[0], rgb=np.full((*SIZE, 3), 20, np.uint8), alpha=np.ones(SIZE, np.float32)
     )

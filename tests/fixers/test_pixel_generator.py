@@ -47,7 +47,7 @@ def rolled(
     return out, state
 
 
-def test_cells_hold_their_pixels_in_rows_and_come_apart_again() -> None:
+def test_cells_hold_their_pixels_in_rows_and_come_apart_again():
     x = torch.arange(2 * 8 * 12 * 3.0).view(2, 8, 12, 3)
     packed = cells(x, 4)
     assert torch.equal(packed[1, 1, 2].view(4, 4, 3), x[1, 4:8, 8:12])
@@ -70,7 +70,7 @@ def test_cells_hold_their_pixels_in_rows_and_come_apart_again() -> None:
         ({"stem.weight": None}, "no kernel stem.weight"),
     ],
 )
-def test_weights_that_do_not_fit_are_named(change: dict[str, Tensor | None], words: str) -> None:
+def test_weights_that_do_not_fit_are_named(change, words):
     tensors = {
         key: value for key, value in (network().state_dict() | change).items() if value is not None
     }
@@ -78,7 +78,7 @@ def test_weights_that_do_not_fit_are_named(change: dict[str, Tensor | None], wor
         PixelGenerator.from_state_dict(tensors)
 
 
-def test_the_state_is_all_that_goes_on() -> None:
+def test_the_state_is_all_that_goes_on():
     net, clip = network(), frames(4)
     whole, _ = rolled(net, clip)
     _, after_two = rolled(net, clip[:2])
@@ -91,7 +91,7 @@ def test_the_state_is_all_that_goes_on() -> None:
     assert not torch.equal(net(*clip[3], after_two)[0], whole[3])  # and the past is seen
 
 
-def test_fresh_clips_start_again_and_others_go_on() -> None:
+def test_fresh_clips_start_again_and_others_go_on():
     net, clip = network(), frames(2)
     _, state = rolled(net, clip[:1])
     mixed = state.restarted(torch.tensor([True, False]), net.start(clip[1][0]))
@@ -100,7 +100,7 @@ def test_fresh_clips_start_again_and_others_go_on() -> None:
     assert not mixed.hidden[0].any()
 
 
-def test_time_one_is_the_deployed_step_and_other_times_differ() -> None:
+def test_time_one_is_the_deployed_step_and_other_times_differ():
     net, (frame,) = network(), frames(1)
     torch.nn.init.normal_(net.time.weight)
     state, source = net.start(frame[0]), torch.randn_like(frame[0])
@@ -112,7 +112,7 @@ def test_time_one_is_the_deployed_step_and_other_times_differ() -> None:
     )
 
 
-def test_noise_enters_holes_alone() -> None:
+def test_noise_enters_holes_alone():
     opacity = torch.tensor([0.0, 0.25, 0.5, 0.9, 1.0])
     assert hole_mask(opacity).tolist() == [0, 0.5, 1, 1, 1]
     ((render, alpha, _),) = frames(1)

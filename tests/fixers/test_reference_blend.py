@@ -44,7 +44,7 @@ def call(
     return out
 
 
-def test_references_that_hold_nowhere_are_as_good_as_none() -> None:
+def test_references_that_hold_nowhere_are_as_good_as_none():
     net = trained_like()
     render, opacity, sdmap, images = inputs(3)
     images[..., 3] = 0
@@ -54,7 +54,7 @@ def test_references_that_hold_nowhere_are_as_good_as_none() -> None:
     assert float(state.recorded.max()) == 0
 
 
-def test_the_order_of_references_does_not_matter() -> None:
+def test_the_order_of_references_does_not_matter():
     net = trained_like()
     render, opacity, sdmap, images = inputs(4)
     one, _ = call(net, render, opacity, sdmap, images)
@@ -63,7 +63,7 @@ def test_the_order_of_references_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize(("batch", "references"), [(1, 0), (1, 1), (2, 3)])
-def test_the_operations_of_a_processor_give_the_same_frame(batch: int, references: int) -> None:
+def test_the_operations_of_a_processor_give_the_same_frame(batch, references):
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, batch)
     given = (images.abs() * 255).byte() if references else None
@@ -78,7 +78,7 @@ def test_the_operations_of_a_processor_give_the_same_frame(batch: int, reference
 
 
 @pytest.mark.parametrize("references", [0, 2])
-def test_a_network_that_sees_smaller_images_blends_at_full_size(references: int) -> None:
+def test_a_network_that_sees_smaller_images_blends_at_full_size(references):
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, 2)
     given = (images.abs() * 255).byte() if references else None
@@ -105,7 +105,7 @@ def test_a_network_that_sees_smaller_images_blends_at_full_size(references: int)
         assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
 
 
-def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on() -> None:
+def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on():
     image = torch.rand(1, HEIGHT, WIDTH, 4, generator=torch.Generator().manual_seed(1))
     offset = torch.zeros(1, HEIGHT // 2, WIDTH // 2, 2)
     offset[..., 0], offset[..., 1] = 3.0, -2.0

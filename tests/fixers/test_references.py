@@ -68,7 +68,7 @@ def columns() -> U8:
     )
 
 
-def test_a_frame_warped_into_its_own_view_is_itself() -> None:
+def test_a_frame_warped_into_its_own_view_is_itself():
     depth = np.random.default_rng(1).uniform(2, 60, (HEIGHT, WIDTH)).astype(np.float32)
     depth[:8] = 0  # sky
     one = picture(at(3.0, 1.0, 0.3), depth)
@@ -77,7 +77,7 @@ def test_a_frame_warped_into_its_own_view_is_itself() -> None:
     assert np.abs(out[..., :3].astype(int) - one.rgb).max() <= 1
 
 
-def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there() -> None:
+def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there():
     here = at(0.0)
     seen, depth = wall(20.0, here), wall(20.0, here)
     seen[:, 20:40] = 5.0  # a post hid the wall when the frame was recorded
@@ -91,7 +91,7 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
     assert (aside[:, 24:, 3] == VALID).all()
 
 
-def test_nothing_but_the_rotation_moves_the_sky() -> None:
+def test_nothing_but_the_rotation_moves_the_sky():
     sky = np.zeros((HEIGHT, WIDTH), np.float32)
     one = picture(at(0.0), sky, columns())
     assert (
@@ -106,7 +106,7 @@ def test_nothing_but_the_rotation_moves_the_sky() -> None:
     assert turned[HEIGHT // 2, 32, 0] == pytest.approx(4 * middle, abs=3)
 
 
-def test_a_car_is_looked_up_where_it_was() -> None:
+def test_a_car_is_looked_up_where_it_was():
     box = Box(4.0, 2.0, 1.5)
     now = se2(20.0, 0.0, 0.0, 0.75)
     then = se2(14.0, 3.0, 0.0, 0.75)
@@ -162,7 +162,7 @@ def hard_case(seed: int) -> Lookup:
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
+def test_the_kernel_agrees_with_the_plain_arithmetic(seed):
     case = hard_case(seed)
     fast, plain = warp_coordinates(case), plain_coordinates(case)
     # A point exactly on a border may fall to either side: at most one pixel in a thousand.
@@ -186,7 +186,7 @@ def recorded(
     ]
 
 
-def test_the_nearest_frames_come_first_and_far_old_or_turned_ones_not_at_all() -> None:
+def test_the_nearest_frames_come_first_and_far_old_or_turned_ones_not_at_all():
     index = ReferenceIndex(recorded([(0, 0), (5, 0), (10, 0), (11, 2.0), (200, 0)]))
     assert index.choose(at(6.0), 600_000, 2) == (1, 2)
     assert index.choose(at(6.0), 600_000, 9) == (1, 2, 0)
@@ -195,14 +195,14 @@ def test_the_nearest_frames_come_first_and_far_old_or_turned_ones_not_at_all() -
     assert ReferenceIndex([]).choose(at(0.0), 0, 2) == ()
 
 
-def test_a_reference_stays_until_another_is_clearly_nearer() -> None:
+def test_a_reference_stays_until_another_is_clearly_nearer():
     index = ReferenceIndex(recorded([(0, 0), (5, 0)], step_us=1))
     assert index.choose(at(2.6), 0, 1) == (1,)
     assert index.choose(at(2.6), 0, 1, last=(0,)) == (0,)
     assert index.choose(at(3.5), 0, 1, last=(0,)) == (1,)
 
 
-def test_only_earlier_frames_are_references_where_the_past_is_asked_for() -> None:
+def test_only_earlier_frames_are_references_where_the_past_is_asked_for():
     index = ReferenceIndex(recorded([(0, 0), (5, 0), (10, 0)]))
     assert index.choose(at(6.0), 500_000, 3, past=True) == (0,)
     assert index.choose(at(6.0), 0, 3, past=True) == ()
@@ -246,7 +246,7 @@ def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
     return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
 
 
-def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted() -> None:
+def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted():
     asked, frame = request(10.0, 500_000)
     frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
     wrong = replace(
@@ -260,7 +260,7 @@ def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted(
         assert (image != of_lower_road).any()
 
 
-def test_without_memory_the_same_view_has_the_same_references_whatever_came_before() -> None:
+def test_without_memory_the_same_view_has_the_same_references_whatever_came_before():
     found, _ = session(hysteresis=False)
     alone = found.of(*request(10.9, 500_000))
     found.of(*request(40.0, 2_000_000))
@@ -268,7 +268,7 @@ def test_without_memory_the_same_view_has_the_same_references_whatever_came_befo
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
 
 
-def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row() -> None:
+def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
     found, _ = session(hysteresis=False)
     asked, frame = request(10.0, 500_000)
     start, share = at(9.5, 0.0, 0.02), rolling(WIDTH, HEIGHT, "rows", backwards=False)

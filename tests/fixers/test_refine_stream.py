@@ -10,7 +10,7 @@ from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.refine import Difference, StreamStats, refine_frames
 
 
-def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_them() -> None:
+def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_them():
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, 256, (2, 5, 9, 7, 3), dtype=np.uint8)
     a[2] = b[2]
@@ -23,7 +23,7 @@ def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_
     assert difference.max_levels == np.abs(d).max()
 
 
-def test_blocks_are_made_as_they_are_asked_for() -> None:
+def test_blocks_are_made_as_they_are_asked_for():
     taken = []
 
     def frames() -> object:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -42,11 +41,11 @@ def draw(camera=PIN, pose=None, *boxes):
         lambda: actor_boxes({"x": np.eye(4)}, KNOWN),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(call: Callable[[], object]) -> None:
+def test_what_cannot_be_drawn_is_refused(call):
     with pytest.raises(InputError):
         call()
 
 
-def test_actor_boxes_join_poses_with_sizes() -> None:
+def test_actor_boxes_join_poses_with_sizes():
     (one,) = actor_boxes({"b": np.eye(4)}, KNOWN)
     assert (one.label, one.box) == ("bus", CAR)

@@ -29,7 +29,7 @@ def trust(output: np.ndarray, render: np.ndarray, recorded: np.ndarray) -> dict[
 @pytest.mark.parametrize(
     ("height", "width"), [(144, 256), (150, 250), (9, 7), (288, 512), (270, 600)]
 )
-def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
+def test_cells_are_the_means_of_their_pixels(height, width):
     rng = np.random.default_rng(height)
     render, recorded = (
         rng.uniform(-1, 1, (height, width, 3)).astype(np.float32),
@@ -53,9 +53,7 @@ def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
             )
 
 
-def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed() -> (
-    None
-):
+def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed():
     grey, zero = np.zeros((32, 48, 3), np.float32), np.zeros((32, 48), np.float32)
     assert trust(grey, grey, zero) == {
         RECORDED_SHARE: 0,
@@ -70,7 +68,7 @@ def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_
     }
 
 
-def test_a_page_says_what_was_seen_in_the_second_before() -> None:
+def test_a_page_says_what_was_seen_in_the_second_before():
     rows = [
         {
             "t_us": t,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Scenario
+from alpasim_plugin.core.types import F64, LaneMap, Marking, Scenario
 from alpasim_plugin.gaussians.scene.paint import (
     GAP_M,
     LINE_M,
@@ -37,22 +37,22 @@ def length(strokes: Strokes, chosen: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def two_by_two() -> tuple[Strokes, F64]:
+def two_by_two():
     return strokes_of(
         make_scenario(with_default_paint(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH)
     )
 
 
 def test_unknown_edge_between_lanes_of_one_direction_is_dashed_white(
-    two_by_two: tuple[Strokes, F64],
-) -> None:
+    two_by_two,
+):
     strokes, middle = two_by_two
     chosen = at(middle, -LANE_M)
     assert set(strokes.colour[chosen]) == {WHITE}
     assert length(strokes, chosen) == pytest.approx(220 * LINE_M / (LINE_M + GAP_M), rel=0.2)
 
 
-def test_dashes_are_three_metres_with_nine_between(two_by_two: tuple[Strokes, F64]) -> None:
+def test_dashes_are_three_metres_with_nine_between(two_by_two):
     strokes, middle = two_by_two
     chosen = at(middle, -LANE_M)
     x = np.sort(np.concatenate([strokes.start[chosen, 0], strokes.end[chosen, 0]]))
@@ -63,8 +63,8 @@ def test_dashes_are_three_metres_with_nine_between(two_by_two: tuple[Strokes, F6
 
 
 def test_unknown_edge_between_opposing_lanes_is_double_yellow(
-    two_by_two: tuple[Strokes, F64],
-) -> None:
+    two_by_two,
+):
     strokes, middle = two_by_two
     pair = at(middle, 0.0, 0.2)
     assert set(strokes.colour[pair]) == {YELLOW}
@@ -73,7 +73,7 @@ def test_unknown_edge_between_opposing_lanes_is_double_yellow(
     assert not at(middle, 0.0).any()
 
 
-def test_unknown_outer_edge_is_solid_white(two_by_two: tuple[Strokes, F64]) -> None:
+def test_unknown_outer_edge_is_solid_white(two_by_two):
     strokes, middle = two_by_two
     for side in (-1, 1):
         chosen = at(middle, side * 2 * LANE_M)
@@ -81,8 +81,8 @@ def test_unknown_outer_edge_is_solid_white(two_by_two: tuple[Strokes, F64]) -> N
         assert length(strokes, chosen) > 210
 
 
-def test_dashes_run_on_from_lane_to_lane() -> None:
-    lanes: dict[str, Lane] = {}
+def test_dashes_run_on_from_lane_to_lane():
+    lanes = {}
     for i in range(4):
         lanes |= road_lanes(line((i * 17.0, 0), (i * 17.0 + 17.0, 0)), f"r{i}", 2)
     strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
@@ -91,7 +91,7 @@ def test_dashes_run_on_from_lane_to_lane() -> None:
     assert np.diff(x).max() == pytest.approx(GAP_M, abs=0.1)
 
 
-def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
+def test_known_paint_is_believed_and_shared_edges_are_painted_once():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     lanes["r-a0"] = replace(
         lanes["r-a0"], right_paint="solid_yellow"
@@ -102,13 +102,13 @@ def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
     assert length(strokes, chosen) == pytest.approx(80, rel=0.02)
 
 
-def test_nothing_unknown_is_painted_inside_an_intersection() -> None:
+def test_nothing_unknown_is_painted_inside_an_intersection():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 1, is_intersection=True)
     strokes, _ = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     assert len(strokes.start) == 0
 
 
-def test_map_with_marking_lines_keeps_unknown_lane_edges_bare() -> None:
+def test_map_with_marking_lines_keeps_unknown_lane_edges_bare():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     marking = Marking(line((0, -LANE_M), (80, -LANE_M)), "solid_white")
     strokes, middle = strokes_of(
@@ -118,7 +118,7 @@ def test_map_with_marking_lines_keeps_unknown_lane_edges_bare() -> None:
     assert length(strokes, at(middle, -LANE_M)) == pytest.approx(80, rel=0.02)
 
 
-def test_zebra_bars_lie_along_the_road_across_the_walk() -> None:
+def test_zebra_bars_lie_along_the_road_across_the_walk():
     walk = np.array([[30.0, -7.0, 0], [33.0, -7.0, 0], [33.0, 7.0, 0], [30.0, 7.0, 0]])
     strokes, middle = strokes_of(make_scenario(LaneMap({}, crosswalks=(walk,)), PATH))
     direction = (strokes.end - strokes.start) / np.linalg.norm(

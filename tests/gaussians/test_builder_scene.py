@@ -56,12 +56,12 @@ def digest(graph: SceneGraph) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def street() -> tuple[Scenario, SceneGraph]:
+def street():
     scenario = straight()
     return scenario, built(scenario)
 
 
-def test_same_scenario_builds_bit_identical_gaussians(street: tuple[Scenario, SceneGraph]) -> None:
+def test_same_scenario_builds_bit_identical_gaussians(street):
     assert digest(street[1]) == digest(built(straight()))
 
 
@@ -73,9 +73,7 @@ def empty_street(make: Callable[..., Scenario]) -> tuple[Scenario, SceneGraph]:
 
 @pytest.mark.parametrize("make", first_of([crossing, straight, curve]))
 @pytest.mark.parametrize("left_m", [0.0, 3.0])
-def test_ground_has_no_holes_from_the_path_or_three_metres_aside(
-    make: Callable[..., Scenario], left_m: float
-) -> None:
+def test_ground_has_no_holes_from_the_path_or_three_metres_aside(make, left_m):
     scenario, graph = empty_street(make)
     n = len(scenario.ego_log)
     for index in (0, n // 2, n - 1):
@@ -85,8 +83,8 @@ def test_ground_has_no_holes_from_the_path_or_three_metres_aside(
 
 
 def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
-    street: tuple[Scenario, SceneGraph],
-) -> None:
+    street,
+):
     scenario, graph = street
     camera = view(scenario, 2, width=480, height=272)
     image = graph.render(camera, {}).rgb
@@ -112,9 +110,7 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
         assert np.ptp(lane) < 0.06
 
 
-def test_coarser_levels_of_the_road_look_like_the_finer_ones(
-    street: tuple[Scenario, SceneGraph], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_coarser_levels_of_the_road_look_like_the_finer_ones(street, monkeypatch):
     scenario, graph = street
     camera = view(scenario, 2)
     usual = graph.render(camera, {}).rgb
@@ -123,7 +119,7 @@ def test_coarser_levels_of_the_road_look_like_the_finer_ones(
     assert np.sqrt(np.mean((fine - usual) ** 2)) < 0.05
 
 
-def test_houses_leave_road_actors_and_each_other_alone() -> None:
+def test_houses_leave_road_actors_and_each_other_alone():
     scenario = straight(environment=Environment(buildings=1.0))
     site = make_site(scenario, partial(height_at, scenario.ground))
     graph = built(scenario)
@@ -135,7 +131,7 @@ def test_houses_leave_road_actors_and_each_other_alone() -> None:
         assert not site.look_up(site.taken, plan).any()
 
 
-def test_map_without_edges_gets_a_road_around_its_centres() -> None:
+def test_map_without_edges_gets_a_road_around_its_centres():
     lanes = {
         k: replace(v, left=None, right=None)
         for k, v in road_lanes(line((-20, 0), (120, 0)), "r", 1).items()
@@ -149,14 +145,14 @@ def test_map_without_edges_gets_a_road_around_its_centres() -> None:
     assert built(scenario).render(view(scenario, 3), {}).alpha[100:].min() > 0.8
 
 
-def test_empty_map_gives_a_road_under_the_logged_path() -> None:
+def test_empty_map_gives_a_road_under_the_logged_path():
     scenario = make_scenario(LaneMap({}), line((0, 0), (50, 0)))
     site = make_site(scenario, partial(height_at, scenario.ground))
     assert site.look_up(site.road, site.path).all()
     assert built(scenario).render(view(scenario, 3), {}).stats["visible"] > 1000
 
 
-def test_roadside_lines_have_the_road_on_their_left() -> None:
+def test_roadside_lines_have_the_road_on_their_left():
     site = make_site(straight(), lambda xy: np.zeros(len(xy)))
     for c in contours(site, 2.0, 40.0):
         d = np.gradient(c, axis=0)
@@ -167,7 +163,7 @@ def test_roadside_lines_have_the_road_on_their_left() -> None:
         )
 
 
-def test_actor_fills_its_box_and_stays_inside(street: tuple[Scenario, SceneGraph]) -> None:
+def test_actor_fills_its_box_and_stays_inside(street):
     for actor in STREET_ACTORS:
         cloud = street[1].actors[actor.actor_id].levels[0].cloud
         half = np.array([actor.box.length_m, actor.box.width_m, actor.box.height_m]) / 2
@@ -178,8 +174,8 @@ def test_actor_fills_its_box_and_stays_inside(street: tuple[Scenario, SceneGraph
 
 
 def test_actors_of_one_scene_differ_in_colour_and_keep_it(
-    street: tuple[Scenario, SceneGraph],
-) -> None:
+    street,
+):
     models = {seed: [build_actor(a, "test", seed) for a in STREET_ACTORS[:2]] for seed in range(5)}
     colours = {
         tuple(np.median(m.levels[0].cloud.sh[:, 0], axis=0).round(3))
@@ -194,7 +190,7 @@ def test_actors_of_one_scene_differ_in_colour_and_keep_it(
 
 
 @pytest.mark.slow
-def test_dusk_darkens_everything_below_the_sky(street: tuple[Scenario, SceneGraph]) -> None:
+def test_dusk_darkens_everything_below_the_sky(street):
     scenario = straight(environment=Environment(sky="dusk"))
     day, dusk = (g.render(view(scenario, 2), {}) for g in (street[1], built(scenario)))
     ground = day.alpha > 0.98
@@ -204,8 +200,8 @@ def test_dusk_darkens_everything_below_the_sky(street: tuple[Scenario, SceneGrap
 
 
 def test_file_background_is_scaled_turned_and_cut_into_blocks(
-    street: tuple[Scenario, SceneGraph],
-) -> None:
+    street,
+):
     cloud = street[1].actors["bus-1"].levels[0].cloud
     T = np.eye(4)
     T[:3, :3] = 2.0 * se3([0, 0, 0], quat_from_yaw(0.5))[:3, :3]

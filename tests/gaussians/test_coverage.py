@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ T_FILE_WORLD = np.array([[0.0, -1, 0, 40], [0, 0, -1, 3], [1, 0, 0, -900], [0, 0
 )
 
 
-def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it() -> None:
+def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it():
     whole = coverage_of(street(), PATH)
     assert whole.covered == 1.0
     assert whole.low[0] == pytest.approx(0.8, abs=0.5)
@@ -71,9 +70,7 @@ def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it() -> No
     )
 
 
-def test_a_file_that_cannot_be_seen_is_refused_until_it_is_placed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_cannot_be_seen_is_refused_until_it_is_placed(tmp_path, capsys):
     write_ply(tmp_path / "lying.ply", placed_cloud(street(), T_FILE_WORLD))
     scene = tmp_path / "scene.yaml"
     scene.write_text(ROAD + "background: {file: lying.ply}\n")

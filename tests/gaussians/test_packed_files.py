@@ -33,7 +33,7 @@ from tests.examples import examples
 
 
 @pytest.fixture
-def biker(shared_data: Path) -> Path:
+def biker(shared_data):
     return shared_data / "gaussians"
 
 
@@ -49,7 +49,7 @@ def as_stored(arrays: GaussianArrays) -> GaussianArrays:
 # --- one model in two files
 
 
-def test_both_bikers_have_the_published_facts(biker: Path) -> None:
+def test_both_bikers_have_the_published_facts(biker):
     ply, spz = (
         read_compressed_ply(biker / "biker.compressed.ply"),
         as_stored(read_spz(biker / "biker.spz")),
@@ -62,7 +62,7 @@ def test_both_bikers_have_the_published_facts(biker: Path) -> None:
     assert f"{ply.opacities.mean():.10f}" == f"{spz.opacities.mean():.10f}" == "0.2966253344"
 
 
-def test_both_bikers_agree_after_the_axis_flip(biker: Path) -> None:
+def test_both_bikers_agree_after_the_axis_flip(biker):
     ply, spz = (
         read_compressed_ply(biker / "biker.compressed.ply"),
         as_stored(read_spz(biker / "biker.spz")),
@@ -78,9 +78,7 @@ def test_both_bikers_agree_after_the_axis_flip(biker: Path) -> None:
 
 @pytest.mark.parametrize("name", ["biker.compressed.ply", "biker.spz"])
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_biker_cut_short_is_refused_by_its_path(
-    biker: Path, tmp_path: Path, name: str, percent: int
-) -> None:
+def test_biker_cut_short_is_refused_by_its_path(biker, tmp_path, name, percent):
     data = (biker / name).read_bytes()
     cut = tmp_path / name
     cut.write_bytes(data[: len(data) * percent // 100])
@@ -89,7 +87,7 @@ def test_biker_cut_short_is_refused_by_its_path(
     assert name in str(caught.value)
 
 
-def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker: Path) -> None:
+def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker):
     with pytest.raises(InputError) as caught:
         read_ply(biker / "biker.compressed.ply")
     assert "read_gaussians" in caught.value.hint
@@ -124,7 +122,7 @@ def write_compressed(
     return path
 
 
-def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
+def test_packed_bits_are_spread_over_the_chunk(tmp_path):
     position = 2047 << 21 | 0 << 11 | 2047
     colour = 255 << 24 | 0 << 16 | 51 << 8 | 102
     path = write_compressed(
@@ -138,7 +136,7 @@ def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
     np.testing.assert_allclose(raw.quats[0], [1, 0, 0, 0], atol=1e-3)
 
 
-def test_harmonics_element_is_channel_major(tmp_path: Path) -> None:
+def test_harmonics_element_is_channel_major(tmp_path):
     table = np.full(9, 128, np.uint8)
     table[1] = 255  # red, second coefficient
     raw = read_compressed_ply(
@@ -150,7 +148,7 @@ def test_harmonics_element_is_channel_major(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("largest", range(4))
-def test_left_out_component_is_restored_in_its_place(largest: int) -> None:
+def test_left_out_component_is_restored_in_its_place(largest):
     quat = np.array([0.1, -0.2, 0.3, 0.15])
     quat[largest] = 0
     quat[largest] = np.sqrt(1 - quat @ quat)
@@ -162,7 +160,7 @@ def test_left_out_component_is_restored_in_its_place(largest: int) -> None:
 # --- .splat
 
 
-def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, biker: Path) -> None:
+def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path, biker):
     cloud, _ = read_gaussians(biker / "train-1000.ply")
     write_splat(tmp_path / "a.splat", cloud)
     assert (tmp_path / "a.splat").stat().st_size == 32 * 1000
@@ -178,7 +176,7 @@ def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, bik
     assert angle.max() < 2 * np.sqrt(4) / 128
 
 
-def test_splat_bytes_worked_by_hand(tmp_path: Path) -> None:
+def test_splat_bytes_worked_by_hand(tmp_path):
     row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 128, 192, 128, 64, 128)
     (tmp_path / "a.splat").write_bytes(row)
     raw = read_splat(tmp_path / "a.splat")
@@ -188,7 +186,7 @@ def test_splat_bytes_worked_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 31, 33, 63])
-def test_splat_of_broken_size_is_refused(tmp_path: Path, size: int) -> None:
+def test_splat_of_broken_size_is_refused(tmp_path, size):
     (tmp_path / "a.splat").write_bytes(bytes(size))
     with pytest.raises(InputError):
         read_splat(tmp_path / "a.splat")
@@ -221,9 +219,7 @@ def write_spz(
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_every_version_unpacks_to_the_same_numbers(
-    tmp_path: Path, version: int, degree: int
-) -> None:
+def test_every_version_unpacks_to_the_same_numbers(tmp_path, version, degree):
     streams = body_streams(version, 6, degree)
     streams[0] = b"".join(int(v).to_bytes(3, "little", signed=True) for v in range(-9, 9))
     raw = as_stored(read_spz(write_spz(tmp_path / "a.spz", version, 6, degree, streams)))
@@ -238,7 +234,7 @@ def test_every_version_unpacks_to_the_same_numbers(
     assert report.n_kept == len(cloud) == 6
 
 
-def test_version_2_rotation_is_xyz_bytes(tmp_path: Path) -> None:
+def test_version_2_rotation_is_xyz_bytes(tmp_path):
     streams = body_streams(2, 1, 0)
     streams[4] = bytes([255, 128, 127])
     quat = as_stored(read_spz(write_spz(tmp_path / "a.spz", 2, 1, 0, streams))).quats[0]
@@ -247,7 +243,7 @@ def test_version_2_rotation_is_xyz_bytes(tmp_path: Path) -> None:
 
 @settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: max(map(abs, q)) > 0.1))
-def test_smallest_three_rotation_is_restored(q: list[float]) -> None:
+def test_smallest_three_rotation_is_restored(q):
     xyzw = np.array(q) / np.linalg.norm(q)
     largest = int(np.argmax(np.abs(xyzw)))
     xyzw = xyzw * np.copysign(1, xyzw[largest])
@@ -261,7 +257,7 @@ def test_smallest_three_rotation_is_restored(q: list[float]) -> None:
     np.testing.assert_allclose(wxyz, xyzw[[3, 0, 1, 2]], atol=2.5e-3)
 
 
-def test_turning_axes_turns_colour_with_direction(tmp_path: Path) -> None:
+def test_turning_axes_turns_colour_with_direction(tmp_path):
     path = write_spz(tmp_path / "a.spz", 3, 6, 3, body_streams(3, 6, 3))
     rdf = read_spz(path)
     rub = as_stored(rdf)
@@ -272,16 +268,14 @@ def test_turning_axes_turns_colour_with_direction(tmp_path: Path) -> None:
     np.testing.assert_allclose(after, before, atol=1e-5)
 
 
-def test_fourth_degree_is_cut_and_noted(tmp_path: Path) -> None:
+def test_fourth_degree_is_cut_and_noted(tmp_path):
     cloud, report = read_gaussians(write_spz(tmp_path / "a.spz", 4, 2, 4, body_streams(4, 2, 4)))
     assert cloud.sh.shape == (2, 16, 3)
     assert any("degree 4" in note for note in report.notes)
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
-def test_count_beyond_the_data_is_refused_without_unpacking_it(
-    tmp_path: Path, version: int
-) -> None:
+def test_count_beyond_the_data_is_refused_without_unpacking_it(tmp_path, version):
     path = write_spz(
         tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000
     )
@@ -289,7 +283,7 @@ def test_count_beyond_the_data_is_refused_without_unpacking_it(
         read_spz(path)
 
 
-def test_unknown_version_and_wrong_magic_are_refused(tmp_path: Path) -> None:
+def test_unknown_version_and_wrong_magic_are_refused(tmp_path):
     (tmp_path / "a.spz").write_bytes(b"NGSP" + struct.pack("<II", 9, 1) + bytes(40))
     with pytest.raises(InputError):
         read_spz(tmp_path / "a.spz")
@@ -299,7 +293,7 @@ def test_unknown_version_and_wrong_magic_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_flipped_compressed_bytes_are_refused(tmp_path: Path, version: int) -> None:
+def test_flipped_compressed_bytes_are_refused(tmp_path, version):
     path = write_spz(tmp_path / "a.spz", version, 500, 1, body_streams(version, 500, 1))
     data = bytearray(path.read_bytes())
     start = 12 if version == 3 else 32 + 16 * 6
@@ -312,12 +306,12 @@ def test_flipped_compressed_bytes_are_refused(tmp_path: Path, version: int) -> N
 # --- dispatch
 
 
-def test_content_decides_before_the_suffix(tmp_path: Path, biker: Path) -> None:
+def test_content_decides_before_the_suffix(tmp_path, biker):
     (tmp_path / "model.bin").write_bytes((biker / "train-1000.ply").read_bytes())
     assert len(read_gaussians(tmp_path / "model.bin")[0]) == 1000
 
 
-def test_unknown_form_lists_the_known_ones(tmp_path: Path) -> None:
+def test_unknown_form_lists_the_known_ones(tmp_path):
     (tmp_path / "a.gltf").write_bytes(b"PK\x03\x04....")
     with pytest.raises(InputError):
         read_gaussians(tmp_path / "a.gltf")

@@ -68,11 +68,11 @@ NAMES = [
 
 
 @pytest.fixture
-def train(shared_data: Path) -> Path:
+def train(shared_data):
     return shared_data / "gaussians" / "train-1000.ply"
 
 
-def test_trained_model_has_the_published_facts(train: Path) -> None:
+def test_trained_model_has_the_published_facts(train):
     raw = read_ply_arrays(train)
     header = read_ply_header(train)
     rows = read_ply_element(header, "vertex")
@@ -92,14 +92,14 @@ def test_trained_model_has_the_published_facts(train: Path) -> None:
     np.testing.assert_allclose(raw.sh[:, 0].mean(axis=0), (0.1658, 0.2361, 0.0812), atol=5e-5)
 
 
-def test_trained_model_comes_back_byte_for_byte(train: Path, tmp_path: Path) -> None:
+def test_trained_model_comes_back_byte_for_byte(train, tmp_path):
     write_ply(tmp_path / "copy.ply", GaussianCloud(*read_ply_arrays(train)[:5]))
     body = 1000 * 62 * 4
     assert (tmp_path / "copy.ply").read_bytes()[-body:] == train.read_bytes()[-body:]
 
 
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_trained_model_cut_short_is_refused(train: Path, tmp_path: Path, percent: int) -> None:
+def test_trained_model_cut_short_is_refused(train, tmp_path, percent):
     data = train.read_bytes()
     cut = tmp_path / "cut.ply"
     cut.write_bytes(data[: len(data) * percent // 100])
@@ -112,7 +112,7 @@ def test_trained_model_cut_short_is_refused(train: Path, tmp_path: Path, percent
 
 
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
-def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int) -> None:
+def test_every_degree_survives_a_round_trip(tmp_path, k):
     cloud = make_cloud(k=k)
     write_ply(tmp_path / "a.ply", cloud)
     back = read_ply_arrays(tmp_path / "a.ply")
@@ -131,9 +131,7 @@ def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int) -> None:
     ),
     mean=st.floats(-1e6, 1e6, width=32),
 )
-def test_means_and_colours_are_bit_exact(
-    tmp_path_factory: pytest.TempPathFactory, sh: np.ndarray, mean: float
-) -> None:
+def test_means_and_colours_are_bit_exact(tmp_path_factory, sh, mean):
     n = len(sh)
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     write_ply(
@@ -152,7 +150,7 @@ def test_means_and_colours_are_bit_exact(
     assert len(back.means) == n
 
 
-def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path: Path) -> None:
+def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path):
     cloud = make_cloud(n=1)
     sh = np.zeros((1, 16, 3), np.float32)
     sh[0, 3, 0] = 0.75  # third coefficient beyond the constant, red
@@ -167,7 +165,7 @@ def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path: Path)
     ]
 
 
-def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path: Path) -> None:
+def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path):
     names = [*NAMES, *(f"f_rest_{i}" for i in range(9))]
     row = np.zeros((1, len(names)))
     row[0, names.index("rot_0")] = 1
@@ -179,7 +177,7 @@ def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path: Path) -
     assert np.count_nonzero(sh) == 1
 
 
-def test_property_order_and_extra_properties_do_not_matter(tmp_path: Path) -> None:
+def test_property_order_and_extra_properties_do_not_matter(tmp_path):
     cloud = make_cloud(n=4, k=4)
     rows = ply_rows(cloud)
     names = [*reversed(rows.dtype.names), "semantic_0"]
@@ -188,7 +186,7 @@ def test_property_order_and_extra_properties_do_not_matter(tmp_path: Path) -> No
     np.testing.assert_array_equal(read_ply_arrays(path).sh, cloud.sh)
 
 
-def test_big_endian_doubles_are_read(tmp_path: Path) -> None:
+def test_big_endian_doubles_are_read(tmp_path):
     header = "element vertex 1\n" + "".join(f"property double {n}\n" for n in NAMES)
     row = (np.arange(1, len(NAMES) + 1) / 100).astype(">f8")
     path = write_elements(tmp_path / "a.ply", (header, row.tobytes()), fmt="binary_big_endian")
@@ -201,7 +199,7 @@ def test_big_endian_doubles_are_read(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def street(tmp_path: Path) -> Path:
+def street(tmp_path):
     background, actor = np.zeros((3, len(NAMES))), np.zeros((2, len(NAMES)))
     background[:, NAMES.index("rot_0")] = actor[:, NAMES.index("rot_0")] = 1
     actor[:, 0] = 5
@@ -212,7 +210,7 @@ def street(tmp_path: Path) -> Path:
     )
 
 
-def test_street_model_asks_which_part(street: Path) -> None:
+def test_street_model_asks_which_part(street):
     with pytest.raises(
         InputError, match=r"2 models in one file: \['vertex_background', 'vertex_obj_000'\]"
     ) as caught:
@@ -220,7 +218,7 @@ def test_street_model_asks_which_part(street: Path) -> None:
     assert "element='vertex_background'" in caught.value.hint
 
 
-def test_street_model_gives_the_named_part(street: Path) -> None:
+def test_street_model_gives_the_named_part(street):
     assert len(read_ply(street, element="vertex_background")) == 3
     actor, _ = read_gaussians(street, element="vertex_obj_000")
     assert len(actor) == 2
@@ -230,7 +228,7 @@ def test_street_model_gives_the_named_part(street: Path) -> None:
 # --- what is refused
 
 
-def test_absurd_count_is_refused_without_allocating(tmp_path: Path) -> None:
+def test_absurd_count_is_refused_without_allocating(tmp_path):
     header = "element vertex 99999999999999\n" + "".join(f"property float {n}\n" for n in NAMES)
     path = write_elements(tmp_path / "a.ply", (header, bytes(560)))
     with pytest.raises(InputError):
@@ -241,20 +239,20 @@ def test_absurd_count_is_refused_without_allocating(tmp_path: Path) -> None:
     "line",
     ["element vertex -5", "element vertex many", "element vertex", "property quark x", "hello"],
 )
-def test_broken_header_line_is_named(tmp_path: Path, line: str) -> None:
+def test_broken_header_line_is_named(tmp_path, line):
     path = write_elements(tmp_path / "a.ply", (line + "\n", b""))
     with pytest.raises(InputError):
         read_ply_header(path)
 
 
-def test_incomplete_band_of_harmonics_is_refused(tmp_path: Path) -> None:
+def test_incomplete_band_of_harmonics_is_refused(tmp_path):
     names = [*NAMES, *(f"f_rest_{i}" for i in range(10))]
     path = write_elements(tmp_path / "a.ply", element("vertex", names, np.zeros((1, len(names)))))
     with pytest.raises(InputError):
         read_ply(path)
 
 
-def test_fourth_degree_is_cut_to_the_third_and_noted(tmp_path: Path) -> None:
+def test_fourth_degree_is_cut_to_the_third_and_noted(tmp_path):
     names = [*NAMES, *(f"f_rest_{i}" for i in range(72))]
     rows = np.zeros((2, len(names)))
     rows[:, names.index("rot_0")] = 1
@@ -265,7 +263,7 @@ def test_fourth_degree_is_cut_to_the_third_and_noted(tmp_path: Path) -> None:
     assert any("degree 4" in note for note in report.notes)
 
 
-def test_broken_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_broken_gaussians_are_dropped_and_counted(tmp_path):
     rows = np.zeros((4, len(NAMES)))
     rows[:, NAMES.index("rot_0")] = 1
     rows[0, 0] = np.nan
@@ -282,7 +280,7 @@ def test_broken_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     }
 
 
-def test_unfinished_file_never_bears_the_name(tmp_path: Path) -> None:
+def test_unfinished_file_never_bears_the_name(tmp_path):
     with pytest.raises(InfrastructureError):
         write_ply(tmp_path / "absent" / "a.ply", make_cloud())
     write_ply(tmp_path / "a.ply", make_cloud())

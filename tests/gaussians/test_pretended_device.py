@@ -31,7 +31,7 @@ def frames() -> list[Frame]:
     ]
 
 
-def test_a_scene_is_uploaded_once_and_a_frame_waits_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_is_uploaded_once_and_a_frame_waits_once(monkeypatch):
     background = [node(f"b{i}", blobs((8 + 4 * i, 3 - 2 * i, 1.0), n=12, seed=i)) for i in range(4)]
     car = node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")
     poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
@@ -50,7 +50,7 @@ def test_a_scene_is_uploaded_once_and_a_frame_waits_once(monkeypatch: pytest.Mon
     assert traffic.launches <= 20
 
 
-def test_the_fixer_waits_once_a_frame_and_downloads_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fixer_waits_once_a_frame_and_downloads_bytes(monkeypatch):
     host = make_fixer("onefixer", scene_id="scene")
     wanted = [host.step([frame], [frame.rgb])[0] for frame in frames()]
     with pretended_device(monkeypatch) as traffic:
@@ -66,7 +66,7 @@ def test_the_fixer_waits_once_a_frame_and_downloads_bytes(monkeypatch: pytest.Mo
             assert traffic.launches <= 300
 
 
-def test_tensors_of_two_devices_do_not_mix(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensors_of_two_devices_do_not_mix(monkeypatch):
     with pretended_device(monkeypatch):
         ours = torch.zeros(3, device="cuda")
         with pytest.raises(RuntimeError):

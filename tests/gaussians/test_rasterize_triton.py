@@ -44,9 +44,7 @@ def moved(cloud: GaussianCloud, offset) -> GaussianCloud:
 
 @pytest.mark.parametrize("antialias_px2", [0.0, MIP_PX2])
 @pytest.mark.parametrize("name", HARD)
-def test_every_pixel_of_a_hard_case_is_within_one_grey_level(
-    name: str, antialias_px2: float
-) -> None:
+def test_every_pixel_of_a_hard_case_is_within_one_grey_level(name, antialias_px2):
     cloud, behind = replace(HARD[name], antialias_px2=antialias_px2), (0.2, 0.3, 0.4)
     found = interpreted(cloud, camera(), behind)
     wanted = rasterize_reference(cloud, camera(), behind, brute=True)
@@ -54,7 +52,7 @@ def test_every_pixel_of_a_hard_case_is_within_one_grey_level(
     assert np.mean(np.abs(found.rgb - wanted.rgb)) < 1e-4
 
 
-def test_a_wall_at_the_near_plane_is_drawn_beyond_it_only() -> None:
+def test_a_wall_at_the_near_plane_is_drawn_beyond_it_only():
     for z in (0.095, 0.105):
         wall = splats([[0, 0, z], [0.01, 0, z]], 0.1, 0.9)
         wanted = rasterize_reference(wall, camera())
@@ -62,7 +60,7 @@ def test_a_wall_at_the_near_plane_is_drawn_beyond_it_only() -> None:
         assert wanted.alpha.any() == (z > 0.1)
 
 
-def test_coordinates_of_utm_size_cost_no_precision() -> None:
+def test_coordinates_of_utm_size_cost_no_precision():
     cloud, offset = random_cloud(60, 8), np.array([691_600.0, 5_334_760.0, 520.0])
     T = np.eye(4)
     T[:3, 3] = -offset
@@ -70,7 +68,7 @@ def test_coordinates_of_utm_size_cost_no_precision() -> None:
     assert_same_image(interpreted(moved(cloud, offset), far), interpreted(cloud, camera()), LSB)
 
 
-def test_nodes_at_poses_equal_the_processor() -> None:
+def test_nodes_at_poses_equal_the_processor():
     clouds = [random_cloud(60, 1), *(random_cloud(20, seed, degree=1) for seed in (2, 3))]
     clouds[1] = replace(clouds[1], antialias_px2=MIP_PX2)
     poses = [None, *(random_rigid(seed, 1.0) for seed in (2, 3))]
@@ -82,7 +80,7 @@ def test_nodes_at_poses_equal_the_processor() -> None:
     assert found.stats["visible"] >= wanted.stats["visible"]
 
 
-def test_equal_depths_are_drawn_in_the_order_of_the_nodes() -> None:
+def test_equal_depths_are_drawn_in_the_order_of_the_nodes():
     red, green = (splats([0, 0, 4.0], 3.0, 0.9, rgb) for rgb in ((1, 0, 0), (0, 1, 0)))
     clouds = UploadedClouds([red, green], "cpu")
     first = clouds.draw([(0, None), (1, np.eye(4))], camera()).rgb[32, 48]
@@ -91,7 +89,7 @@ def test_equal_depths_are_drawn_in_the_order_of_the_nodes() -> None:
     assert second == pytest.approx([0.09, 0.9, 0], abs=2e-3)
 
 
-def test_lists_that_outgrow_their_room_are_drawn_again() -> None:
+def test_lists_that_outgrow_their_room_are_drawn_again():
     cloud = random_cloud(60, 9)
     small = UploadedClouds([cloud], "cpu")
     small.capacity = 10
@@ -100,14 +98,14 @@ def test_lists_that_outgrow_their_room_are_drawn_again() -> None:
     assert_same_image(found, interpreted(cloud, camera()), 0.0)
 
 
-def test_a_window_shows_what_the_whole_image_does() -> None:
+def test_a_window_shows_what_the_whole_image_does():
     cloud = random_cloud(60, 10)
     part = interpreted(cloud, camera().window(slice(8, 40), slice(16, 80)))
     whole = interpreted(cloud, camera())
     np.testing.assert_allclose(part.rgb, whole.rgb[8:40, 16:80], atol=1e-4)
 
 
-def test_bad_devices_are_refused() -> None:
+def test_bad_devices_are_refused():
     with pytest.raises(InputError):
         UploadedClouds([], "gpu")
     import torch
@@ -121,7 +119,7 @@ COMPILE = Path(__file__).parents[2] / "docs" / "scripts" / "compile_gpu_kernels.
 
 
 @pytest.mark.parametrize("capability", [80, 90])
-def test_kernels_compile_without_spilling(capability: int) -> None:
+def test_kernels_compile_without_spilling(capability):
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     done = subprocess.run(
         [sys.executable, str(COMPILE), str(capability)],
@@ -136,7 +134,7 @@ def test_kernels_compile_without_spilling(capability: int) -> None:
 
 
 @pytest.mark.gpu
-def test_a_card_draws_what_the_reference_does() -> None:
+def test_a_card_draws_what_the_reference_does():
     cloud = random_cloud(2000, 11)
     found = rasterize(cloud, camera(960, 544, 700.0), backend="triton")
     assert_same_image(found, rasterize_reference(cloud, camera(960, 544, 700.0)), LSB, 1e-4)

@@ -59,7 +59,7 @@ def joined(chosen) -> GaussianCloud:
     return GaussianCloud.concatenate([c if T is None else c.transformed(T) for c, T in clouds])
 
 
-def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud() -> None:
+def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud():
     background = [node(f"b{i}", blobs((8 + 4 * i, 3 - 2 * i, 1.0), n=12, seed=i)) for i in range(4)]
     graph = SceneGraph(
         background, [node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")], SKY
@@ -72,7 +72,7 @@ def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud() 
     assert np.abs(fast.alpha - slow.alpha).max() < 5e-3
 
 
-def test_camera_and_actor_turned_together_see_the_same_image() -> None:
+def test_camera_and_actor_turned_together_see_the_same_image():
     cloud = blobs((0, 0, 0.5), sheen=True)
     graph = SceneGraph([], [node("a", cloud, "actor")], SKY)
     move = se3([300.0, -70.0, 4.0], quat_from_yaw(2.3))
@@ -84,7 +84,7 @@ def test_camera_and_actor_turned_together_see_the_same_image() -> None:
     np.testing.assert_allclose(still.rgb[covered], moved.rgb[covered], atol=0.02)
 
 
-def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image() -> None:
+def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image():
     ahead, behind = node("ahead", blobs((10, 0, 1))), node("behind", blobs((-30, 0, 1), seed=3))
     both, one = (
         SceneGraph([ahead, behind], [], SKY).render(camera(), {}),
@@ -95,7 +95,7 @@ def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image() -> None:
     assert both.stats["nodes_total"] == 2
 
 
-def test_node_beyond_its_far_limit_is_not_drawn() -> None:
+def test_node_beyond_its_far_limit_is_not_drawn():
     graph = SceneGraph([node("paint", blobs((60, 0, 1)), far_m=20.0)], [], SKY)
     assert graph.render(camera(), {}).stats["nodes"] == 0
 
@@ -108,11 +108,11 @@ def test_node_beyond_its_far_limit_is_not_drawn() -> None:
     st.floats(-np.pi, np.pi),
 )
 def test_sphere_with_a_visible_point_is_always_in_view(
-    centre: tuple[float, float, float],
-    radius: float,
-    inside: tuple[float, float, float],
-    yaw: float,
-) -> None:
+    centre,
+    radius,
+    inside,
+    yaw,
+):
     view = camera(T_world_rig=se2(1.0, -2.0, yaw))
     point = np.array(centre) + radius * np.array(inside) / max(1.0, float(np.linalg.norm(inside)))
     x, y, z = view.T_camera_world[:3, :3] @ point + view.T_camera_world[:3, 3]
@@ -124,7 +124,7 @@ def test_sphere_with_a_visible_point_is_always_in_view(
     assert not visible or bool(in_view(view, np.array([centre]), np.array([radius]))[0])
 
 
-def test_farther_nodes_use_coarser_levels() -> None:
+def test_farther_nodes_use_coarser_levels():
     levels = tuple(
         Level(cell, blobs((0, 0, 0.5), n=n)) for cell, n in ((0.1, 64), (0.4, 16), (1.6, 4))
     )
@@ -135,7 +135,7 @@ def test_farther_nodes_use_coarser_levels() -> None:
     assert drawn == [64, 16, 4]
 
 
-def test_sky_is_not_in_alpha_unless_asked_for() -> None:
+def test_sky_is_not_in_alpha_unless_asked_for():
     graph = SceneGraph([], [], SKY)
     out = graph.render(camera(), {})
     assert out.alpha.max() == 0
@@ -143,7 +143,7 @@ def test_sky_is_not_in_alpha_unless_asked_for() -> None:
     assert graph.render(camera(), {}, sky_in_alpha=True).alpha.min() == 1
 
 
-def test_sky_has_no_seam_where_the_azimuth_wraps() -> None:
+def test_sky_has_no_seam_where_the_azimuth_wraps():
     for yaw in (
         0.0,
         np.pi,
@@ -152,7 +152,7 @@ def test_sky_has_no_seam_where_the_azimuth_wraps() -> None:
         assert step[124:131].max() < 1.5 * np.delete(step, slice(124, 131)).max() + 0.01
 
 
-def test_splitting_by_tile_loses_nothing() -> None:
+def test_splitting_by_tile_loses_nothing():
     cloud = blobs((0, 0, 0), n=101)
     tile = np.floor(cloud.means[:, 0]).astype(np.int64)
     parts = split_by_tile(cloud, tile)

@@ -24,7 +24,7 @@ def view(alpha: np.ndarray, **pose: float) -> SkyView:
     return SkyView(camera(alpha.shape[1], alpha.shape[0], **pose), sky)
 
 
-def test_same_pose_at_twice_the_size_repeats_what_the_view_saw() -> None:
+def test_same_pose_at_twice_the_size_repeats_what_the_view_saw():
     alpha = np.ones((18, 32), np.float32)
     alpha[:8] = 0.0
     share = SkyMask([view(alpha)]).share(camera(64, 36))
@@ -32,7 +32,7 @@ def test_same_pose_at_twice_the_size_repeats_what_the_view_saw() -> None:
     np.testing.assert_array_equal(share[17:], 0.0)
 
 
-def test_turning_left_moves_the_skyline_to_the_right() -> None:
+def test_turning_left_moves_the_skyline_to_the_right():
     alpha = np.ones((18, 32), np.float32)
     alpha[:, 16:] = 0.0  # sky to the right of straight ahead
     share = SkyMask([view(alpha)]).share(camera(32, 18, yaw_rad=np.arctan(4 / 32)))
@@ -41,7 +41,7 @@ def test_turning_left_moves_the_skyline_to_the_right() -> None:
     assert columns[21:].all()
 
 
-def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
+def test_nearest_view_that_looks_the_same_way_is_taken():
     clear, hidden = np.zeros((18, 32), np.float32), np.ones((18, 32), np.float32)
     mask = SkyMask(
         [view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)]
@@ -50,7 +50,7 @@ def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
     assert mask.share(camera(32, 18, x_m=9.0)).max() == 0.0
 
 
-def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None:
+def test_directions_between_corners_are_those_at_the_middles_of_pixels():
     height, width = 2 * STEP_PX + 3, 3 * STEP_PX + 5
     grid = np.random.default_rng(0).uniform(-1e3, 1e3, (4, 5))
     rows, columns = np.indices((height, width), dtype=np.float32)
@@ -60,7 +60,7 @@ def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None
     np.testing.assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)
 
 
-def test_only_actors_present_are_posed() -> None:
+def test_only_actors_present_are_posed():
     early = replace(
         parked("early", 5, 0),
         track=replace(parked("early", 5, 0).track, t_us=np.array([0, 1_000_000])),

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -85,7 +84,7 @@ def write_sog(folder: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("zipped", [False, True], ids=["folder", "zip"])
-def test_a_model_comes_back(tmp_path: Path, zipped: bool) -> None:
+def test_a_model_comes_back(tmp_path, zipped):
     true = write_sog(tmp_path / "model")
     path = tmp_path / "model"
     if zipped:
@@ -102,7 +101,7 @@ def test_a_model_comes_back(tmp_path: Path, zipped: bool) -> None:
     assert np.allclose(cloud.sh, true["sh"], atol=1e-5)
 
 
-def test_three_levels_of_a_real_model_agree(data_set: Callable[[str], Path]) -> None:
+def test_three_levels_of_a_real_model_agree(data_set):
     folder = data_set("gaussians/playbot")
     clouds = [read_gaussians(folder / level)[0] for level in ("4_0", "5_0", "6_0")]
     assert [len(cloud) for cloud in clouds] == [8406, 3000, 1873]
@@ -137,7 +136,7 @@ def test_three_levels_of_a_real_model_agree(data_set: Callable[[str], Path]) -> 
         ),
     ],
 )
-def test_what_cannot_be_a_model_is_said(tmp_path: Path, change: object, says: str) -> None:
+def test_what_cannot_be_a_model_is_said(tmp_path, change, says):
     write_sog(tmp_path / "model")
     change(tmp_path / "model")  # type: ignore[operator]
     with pytest.raises(InputError):

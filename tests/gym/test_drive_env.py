@@ -54,7 +54,7 @@ def finish(
     [pytest.param(doors.DRIVE, "front", marks=pytest.mark.slow), (doors.PLAN, "")],
 )
 @pytest.mark.filterwarnings("error::UserWarning")
-def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
+def test_gymnasiums_own_check_finds_nothing(name, camera):
     env = gymnasium.make(
         name, overrides=(SMALL, *SHORT), camera=camera, render_mode="rgb_array" if camera else None
     )
@@ -64,7 +64,7 @@ def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
     env.close()
 
 
-def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
+def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run():
     env = DriveEnv(
         "smoke/lead_car",
         "trajectory",
@@ -128,7 +128,7 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
     env.close()
 
 
-def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_episode() -> None:
+def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_episode():
     env = DriveEnv("smoke/curve", camera="")
     _, first = env.reset(seed=0)
     facts, total = [first], 0.0
@@ -161,7 +161,7 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
 
 
 @pytest.mark.slow
-def test_a_contact_ends_the_episode() -> None:
+def test_a_contact_ends_the_episode():
     env = DriveEnv(
         "smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0)
     )
@@ -173,7 +173,7 @@ def test_a_contact_ends_the_episode() -> None:
 
 
 @pytest.mark.slow
-def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind() -> None:
+def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind():
     env = DriveEnv("smoke/curve", camera="", scene_seeds=(0, 1), overrides=SHORT)
     env.reset(seed=12)
     folder = Path(env._episode.folder.name)  # type: ignore[union-attr]
@@ -187,7 +187,7 @@ def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind(
     env.close()
 
 
-def test_wheel_and_pedals_do_what_they_say() -> None:
+def test_wheel_and_pedals_do_what_they_say():
     env = DriveEnv("smoke/straight", camera="")
     env.reset(seed=0)
     assert isinstance(env._actions.controller, HeldCommand)
@@ -204,7 +204,7 @@ def test_wheel_and_pedals_do_what_they_say() -> None:
     env.close()
 
 
-def test_what_makes_no_environment_is_refused() -> None:
+def test_what_makes_no_environment_is_refused():
     for settings in (
         {"camera": "left"},
         {"actions": "words"},
@@ -228,14 +228,14 @@ def blocks(name: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_example_of_the_page_runs() -> None:
-    space: dict[str, Any] = {}
+def test_the_example_of_the_page_runs():
+    space = {}
     exec(compile(blocks("policies.md")[-1], "docs/policies.md", "exec"), space)
     assert space["seen"]["camera"].shape == (54, 96, 3)
 
 
 @pytest.mark.slow
-def test_environments_run_in_processes_and_agree_with_one_in_this_process() -> None:
+def test_environments_run_in_processes_and_agree_with_one_in_this_process():
     settings = {"camera": "", "overrides": SHORT}
     several = gymnasium.make_vec(
         doors.DRIVE,

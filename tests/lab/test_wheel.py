@@ -11,7 +11,7 @@ from pathlib import Path
 from alpasim_plugin.lab.build import HERE, stage
 
 
-def test_the_source_tree_of_the_wheel_is_the_laboratory_and_nothing_else(tmp_path: Path) -> None:
+def test_the_source_tree_of_the_wheel_is_the_laboratory_and_nothing_else(tmp_path):
     stage(tmp_path)
     inside = {
         path.relative_to(tmp_path / "alpasim_plugin" / "lab")
@@ -24,7 +24,7 @@ def test_the_source_tree_of_the_wheel_is_the_laboratory_and_nothing_else(tmp_pat
     assert not (tmp_path / "alpasim_plugin" / "__init__.py").exists()  # the core's
 
 
-def test_what_it_registers_lies_in_it(tmp_path: Path) -> None:
+def test_what_it_registers_lies_in_it(tmp_path):
     stage(tmp_path)
     project = tomllib.loads((tmp_path / "pyproject.toml").read_text())
     assert project["tool"]["setuptools"]["packages"]["find"]["include"] == ["alpasim_plugin.lab*"]

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from tests.log.make_rollout import write_rollout
 from tests.report.conftest import usual_run as usual_run
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return write_rollout(tmp_path / "rollout.asl")
 
 
 @pytest.fixture
-def log(path: Path) -> RolloutLog:
+def log(path):
     return read_asl(path)

@@ -20,8 +20,8 @@ def golden(shared_data: Path) -> list[Path]:
     return sorted((shared_data / "alpasim-golden").rglob("*.asl"))
 
 
-def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
-    totals: Counter[str] = Counter()
+def test_every_log_written_by_alpasim_is_read(shared_data):
+    totals = Counter()
     logs = golden(shared_data)
     assert len(logs) == 57
     for path in logs:
@@ -74,9 +74,7 @@ def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
         ("synthetic-vru-offset-a", 100_000, 1_700_000, 4),
     ],
 )
-def test_golden_headers(
-    shared_data: Path, scene: str, control_us: int, force_gt_us: int, n_actors: int | None
-) -> None:
+def test_golden_headers(shared_data, scene, control_us, force_gt_us, n_actors):
     for path in sorted((shared_data / "alpasim-golden" / "rollouts" / scene).rglob("*.asl")):
         log = read_log(path)
         assert (log.control_us, log.force_gt_us) == (control_us, force_gt_us)
@@ -84,12 +82,12 @@ def test_golden_headers(
         assert decode_image(log.images[0].data).shape == (40, 64, 3)
 
 
-def test_golden_ego_size_comes_from_the_first_definition(shared_data: Path) -> None:
+def test_golden_ego_size_comes_from_the_first_definition(shared_data):
     sizes = {read_asl(p, images=False).ego_box for p in golden(shared_data)}
     assert sizes == {Box(5.393, 2.109, 1.503), Box(5.0, 2.0, 1.6), Box(4.8, 1.95, 1.5)}
 
 
-def test_golden_plans_rollout_has_empty_and_sampled_answers(shared_data: Path) -> None:
+def test_golden_plans_rollout_has_empty_and_sampled_answers(shared_data):
     logs = [
         read_asl(p)
         for p in sorted((shared_data / "alpasim-golden/rollouts/synthetic-plans-a").rglob("*.asl"))
@@ -98,13 +96,13 @@ def test_golden_plans_rollout_has_empty_and_sampled_answers(shared_data: Path) -
     assert {len(plan.samples) for plan in logs[1].plans} == set(range(8))
 
 
-def test_golden_log_without_actors_has_none(shared_data: Path) -> None:
+def test_golden_log_without_actors_has_none(shared_data):
     logs = list((shared_data / "alpasim-golden/cases/no-actors/rollouts").rglob("*.asl"))
     assert len(logs) == 2
     assert all(read_log(path).actors == {} for path in logs)
 
 
-def test_golden_log_of_a_failed_rollout_is_read(shared_data: Path) -> None:
+def test_golden_log_of_a_failed_rollout_is_read(shared_data):
     (path,) = (shared_data / "alpasim-golden/cases/failed-rollout/incomplete").rglob("*.asl")
     log = read_log(path)
     assert (len(log.ego), log.info["empty_plans"], log.info["n_steps"]) == (27, 1, 46)

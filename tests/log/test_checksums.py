@@ -5,12 +5,11 @@ one.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 from alpasim_plugin.log.run_folder.checksums import checksums_of, problem_of
 
 
-def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
+def test_missing_cut_and_changed_files_are_told_apart(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"0123456789")
     facts = checksums_of(tmp_path, ["a", "absent"])
@@ -28,8 +27,8 @@ def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything_is_read(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     path = tmp_path / "a"
     path.write_bytes(b"0123456789")
     facts = checksums_of(tmp_path, ["a"])["a"]

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +15,7 @@ from tests.core.checksum_files import vouch_for
 
 
 @pytest.mark.parametrize("time_s", [-(10**6), 0, 2**33])
-def test_a_folder_of_another_time_is_whole_and_read(
-    tmp_path: Path, usual_run: Path, time_s: int
-) -> None:
+def test_a_folder_of_another_time_is_whole_and_read(tmp_path, usual_run, time_s):
     run = shutil.copytree(usual_run, tmp_path / "run")
     (run / "run.json").write_text(
         json.dumps(

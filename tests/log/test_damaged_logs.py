@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
 from alpasim_plugin.log.wire import logging_pb2
 from tests.log.make_rollout import T0_US
 
 
-def test_cut_log_gives_what_is_whole_and_a_warning(path: Path) -> None:
+def test_cut_log_gives_what_is_whole_and_a_warning(path):
     path.write_bytes(path.read_bytes()[:-40])
     log = read_asl(path)
     assert len(log.images) == 4
@@ -25,13 +24,13 @@ def test_cut_log_gives_what_is_whole_and_a_warning(path: Path) -> None:
     assert "last entry cut" in log.warnings[0]
 
 
-def test_cut_inside_the_first_entry_is_an_error(path: Path) -> None:
+def test_cut_inside_the_first_entry_is_an_error(path):
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(InputError, match="no rollout_metadata"):
         read_asl(path)
 
 
-def test_damage_in_the_middle_is_an_error_with_its_place(path: Path) -> None:
+def test_damage_in_the_middle_is_an_error_with_its_place(path):
     data = bytearray(path.read_bytes())
     first = 4 + struct.unpack(">I", data[:4])[0]
     data[first + 4 : first + 12] = b"\xff" * 8
@@ -51,7 +50,7 @@ def edited(path: Path, change: object) -> Path:
     return path
 
 
-def test_log_of_the_five_scored_kinds_is_enough(path: Path, log: RolloutLog) -> None:
+def test_log_of_the_five_scored_kinds_is_enough(path, log):
     needed = {
         "rollout_metadata",
         "actor_poses",
@@ -65,12 +64,12 @@ def test_log_of_the_five_scored_kinds_is_enough(path: Path, log: RolloutLog) -> 
     assert len(bare.images) == len(log.images)
 
 
-def test_metadata_must_come_first(path: Path) -> None:
+def test_metadata_must_come_first(path):
     with pytest.raises(InputError, match="first entry is available_cameras_request"):
         read_asl(edited(path, lambda i, e: None if i == 0 else e))
 
 
-def test_ego_must_be_defined_first(path: Path) -> None:
+def test_ego_must_be_defined_first(path):
     def swap(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
         if i == 0:
             boxes = e.rollout_metadata.actor_definitions.actor_aabb
@@ -81,12 +80,12 @@ def test_ego_must_be_defined_first(path: Path) -> None:
         read_asl(edited(path, swap))
 
 
-def test_log_without_ego_poses_is_refused(path: Path) -> None:
+def test_log_without_ego_poses_is_refused(path):
     with pytest.raises(InputError, match="no actor_poses of EGO"):
         read_asl(edited(path, lambda i, e: None if e.HasField("actor_poses") else e))
 
 
-def test_time_running_backwards_is_refused(path: Path) -> None:
+def test_time_running_backwards_is_refused(path):
     def stop(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
         if e.HasField("actor_poses"):
             e.actor_poses.timestamp_us = T0_US
@@ -96,7 +95,7 @@ def test_time_running_backwards_is_refused(path: Path) -> None:
         read_asl(edited(path, stop))
 
 
-def test_unset_quaternion_is_refused(path: Path) -> None:
+def test_unset_quaternion_is_refused(path):
     def unset(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
         if e.HasField("actor_poses"):
             e.actor_poses.actor_poses[-1].actor_pose.ClearField("quat")
@@ -106,12 +105,12 @@ def test_unset_quaternion_is_refused(path: Path) -> None:
         read_asl(edited(path, unset))
 
 
-def test_answer_without_a_question_is_refused(path: Path) -> None:
+def test_answer_without_a_question_is_refused(path):
     with pytest.raises(InputError, match="driver_return without a driver_request"):
         read_asl(edited(path, lambda i, e: None if e.HasField("driver_request") else e))
 
 
-def test_poses_of_undefined_actors_are_left_out_and_named(path: Path) -> None:
+def test_poses_of_undefined_actors_are_left_out_and_named(path):
     def rename(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
         for pose in e.actor_poses.actor_poses:
             if pose.actor_id == "7":
@@ -123,7 +122,7 @@ def test_poses_of_undefined_actors_are_left_out_and_named(path: Path) -> None:
     assert log.info["undefined_actors"] == ("hidden",)
 
 
-def test_entry_of_a_future_kind_is_skipped_with_a_warning(path: Path) -> None:
+def test_entry_of_a_future_kind_is_skipped_with_a_warning(path):
     body = b"\xfa\x01\x02\x08\x01"
     path.write_bytes(path.read_bytes() + struct.pack(">I", len(body)) + body)
     log = read_asl(path)
@@ -138,7 +137,7 @@ class Bomb:
         return (pytest.fail, ("debug bytes were unpickled",))
 
 
-def test_debug_bytes_are_never_unpickled(path: Path) -> None:
+def test_debug_bytes_are_never_unpickled(path):
     def arm(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
         if e.HasField("driver_return"):
             e.driver_return.debug_info.unstructured_debug_info = pickle.dumps(Bomb())

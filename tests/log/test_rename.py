@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,11 +13,11 @@ from alpasim_plugin.log.schema import session_uuid
 
 
 @pytest.fixture(scope="module")
-def logs(shared_data: Path) -> list[Path]:
+def logs(shared_data):
     return sorted((shared_data / "alpasim-golden" / "rollouts").glob("*/*/rollout.asl"))
 
 
-def test_alpasims_own_logs_are_copied_byte_by_byte(logs: list[Path], tmp_path: Path) -> None:
+def test_alpasims_own_logs_are_copied_byte_by_byte(logs, tmp_path):
     whole = [log for log in logs if log.parent == min(log.parent.parent.iterdir())][
         ::4
     ]  # complete logs, of a few scenes
@@ -29,7 +27,7 @@ def test_alpasims_own_logs_are_copied_byte_by_byte(logs: list[Path], tmp_path: P
         assert (tmp_path / "copy.asl").read_bytes() == log.read_bytes(), log
 
 
-def test_a_renamed_log_differs_in_its_names_alone(logs: list[Path], tmp_path: Path) -> None:
+def test_a_renamed_log_differs_in_its_names_alone(logs, tmp_path):
     source, target = logs[0], tmp_path / "copy.asl"
     old, camera = source.parent.name, "camera_front_wide_120fov"
     new = session_uuid(7, "x")
@@ -45,14 +43,14 @@ def test_a_renamed_log_differs_in_its_names_alone(logs: list[Path], tmp_path: Pa
     assert (tmp_path / "back.asl").read_bytes() == source.read_bytes()
 
 
-def test_a_cut_log_is_no_source(logs: list[Path], tmp_path: Path) -> None:
+def test_a_cut_log_is_no_source(logs, tmp_path):
     (tmp_path / "cut.asl").write_bytes(logs[0].read_bytes()[:5000])
     with pytest.raises(InputError, match="last entry cut"):
         copy_log(tmp_path / "cut.asl", tmp_path / "copy.asl", Renaming("x"))
     assert not (tmp_path / "copy.asl").exists()
 
 
-def test_stages_follow_one_another(logs: list[Path], tmp_path: Path) -> None:
+def test_stages_follow_one_another(logs, tmp_path):
     count = copy_log(logs[0], tmp_path / "copy.asl", lambda entry: [entry, entry], Renaming("x"))
     assert count == 2 * sum(1 for _ in AslReader(logs[0]))
 
@@ -60,7 +58,7 @@ def test_stages_follow_one_another(logs: list[Path], tmp_path: Path) -> None:
 @given(
     st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=8, unique=True), st.text(), st.text()
 )
-def test_session_ids_sort_as_their_seeds(seeds: list[int], one: str, other: str) -> None:
+def test_session_ids_sort_as_their_seeds(seeds, one, other):
     ids = {seed: session_uuid(seed, one if i % 2 else other) for i, seed in enumerate(seeds)}
     assert sorted(seeds) == sorted(seeds, key=ids.__getitem__)
     assert all(len(name) == 36 and name[14] == "8" and name[19] in "89ab" for name in ids.values())

@@ -5,13 +5,11 @@ them.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
 from alpasim_plugin.log.asl import AslReader
 from tests.log.make_rollout import (
@@ -28,7 +26,7 @@ from tests.log.make_rollout import (
 )
 
 
-def test_entries_stand_in_the_order_of_alpasims_runtime(path: Path) -> None:
+def test_entries_stand_in_the_order_of_alpasims_runtime(path):
     kinds = [entry.WhichOneof("log_entry") for entry in AslReader(path)]
     start = "rollout_metadata available_cameras_request available_cameras_return driver_session_request traffic_session_request"
     frame = "batch_render_request driver_camera_image"
@@ -36,7 +34,7 @@ def test_entries_stand_in_the_order_of_alpasims_runtime(path: Path) -> None:
     assert kinds == f"{start} actor_poses actor_poses {' '.join([step] * 4)} {frame}".split()
 
 
-def test_ego_is_first_in_definitions_and_last_in_poses(path: Path) -> None:
+def test_ego_is_first_in_definitions_and_last_in_poses(path):
     entries = list(AslReader(path))
     definitions = entries[0].rollout_metadata.actor_definitions.actor_aabb
     assert [d.actor_id for d in definitions] == ["EGO", "7", "late", "wall"]
@@ -57,7 +55,7 @@ def test_ego_is_first_in_definitions_and_last_in_poses(path: Path) -> None:
     ]
 
 
-def test_times_and_sizes_are_exact(log: RolloutLog) -> None:
+def test_times_and_sizes_are_exact(log):
     assert (log.start_us, log.render_start_us, log.force_gt_us, log.control_us) == (
         T0_US,
         T0_US + STEP_US,
@@ -71,7 +69,7 @@ def test_times_and_sizes_are_exact(log: RolloutLog) -> None:
     assert log.warnings == ()
 
 
-def test_ego_in_the_log_is_the_box_centre(log: RolloutLog) -> None:
+def test_ego_in_the_log_is_the_box_centre(log):
     yaw, offset = 0.3, HEADER.vehicle.rear_axle_to_centre_m
     rig = HEADER.ego_log.xyz[:6]
     expected = rig + np.array(
@@ -83,14 +81,14 @@ def test_ego_in_the_log_is_the_box_centre(log: RolloutLog) -> None:
     np.testing.assert_allclose(log.ego_log.xyz, HEADER.ego_log.xyz, atol=1e-6)
 
 
-def test_actor_is_there_only_while_it_was_present(log: RolloutLog) -> None:
+def test_actor_is_there_only_while_it_was_present(log):
     assert log.actors["late"].track.t_us.tolist() == [T0_US + 4 * STEP_US, T0_US + 5 * STEP_US]
     np.testing.assert_allclose(log.actors["late"].track.xyz, ACTORS[1].track.xyz[:2], atol=1e-6)
     assert [a.is_static for a in log.actors.values()] == [False, False, True]
     assert [a.label for a in log.actors.values()] == ["automobile", "person", "other"]
 
 
-def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log: RolloutLog) -> None:
+def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log):
     assert [(p.now_us, p.query_us) for p in log.plans] == [
         (T0_US + i * STEP_US, T0_US + (i + 1) * STEP_US) for i in (2, 3, 4)
     ]
@@ -101,7 +99,7 @@ def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log: RolloutL
     assert [len(p.samples) for p in log.plans] == [0, 2, 2]
 
 
-def test_png_images_come_back_pixel_for_pixel_in_time_order(log: RolloutLog) -> None:
+def test_png_images_come_back_pixel_for_pixel_in_time_order(log):
     assert [i.end_us for i in log.images] == [T0_US + s * STEP_US for s in range(1, 6)]
     assert all(
         i.end_us - i.start_us == CAMERA.shutter_us and i.camera == CAMERA.name for i in log.images
@@ -110,26 +108,26 @@ def test_png_images_come_back_pixel_for_pixel_in_time_order(log: RolloutLog) -> 
         np.testing.assert_array_equal(decode_image(image.data), picture(step))
 
 
-def test_jpeg_images_come_back_close(tmp_path: Path) -> None:
+def test_jpeg_images_come_back_close(tmp_path):
     log = read_asl(write_rollout(tmp_path / "a.asl", "jpeg"))
     assert log.images[0].data[:2] == b"\xff\xd8"
     assert np.abs(decode_image(log.images[2].data).astype(int) - picture(3)).mean() < 1.5
 
 
-def test_images_can_be_left_out(path: Path) -> None:
+def test_images_can_be_left_out(path):
     log = read_asl(path, images=False)
     assert log.images == ()
     assert log.info["entries"]["driver_camera_image"] == 5
 
 
-def test_camera_survives(log: RolloutLog) -> None:
+def test_camera_survives(log):
     (camera,) = log.info["cameras"]
     assert (camera.name, camera.width, camera.height) == (CAMERA.name, 64, 40)
     np.testing.assert_array_equal(camera.K, CAMERA.K)
     np.testing.assert_allclose(camera.T_rig_camera, CAMERA.T_rig_camera, atol=1e-6)
 
 
-def test_controller_entries_hold_the_plan_in_its_own_rig_frame(path: Path) -> None:
+def test_controller_entries_hold_the_plan_in_its_own_rig_frame(path):
     requests = [e.controller_request for e in AslReader(path) if e.HasField("controller_request")]
     assert [r.coerce_dynamic_state for r in requests] == [True, True, False, False]
     assert requests[0].future_time_us == T0_US + 2 * STEP_US
@@ -142,21 +140,21 @@ def test_controller_entries_hold_the_plan_in_its_own_rig_frame(path: Path) -> No
     assert returned.states[-1].dynamic_state.linear_acceleration.y == pytest.approx(10.0 * 0.1)
 
 
-def test_ego_states_carry_speed_and_context(path: Path) -> None:
+def test_ego_states_carry_speed_and_context(path):
     told = [e.driver_ego_trajectory for e in AslReader(path) if e.HasField("driver_ego_trajectory")]
     assert [len(t.trajectory.poses) for t in told] == [2, 1, 1, 1]
     assert all(len(t.dynamic_states) == len(t.trajectory.poses) for t in told)
     assert told[0].dynamic_states[0].linear_velocity.x == 10.0
 
 
-def test_route_keeps_its_missing_end(path: Path) -> None:
+def test_route_keeps_its_missing_end(path):
     route = next(e.route_request for e in AslReader(path) if e.HasField("route_request")).route
     assert len(route.waypoints) == 20
     assert np.isnan(route.waypoints[19].x)
     assert not np.isnan(route.waypoints[17].x)
 
 
-def test_render_request_tells_both_shutter_ends(path: Path) -> None:
+def test_render_request_tells_both_shutter_ends(path):
     item = next(
         e.batch_render_request for e in AslReader(path) if e.HasField("batch_render_request")
     ).items[0]
@@ -174,14 +172,14 @@ def test_render_request_tells_both_shutter_ends(path: Path) -> None:
     assert [o.track_id for o in request.dynamic_objects] == ["7", "wall"]
 
 
-def test_two_writes_give_the_same_bytes(tmp_path: Path) -> None:
+def test_two_writes_give_the_same_bytes(tmp_path):
     assert (
         write_rollout(tmp_path / "a.asl").read_bytes()
         == write_rollout(tmp_path / "b.asl").read_bytes()
     )
 
 
-def test_log_without_context_before_the_first_frame_has_no_double_time(tmp_path: Path) -> None:
+def test_log_without_context_before_the_first_frame_has_no_double_time(tmp_path):
     header = replace(HEADER, render_start_us=T0_US)
     with AslWriter(tmp_path / "a.asl", header) as log:
         log.begin([CAMERA])

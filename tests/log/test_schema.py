@@ -19,7 +19,6 @@ from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import (
     ROLLOUTS_TABLE,
     STEPS_TABLE,
-    TableSchema,
     cell_name,
     rollout_folder,
 )
@@ -82,8 +81,8 @@ def changed(column: str, value: Any) -> pa.Table:
 )
 @pytest.mark.parametrize("with_statistics", [True, False])
 def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_row(
-    tmp_path: Path, usual_run: Path, table: pa.Table, where: str, found: str, with_statistics: bool
-) -> None:
+    tmp_path, usual_run, table, where, found, with_statistics
+):
     for name in ("run.json", "summary.json"):
         shutil.copy(usual_run / name, tmp_path)
     path = tmp_path / "rollouts.parquet"
@@ -95,9 +94,7 @@ def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_ro
 
 
 @pytest.mark.parametrize("value", [-1e14, 1.5])
-def test_a_rate_outside_its_range_is_refused_by_row(
-    tmp_path: Path, usual_run: Path, value: float
-) -> None:
+def test_a_rate_outside_its_range_is_refused_by_row(tmp_path, usual_run, value):
     run = shutil.copytree(usual_run, tmp_path / "run")
     pq.write_table(changed("offroad", value), run / "rollouts.parquet")
     vouch_for(run)
@@ -107,9 +104,7 @@ def test_a_rate_outside_its_range_is_refused_by_row(
         assert caught.value.message.startswith(f"{run / 'rollouts.parquet'}, row 2")
 
 
-def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(
-    tmp_path: Path, usual_run: Path
-) -> None:
+def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path, usual_run):
     run = vouch_for(shutil.copytree(usual_run, tmp_path / "run"))
     (run / "summary.json").unlink()
     for path in run.rglob("manifest.json"):
@@ -119,7 +114,7 @@ def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(
         read_so_far(run)
 
 
-def test_steps_without_their_time_are_refused_by_row(tmp_path: Path, usual_run: Path) -> None:
+def test_steps_without_their_time_are_refused_by_row(tmp_path, usual_run):
     for name in ("run.json", "summary.json", "rollouts.parquet"):
         shutil.copy(usual_run / name, tmp_path)
     pq.write_table(pa.Table.from_pylist([STEP, STEP | {"t_us": None}]), tmp_path / "steps.parquet")
@@ -127,7 +122,7 @@ def test_steps_without_their_time_are_refused_by_row(tmp_path: Path, usual_run: 
         read_run(tmp_path).steps(["offroad"])
 
 
-def test_what_the_schema_writes_it_also_reads(tmp_path: Path) -> None:
+def test_what_the_schema_writes_it_also_reads(tmp_path):
     made = pa.Table.from_pylist(ROWS, schema=ROLLOUTS_TABLE.arrow(["offroad"], of_logs=True))
     pq.write_table(made, tmp_path / "rollouts.parquet")
     assert ROLLOUTS_TABLE.read(tmp_path / "rollouts.parquet").equals(made)
@@ -137,8 +132,8 @@ def test_what_the_schema_writes_it_also_reads(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("table", [ROLLOUTS_TABLE, STEPS_TABLE])
 def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
-    table: TableSchema,
-) -> None:
+    table,
+):
     page = (DOCS / "runs.md").read_text()
     (line,) = [line for line in page.splitlines() if line.startswith(f"| `{table.name}` |")]
     assert "`rollout`" in page
@@ -157,7 +152,7 @@ def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
     assert list(documented) == list(wanted)
 
 
-def test_a_rollout_has_one_folder_and_one_name() -> None:
+def test_a_rollout_has_one_folder_and_one_name():
     assert rollout_folder("nre://host:50051", "p", "a/b", 3).parts[0] == "rollouts"
     assert len(rollout_folder("nre://host:50051", "p", "a/b", 3).parts) == 5
     assert rollout_folder("r", "p", "s", "log 1") != rollout_folder("r", "p", "s", "log-1")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ def frames(n: int, height: int = 144, width: int = 256) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("fps", [10, 30, 7.5, 29.97, Fraction(30000, 1001), Fraction(10, 3), 1])
-def test_frame_times_are_exact(tmp_path: Path, fps: float | Fraction) -> None:
+def test_frame_times_are_exact(tmp_path, fps):
     assert write_mp4(tmp_path / "a.mp4", frames(25), fps) == 25
     video = read_mp4(tmp_path / "a.mp4")
     rate = Fraction(fps).limit_denominator(1001)
@@ -31,7 +30,7 @@ def test_frame_times_are_exact(tmp_path: Path, fps: float | Fraction) -> None:
     assert video.t_us.tolist() == [round(i / rate * 1_000_000) for i in range(25)]
 
 
-def test_pictures_come_back_in_order_and_close(tmp_path: Path) -> None:
+def test_pictures_come_back_in_order_and_close(tmp_path):
     given = np.stack(frames(30))
     write_mp4(tmp_path / "a.mp4", given, 10)
     back = read_mp4(tmp_path / "a.mp4").frames
@@ -41,7 +40,7 @@ def test_pictures_come_back_in_order_and_close(tmp_path: Path) -> None:
     assert nearest == list(range(30))
 
 
-def test_odd_sizes_are_padded_by_their_last_row_and_column(tmp_path: Path) -> None:
+def test_odd_sizes_are_padded_by_their_last_row_and_column(tmp_path):
     given = frames(3, 45, 61)
     write_mp4(tmp_path / "a.mp4", given, 10)
     back = read_mp4(tmp_path / "a.mp4").frames
@@ -50,12 +49,12 @@ def test_odd_sizes_are_padded_by_their_last_row_and_column(tmp_path: Path) -> No
     assert np.abs(back[0, :45, 61].astype(int) - given[0][:, 60]).mean() < 4
 
 
-def test_single_frame_is_a_video(tmp_path: Path) -> None:
+def test_single_frame_is_a_video(tmp_path):
     write_mp4(tmp_path / "a.mp4", frames(1), 10)
     assert read_mp4(tmp_path / "a.mp4").t_us.tolist() == [0]
 
 
-def test_frames_may_come_from_a_generator(tmp_path: Path) -> None:
+def test_frames_may_come_from_a_generator(tmp_path):
     assert write_mp4(tmp_path / "a.mp4", iter(frames(4)), 10) == 4
 
 
@@ -68,25 +67,23 @@ def test_frames_may_come_from_a_generator(tmp_path: Path) -> None:
         ([np.zeros((8, 8), np.uint8)], "frame 0: "),
     ],
 )
-def test_unusable_frames_are_refused_and_leave_no_file(
-    tmp_path: Path, bad: list[np.ndarray], found: str
-) -> None:
+def test_unusable_frames_are_refused_and_leave_no_file(tmp_path, bad, found):
     with pytest.raises(InputError, match=found):
         write_mp4(tmp_path / "a.mp4", bad, 10)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_rate_must_be_positive(tmp_path: Path) -> None:
+def test_rate_must_be_positive(tmp_path):
     with pytest.raises(InputError, match="0 frames per second"):
         write_mp4(tmp_path / "a.mp4", frames(1), 0)
 
 
-def test_missing_folder_is_an_infrastructure_failure(tmp_path: Path) -> None:
+def test_missing_folder_is_an_infrastructure_failure(tmp_path):
     with pytest.raises(InfrastructureError):
         write_mp4(tmp_path / "absent" / "a.mp4", frames(1), 10)
 
 
-def test_unreadable_videos_are_refused(tmp_path: Path) -> None:
+def test_unreadable_videos_are_refused(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"no video at all")
     with pytest.raises(InputError):
         read_mp4(tmp_path / "a.mp4")

@@ -43,12 +43,12 @@ def times_s(path: Path) -> list[Fraction]:
         ([0, 3000, 6000], Fraction(1, 90000)),
     ],
 )
-def test_times_are_kept_exactly(tmp_path: Path, times: list[int], base: Fraction) -> None:
+def test_times_are_kept_exactly(tmp_path, times, base):
     assert times_s(write(tmp_path / "a.mp4", times, base)) == [t * base for t in times]
 
 
 @pytest.mark.parametrize("matrix", [1, 2, 5, 6, 7, 9])
-def test_colours_follow_the_stated_matrix(tmp_path: Path, matrix: int) -> None:
+def test_colours_follow_the_stated_matrix(tmp_path, matrix):
     image = picture()
     image[:] = (200, 40, 90)
     with VideoWriter(
@@ -60,7 +60,7 @@ def test_colours_follow_the_stated_matrix(tmp_path: Path, matrix: int) -> None:
         assert np.abs(next(iter(back)).image.astype(int) - image).max() <= 2
 
 
-def test_brightness_does_not_drift_over_generations(tmp_path: Path) -> None:
+def test_brightness_does_not_drift_over_generations(tmp_path):
     rng = np.random.default_rng(0)
     image = np.repeat(np.repeat(rng.integers(20, 235, (8, 12, 3)), 4, 0), 4, 1).astype(np.uint8)
     given = image
@@ -74,7 +74,7 @@ def test_brightness_does_not_drift_over_generations(tmp_path: Path) -> None:
     )  # the default scaler loses a grey level each time
 
 
-def test_a_rotated_video_is_read_upright(tmp_path: Path) -> None:
+def test_a_rotated_video_is_read_upright(tmp_path):
     image = picture(0)
     image[:8] = 255
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
@@ -90,7 +90,7 @@ def test_a_rotated_video_is_read_upright(tmp_path: Path) -> None:
     assert upright[:, 8:].max() < 60
 
 
-def test_pixel_aspect_is_kept(tmp_path: Path) -> None:
+def test_pixel_aspect_is_kept(tmp_path):
     with VideoWriter(
         tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), pixel_aspect=Fraction(4, 3)
     ) as video:
@@ -164,9 +164,7 @@ def empty(folder: Path) -> Path:
         (lambda folder: folder / "absent.mp4", "no such file"),
     ],
 )
-def test_broken_files_are_refused_with_what_was_found(
-    tmp_path: Path, make: object, found: str
-) -> None:
+def test_broken_files_are_refused_with_what_was_found(tmp_path, make, found):
     assert callable(make)
     with pytest.raises(InputError, match=found), VideoReader(make(tmp_path)) as video:
         list(video)
@@ -180,19 +178,19 @@ def write_until(path: Path, times: list[int], stop: BaseException | None = None)
             raise stop
 
 
-def test_times_that_go_back_are_refused(tmp_path: Path) -> None:
+def test_times_that_go_back_are_refused(tmp_path):
     with pytest.raises(InfrastructureError):
         write_until(tmp_path / "a.mp4", [0, 5, 3, 3, 3])
     assert not list(tmp_path.iterdir())
 
 
-def test_an_error_on_the_way_leaves_neither_file_nor_remains(tmp_path: Path) -> None:
+def test_an_error_on_the_way_leaves_neither_file_nor_remains(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_until(tmp_path / "a.mp4", [0], KeyboardInterrupt())
     assert not list(tmp_path.iterdir())
 
 
-def test_an_old_file_stays_until_the_new_one_is_complete(tmp_path: Path) -> None:
+def test_an_old_file_stays_until_the_new_one_is_complete(tmp_path):
     write(tmp_path / "a.mp4", [0, 1], Fraction(1, 10))
     old = (tmp_path / "a.mp4").read_bytes()
     with VideoWriter(tmp_path / "a.mp4", Fraction(1, 10), Fraction(10)) as video:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
         lambda q: np.linalg.norm(q) > 1e-3
     ),
 )
-def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -> None:
+def test_any_pose_survives_within_float32(xyz, quat):
     messages = wire_poses(np.array([xyz]), np.array([quat]), "a test")
     back_xyz, back_quat = read_poses(messages, "a test")
     assert np.abs(back_xyz[0] - xyz).max() <= np.spacing(np.float32(max(*np.abs(xyz), 1e-30))) / 2
@@ -39,9 +38,7 @@ def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -
 
 @settings(max_examples=examples(50), deadline=None)
 @given(n=st.integers(0, 6), seed=st.integers(0, 1000), zeros=st.booleans())
-def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(
-    n: int, seed: int, zeros: bool
-) -> None:
+def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n, seed, zeros):
     rng = np.random.default_rng(seed)
     xyz = np.zeros((n, 3)) if zeros else rng.normal(size=(n, 3)) * 1000
     trajectory = Trajectory(T0_US + np.arange(n, dtype=np.int64), xyz, rng.normal(size=(n, 4)))
@@ -57,7 +54,7 @@ def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(
     assert fast.SerializeToString() == slow.SerializeToString()
 
 
-def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much() -> None:
+def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much():
     rng = np.random.default_rng(0)
     for _ in range(200):
         pose = se3(rng.normal(size=3) * 1000, rng.normal(size=4))  # no rotation: it is made one
@@ -74,7 +71,7 @@ def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much() -> None
             wire_pose(pose, "a test")
 
 
-def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path) -> None:
+def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path):
     with (
         AslWriter(tmp_path / "a.asl", HEADER) as log,
         pytest.raises(InputError, match=r"position .*500001\.4") as caught,
@@ -83,12 +80,12 @@ def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path
     assert "local origin" in caught.value.hint
 
 
-def test_nan_pose_is_refused_at_writing(tmp_path: Path) -> None:
+def test_nan_pose_is_refused_at_writing(tmp_path):
     with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match="nan"):
         log.actor_poses(T0_US, se2(0, 0, 0), {"7": se2(float("nan"), 0, 0)})
 
 
-def test_heading_of_half_a_turn_survives() -> None:
+def test_heading_of_half_a_turn_survives():
     quat = quat_from_yaw(np.array([np.pi, -np.pi, np.pi - 1e-9]))
     _, back = read_poses(wire_poses(np.zeros((3, 3)), quat, "a test"), "a test")
     np.testing.assert_allclose(np.abs(yaw_from_quat(back)), np.pi, atol=1e-6)
@@ -98,7 +95,7 @@ def test_heading_of_half_a_turn_survives() -> None:
     ("scale", "fine"),
     [(1.0, True), (1 + 4.9e-5, True), (1 - 4.9e-5, True), (1 + 6e-5, False), (0.0, False)],
 )
-def test_quaternion_norm_rule(scale: float, fine: bool) -> None:
+def test_quaternion_norm_rule(scale, fine):
     pose = common_pb2.Pose(
         vec=common_pb2.Vec3(), quat=common_pb2.Quat(w=0.6 * scale, z=0.8 * scale)
     )
@@ -109,12 +106,12 @@ def test_quaternion_norm_rule(scale: float, fine: bool) -> None:
             read_poses([pose], "a test")
 
 
-def test_actor_outside_the_header_is_refused(tmp_path: Path) -> None:
+def test_actor_outside_the_header_is_refused(tmp_path):
     with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match="'ghost'"):
         log.actor_poses(T0_US, se2(0, 0, 0), {"ghost": se2(1, 0, 0)})
 
 
-def test_ids_of_actors_must_be_their_own(tmp_path: Path) -> None:
+def test_ids_of_actors_must_be_their_own(tmp_path):
     twin = Actor("7", "automobile", Box(1, 1, 1), straight(2))
     with pytest.raises(InputError, match=r"\['7'\] are taken or repeated"):
         AslWriter(tmp_path / "a.asl", replace(HEADER, actors=(*ACTORS, twin)))

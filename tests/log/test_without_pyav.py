@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -23,7 +22,7 @@ except InfrastructureError as error:
 """
 
 
-def test_everything_but_video_works_without_it(tmp_path: Path) -> None:
+def test_everything_but_video_works_without_it(tmp_path):
     video = tmp_path / "a.mp4"
     video.write_bytes(b"0" * 64)
     done = subprocess.run([sys.executable, "-c", CODE, str(video)], capture_output=True, text=True)

@@ -208,7 +208,7 @@ class OtherCamera(Honest):
 
 
 @pytest.mark.parametrize("name", ["log-replay", "constant-velocity", "pure-pursuit", "lane-camera"])
-def test_shipped_policy_conforms(name: str) -> None:
+def test_shipped_policy_conforms(name):
     report = check_policy(name, latency_limit_ms=1000.0)
     assert report.ok, str(report)
     assert {
@@ -262,21 +262,21 @@ def test_shipped_policy_conforms(name: str) -> None:
         (OtherCamera, "asks for cameras ['roof']; the scenario has ['front']"),
     ],
 )
-def test_broken_policy_gets_its_sentence(broken: type[Honest], sentence: str) -> None:
+def test_broken_policy_gets_its_sentence(broken, sentence):
     report = check_policy(broken(), SCENARIO)
     assert not report.ok
     assert any(sentence in failure for failure in report.failures), str(report)
     assert sentence in str(report)
 
 
-def test_slow_policy_is_told_its_limit() -> None:
+def test_slow_policy_is_told_its_limit():
     report = check_policy(Slow(), SCENARIO, latency_limit_ms=5.0)
     assert [c.name for c in report.checks if not c.ok] == ["latency"]
     assert "the limit is 5 ms" in report.failures[0]
     assert report.latency_ms[0] >= 10.0
 
 
-def test_blind_policy_passes_with_a_note() -> None:
+def test_blind_policy_passes_with_a_note():
     report = check_policy("constant-velocity")
     assert report.ok
     assert report.notes[0].name == "route_rig"

@@ -31,7 +31,7 @@ def lateral(plan: object, index: int = 20) -> float:
 # --- the plan depends on the pixels
 
 
-def test_plan_steers_back_to_the_lane_that_the_picture_shows() -> None:
+def test_plan_steers_back_to_the_lane_that_the_picture_shows():
     for offset in (-0.7, -0.3, 0.3, 0.7):
         plan = look(policy(), ROAD.image(CAMERA, ROAD.pose(0.0, offset)))
         assert plan.debug["mode"] == "lane"
@@ -43,7 +43,7 @@ def test_plan_steers_back_to_the_lane_that_the_picture_shows() -> None:
     assert lateral(right) - lateral(left) == pytest.approx(1.2, abs=0.2)
 
 
-def test_shifted_picture_shifts_the_plan_although_everything_else_is_the_same() -> None:
+def test_shifted_picture_shifts_the_plan_although_everything_else_is_the_same():
     picture = SYMMETRIC.image(CAMERA, SYMMETRIC.pose(0.0))
     route = route_of(SYMMETRIC, SYMMETRIC.pose(0.0))
     plain = look(policy(), picture, route_rig=route)
@@ -54,14 +54,14 @@ def test_shifted_picture_shifts_the_plan_although_everything_else_is_the_same() 
     assert lateral(shifted) < lateral(plain) - 0.3
 
 
-def test_mirrored_picture_mirrors_what_is_seen() -> None:
+def test_mirrored_picture_mirrors_what_is_seen():
     picture = ROAD.image(CAMERA, ROAD.pose(0.0, 0.5), seed=3)
     seen, mirrored = look(policy(), picture), look(policy(), picture[:, ::-1].copy())
     assert seen.debug["lane_offset_m"] == pytest.approx(-mirrored.debug["lane_offset_m"], abs=0.03)
     assert seen.debug["lane_width_m"] == pytest.approx(mirrored.debug["lane_width_m"], abs=0.05)
 
 
-def test_blank_picture_leaves_only_the_route_and_says_so() -> None:
+def test_blank_picture_leaves_only_the_route_and_says_so():
     blank = np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
     curve = PaintedRoad(curvature_1pm=1 / 60)
     plan = look(policy(), blank, route_rig=route_of(curve, curve.pose(0.0)))
@@ -71,7 +71,7 @@ def test_blank_picture_leaves_only_the_route_and_says_so() -> None:
     assert look(policy(), blank).debug["mode"] == "straight"
 
 
-def test_paint_outweighs_a_route_that_lies_beside_the_lane() -> None:
+def test_paint_outweighs_a_route_that_lies_beside_the_lane():
     pose = ROAD.pose(0.0)
     picture = ROAD.image(CAMERA, pose)
     beside = look(policy(), picture, route_rig=route_of(ROAD, pose, 0.8))
@@ -80,7 +80,7 @@ def test_paint_outweighs_a_route_that_lies_beside_the_lane() -> None:
     assert abs(lateral(beside) - lateral(on)) < 0.15
 
 
-def test_lane_is_remembered_over_frames_without_paint() -> None:
+def test_lane_is_remembered_over_frames_without_paint():
     one = policy()
     one.reset(0, Route(np.zeros((2, 3))))
     modes, sure = [], 0.0
@@ -108,18 +108,18 @@ def test_lane_is_remembered_over_frames_without_paint() -> None:
 @pytest.mark.parametrize(
     ("curvature", "speed"), first_rows_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)])
 )
-def test_lane_is_kept_without_any_route(curvature: float, speed: float) -> None:
+def test_lane_is_kept_without_any_route(curvature, speed):
     drive = close_loop(policy(), PaintedRoad(curvature_1pm=curvature), speed, 5.0, with_route=False)
     assert np.abs(drive.offset_m).max() < 0.6
     assert abs(drive.s_m[-1]) > 0.8 * speed * 5.0
 
 
-def test_route_half_a_lane_off_does_not_pull_the_car_out_of_its_lane() -> None:
+def test_route_half_a_lane_off_does_not_pull_the_car_out_of_its_lane():
     off, on = (close_loop(policy(), ROAD, 12.0, 3.5, route_off_m=r) for r in (0.9, 0.0))
     assert np.abs(off.offset_m - on.offset_m).max() < 0.15
 
 
-def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
+def test_car_ahead_is_stopped_for_and_the_car_stays_standing():
     road = BusyRoad(blocks=(Block(42.0),))
     drive = close_loop(policy(), road, 9.0, 8.0)
     front_m = drive.s_m[-1] + 1.4 + 4.855 / 2
@@ -141,7 +141,7 @@ def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
     ),
     ids=["crosswalk", "stop line", "shadow"],
 )
-def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> None:
+def test_flat_things_on_the_road_are_not_braked_for(flat):
     drive = close_loop(policy(), BusyRoad(patches=flat), 10.0, 4.5)
     assert drive.speed_mps.min() > 8.5
     assert np.abs(drive.offset_m).max() < 0.6
@@ -150,7 +150,7 @@ def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> 
 # --- the contract
 
 
-def test_samples_carry_the_noise_of_the_seed_and_the_same_seed_repeats() -> None:
+def test_samples_carry_the_noise_of_the_seed_and_the_same_seed_repeats():
     drives = [close_loop(policy(), ROAD, 10.0, 1.0, seed=seed) for seed in (0, 0, 1)]
     first, again, other = (np.array([p.xy for p in d.plans]) for d in drives)
     assert np.array_equal(first, again)
@@ -161,7 +161,7 @@ def test_samples_carry_the_noise_of_the_seed_and_the_same_seed_repeats() -> None
     assert np.ptp([sample[20, 1] for sample in plan.samples]) > 0.05
 
 
-def test_frame_that_is_late_is_read_for_where_the_car_was_then() -> None:
+def test_frame_that_is_late_is_read_for_where_the_car_was_then():
     one = policy()
     one.reset(0, Route(np.zeros((2, 3))))
     curve = PaintedRoad(curvature_1pm=1 / 50)
@@ -178,7 +178,7 @@ def test_frame_that_is_late_is_read_for_where_the_car_was_then() -> None:
     assert plan.debug["lane_heading_rad"] == pytest.approx(0.0, abs=0.03)
 
 
-def test_missing_or_misshapen_frame_is_a_policy_error() -> None:
+def test_missing_or_misshapen_frame_is_a_policy_error():
     one = policy()
     with pytest.raises(PolicyError, match=r"\(10, 10, 3\)"):
         one.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
@@ -189,7 +189,7 @@ def test_missing_or_misshapen_frame_is_a_policy_error() -> None:
         one.act(without)
 
 
-def test_scenario_without_a_camera_that_looks_ahead_is_refused() -> None:
+def test_scenario_without_a_camera_that_looks_ahead_is_refused():
     back = pinhole_camera("rear")
     turned = back.T_rig_camera.copy()
     turned[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ turned[:3, :3]
@@ -205,13 +205,13 @@ def test_scenario_without_a_camera_that_looks_ahead_is_refused() -> None:
         pinhole_camera(hfov_deg=100.0, mount_m=(2.0, 0.2, 1.3)),
     ],
 )
-def test_other_cameras_see_the_same_lane(camera: object) -> None:
+def test_other_cameras_see_the_same_lane(camera):
     one = LaneCamera(scenario_with(camera))  # type: ignore[arg-type]
     plan = look(one, ROAD.image(camera, ROAD.pose(0.0, 0.4)), camera=camera)  # type: ignore[arg-type]
     assert plan.debug["lane_offset_m"] == pytest.approx(-0.4, abs=0.12)
 
 
-def test_noise_without_a_road_gives_a_finite_plan() -> None:
+def test_noise_without_a_road_gives_a_finite_plan():
     random = np.random.default_rng(0)
     one = policy()
     for k in range(20):

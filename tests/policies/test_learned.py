@@ -4,8 +4,6 @@ image.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -39,7 +37,7 @@ ROAD = PaintedRoad()
 # --- the view
 
 
-def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera() -> None:
+def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera():
     point = np.array([20.0, -3.0, 0.4])
     for camera in (
         pinhole_camera(),
@@ -58,7 +56,7 @@ def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera() -> N
             np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
 
 
-def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
+def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view():
     road, pose = (
         PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0)),
         ROAD.pose(0.0, 0.4),
@@ -88,7 +86,7 @@ def route_with_turn(
 
 
 @pytest.mark.parametrize("left", [True, False])
-def test_turn_is_announced_and_then_due(left: bool) -> None:
+def test_turn_is_announced_and_then_due(left):
     word = "left" if left else "right"
     assert route_command(route_with_turn(25.0, 10.0, left)) == f"{word}-ahead"
     assert route_command(route_with_turn(3.0, 10.0, left)) == f"{word}-now"
@@ -96,11 +94,11 @@ def test_turn_is_announced_and_then_due(left: bool) -> None:
 
 
 @pytest.mark.parametrize("radius_m", [1e6, 200.0, 50.0])
-def test_bend_of_the_road_itself_is_no_turn(radius_m: float) -> None:
+def test_bend_of_the_road_itself_is_no_turn(radius_m):
     assert route_command(route_with_turn(10.0, radius_m, left=True)) == "keep"
 
 
-def test_route_that_is_over_or_absent_gives_keep() -> None:
+def test_route_that_is_over_or_absent_gives_keep():
     route = route_with_turn(3.0, 10.0, True)
     route[3:] = np.nan
     assert route_command(route) == "keep"
@@ -110,7 +108,7 @@ def test_route_that_is_over_or_absent_gives_keep() -> None:
 # --- the network
 
 
-def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -> None:
+def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path):
     net = LearnedNet(3)
     path = tmp_path / "net.safetensors"
     save_net(net, path, {})
@@ -143,12 +141,12 @@ def policy_route():
     return scenario_with().route
 
 
-def test_it_keeps_the_contract() -> None:
+def test_it_keeps_the_contract():
     report = check_policy("learned")
     assert report.ok, str(report)
 
 
-def test_seeds_drive_differently_and_a_seed_alike() -> None:
+def test_seeds_drive_differently_and_a_seed_alike():
     policy = Learned(scenario_with())
     first = drive(policy, 1)
     again = drive(policy, 1)
@@ -162,7 +160,7 @@ def test_seeds_drive_differently_and_a_seed_alike() -> None:
 
 
 @pytest.mark.slow
-def test_temperature_zero_is_the_mean_for_every_seed() -> None:
+def test_temperature_zero_is_the_mean_for_every_seed():
     policy = make_policy("learned-mean", scenario_with())
     assert isinstance(policy, Learned)
     for a, b in zip(drive(policy, 1), drive(policy, 2), strict=True):
@@ -175,7 +173,7 @@ def test_temperature_zero_is_the_mean_for_every_seed() -> None:
             Learned(scenario_with(), temperature=bad)
 
 
-def test_number_of_threads_does_not_change_a_bit() -> None:
+def test_number_of_threads_does_not_change_a_bit():
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -189,7 +187,7 @@ def test_number_of_threads_does_not_change_a_bit() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_plan_follows_the_pixels_and_not_the_route() -> None:
+def test_plan_follows_the_pixels_and_not_the_route():
     policy = Learned(scenario_with(), temperature=0.0)
     observation = seen()[0]
     plan = policy.act(observation)
@@ -206,7 +204,7 @@ def test_plan_follows_the_pixels_and_not_the_route() -> None:
     assert policy.act(shifted).xy[20, 1] < plan.xy[20, 1] - 0.3
 
 
-def test_wrong_frame_is_refused() -> None:
+def test_wrong_frame_is_refused():
     policy = Learned(scenario_with())
     with pytest.raises(PolicyError, match=r"shape \(10, 10, 3\)"):
         policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))

@@ -37,7 +37,7 @@ RIDGES = RidgeFilter(GRID)
     "camera",
     [CAMERA, pinhole_camera(pitch_deg=8.0), pinhole_camera(mount_m=(2.2, -0.3, 1.2), hfov_deg=100)],
 )
-def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera: object) -> None:
+def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera):
     grid = make_grid(camera)  # type: ignore[arg-type]
     K, T = camera.K, inverse(camera.T_rig_camera)  # type: ignore[attr-defined]
     for row in (0, len(grid.x_m) // 2, len(grid.x_m) - 1):
@@ -66,7 +66,7 @@ def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
     return max(min(centre - left, centre - right), 0.0)
 
 
-def test_ridge_response_equals_plain_window_means() -> None:
+def test_ridge_response_equals_plain_window_means():
     value = np.random.default_rng(0).integers(0, 256, GRID.inside.shape, dtype=np.uint8)
     fast = RIDGES.response(value)
     for row in range(0, len(GRID.x_m), 9):
@@ -78,7 +78,7 @@ def test_ridge_response_equals_plain_window_means() -> None:
             )
 
 
-def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
+def test_step_edge_is_no_paint_but_a_stroke_is():
     value = np.full(GRID.inside.shape, 90, np.uint8)
     value[:, 200:] = 180
     assert RIDGES.response(value)[:, 150:250].max() == 0.0
@@ -87,7 +87,7 @@ def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
     assert RIDGES.response(value)[5:30, 160].min() > 60.0
 
 
-def test_bars_of_a_crosswalk_are_not_taken_for_lines() -> None:
+def test_bars_of_a_crosswalk_are_not_taken_for_lines():
     ground = np.full((*GRID.inside.shape, 3), 90, np.uint8)
     for y in (1.75, -1.75):
         c = round(float(GRID.column_of(np.array(y))))
@@ -144,9 +144,7 @@ def settled(points: PaintPoints, lane: LaneState) -> LaneState:
     curvature=st.floats(-0.015, 0.015),
     width=st.floats(3.0, 4.0),
 )
-def test_lane_is_recovered_from_its_paint(
-    offset: float, heading: float, curvature: float, width: float
-) -> None:
+def test_lane_is_recovered_from_its_paint(offset, heading, curvature, width):
     points = paint_of(offset, heading, curvature, width)
     found = search(points, np.ones(48), 0.0, 0.0, 0.0)
     assert found is not None
@@ -156,7 +154,7 @@ def test_lane_is_recovered_from_its_paint(
     assert np.allclose(lane.centre(x), offset + heading * x + curvature * x**2 / 2, atol=0.12)
 
 
-def test_outliers_beside_the_lane_do_not_pull_it() -> None:
+def test_outliers_beside_the_lane_do_not_pull_it():
     good = paint_of(0.2, 0.02, 0.0, 3.5)
     random = np.random.default_rng(1)
     x = random.uniform(6, 30, 30)
@@ -171,7 +169,7 @@ def test_outliers_beside_the_lane_do_not_pull_it() -> None:
     )
 
 
-def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure() -> None:
+def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure():
     fresh = start(0.0, 0.0, 0.0)
     both = update(fresh, paint_of(0, 0, 0, 3.5), np.ones(48))
     one = update(fresh, paint_of(0, 0, 0, 3.5, sides=(1,)), np.ones(24))
@@ -183,7 +181,7 @@ def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure() -> No
     assert blind.blind_m == pytest.approx(20.0)
 
 
-def test_prediction_sees_the_lane_that_a_moved_ego_would_see() -> None:
+def test_prediction_sees_the_lane_that_a_moved_ego_would_see():
     """The same curve, drawn from a pose further along it."""
     road = PaintedRoad(curvature_1pm=1 / 80)
     before, after = road.pose(0.0, -0.3), road.pose(3.0, 0.1, 0.05)
@@ -199,7 +197,7 @@ def test_prediction_sees_the_lane_that_a_moved_ego_would_see() -> None:
         assert lane.centre(np.array([x]))[0] == pytest.approx(y, abs=0.05)
 
 
-def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of_two() -> None:
+def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of_two():
     left, right = paint_of(0.4, 0.05, 0.01, 3.4), paint_of(-3.0, 0.05, 0.01, 3.4)
     both = PaintPoints(
         *(
@@ -233,30 +231,30 @@ def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
 
 @pytest.mark.parametrize("distance", [8.0, 12.0, 20.0, 30.0, 40.0])
 @pytest.mark.parametrize("colour", [(150, 30, 30), (235, 235, 235), (25, 25, 30), (30, 60, 160)])
-def test_foot_of_a_car_gives_its_distance(distance: float, colour: tuple[int, int, int]) -> None:
+def test_foot_of_a_car_gives_its_distance(distance, colour):
     found = foot_in(BusyRoad(blocks=(Block(distance + 2.25, colour=colour),)))
     assert found[0] == pytest.approx(distance, abs=0.35 + 2.0 * found[1])
     assert found[1] < 0.15 * distance
 
 
-def test_pedestrian_in_the_corridor_is_seen_and_beside_it_is_not() -> None:
+def test_pedestrian_in_the_corridor_is_seen_and_beside_it_is_not():
     person = (0.4, 0.5, 1.75)
     assert foot_in(BusyRoad(blocks=(Block(15.0, 0.3, person, (40, 40, 90)),))) is not None
     assert foot_in(BusyRoad(blocks=(Block(15.0, 2.2, person, (40, 40, 90)),))) is None
 
 
-def test_low_kerb_stone_is_not_taken_for_a_car() -> None:
+def test_low_kerb_stone_is_not_taken_for_a_car():
     assert foot_in(BusyRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
 
 
-def test_road_colour_is_not_learned_from_the_car_in_front() -> None:
+def test_road_colour_is_not_learned_from_the_car_in_front():
     road = BusyRoad(lines=(Line(1.75), Line(-1.75)), blocks=(Block(9.0),))
     lab = cv2.cvtColor(GRID.warp(road.image(CAMERA, np.eye(4))), cv2.COLOR_RGB2LAB)
     centre = np.zeros(len(GRID.x_m))
     assert learn_road(None, lab, GRID, centre, free_to_m=6.5) is None
 
 
-def test_closing_speed_is_learned_from_the_feet() -> None:
+def test_closing_speed_is_learned_from_the_feet():
     track = None
     random = np.random.default_rng(0)
     for k in range(40):
@@ -267,7 +265,7 @@ def test_closing_speed_is_learned_from_the_feet() -> None:
     assert track.speed_mps == pytest.approx(6.0, abs=1.0)
 
 
-def test_track_needs_three_sightings_and_ends_after_nine_misses() -> None:
+def test_track_needs_three_sightings_and_ends_after_nine_misses():
     track = track_obstacle(None, (20.0, 0.5), 5.0, 0.1)
     assert not track.confirmed
     for k in range(5):
@@ -288,9 +286,7 @@ def test_track_needs_three_sightings_and_ends_after_nine_misses() -> None:
     points=st.integers(2, 60),
     turn=st.sampled_from([0.02, 0.4, 2.0]),
 )
-def test_lengths_and_targets_are_those_of_the_plain_arithmetic_to_the_bit(
-    seed: int, points: int, turn: float
-) -> None:
+def test_lengths_and_targets_are_those_of_the_plain_arithmetic_to_the_bit(seed, points, turn):
     random = np.random.default_rng(seed)
     angle = np.cumsum(random.normal(0.0, turn, points))
     line = np.cumsum(

@@ -31,7 +31,7 @@ def curved_log() -> Scenario:
     return replace(SCENARIO, ego_log=trajectory_from_poses(t, np.array(poses)))
 
 
-def test_log_replay_with_the_perfect_controller_is_the_log() -> None:
+def test_log_replay_with_the_perfect_controller_is_the_log():
     scenario = curved_log()
     policy = make_policy("log-replay", scenario)
     controller = make_controller(policy.controller, Vehicle())  # type: ignore[attr-defined]
@@ -44,7 +44,7 @@ def test_log_replay_with_the_perfect_controller_is_the_log() -> None:
         assert abs(yaw_of(inverse(truth) @ ego.T_world_rig)) < 1e-9
 
 
-def test_log_replay_ends_its_plan_with_the_log() -> None:
+def test_log_replay_ends_its_plan_with_the_log():
     scenario = curved_log()
     last = int(scenario.ego_log.t_us[-1])
     plan = make_policy("log-replay", scenario).act(
@@ -54,13 +54,13 @@ def test_log_replay_ends_its_plan_with_the_log() -> None:
     assert len(plan.times_us) == 11
 
 
-def test_log_replay_outside_its_log_is_an_error_and_not_a_guess() -> None:
+def test_log_replay_outside_its_log_is_an_error_and_not_a_guess():
     with pytest.raises(InputError):
         make_policy("log-replay", curved_log()).act(blind(EgoState(START_US - 1, np.eye(4), 8.0)))
 
 
 @pytest.mark.parametrize("speed", [0.0, 13.0, -2.0])
-def test_constant_velocity_goes_straight_on(speed: float) -> None:
+def test_constant_velocity_goes_straight_on(speed):
     plan = make_policy("constant-velocity", SCENARIO).act(
         blind(EgoState(START_US, se2(5, 5, 2.0), speed))
     )
@@ -82,13 +82,13 @@ def pursue(route: np.ndarray, speed: float) -> Plan:
 
 
 @pytest.mark.parametrize("radius", [25.0, -25.0, 60.0, -200.0])
-def test_pure_pursuit_stays_on_a_circle(radius: float) -> None:
+def test_pure_pursuit_stays_on_a_circle(radius):
     plan = pursue(arc_route(radius), 6.0)
     off = np.hypot(plan.xy[:, 0], plan.xy[:, 1] - radius) - abs(radius)
     assert np.abs(off).max() < 0.15
 
 
-def test_pure_pursuit_slows_down_before_a_bend_it_cannot_take_at_speed() -> None:
+def test_pure_pursuit_slows_down_before_a_bend_it_cannot_take_at_speed():
     a = np.linspace(0, 1.5, 12)
     straight = np.column_stack([np.arange(0, 32, 4.2), np.zeros(8)])
     bend = np.concatenate([straight, np.column_stack([32 + 15 * np.sin(a), 15 * (1 - np.cos(a))])])
@@ -100,7 +100,7 @@ def test_pure_pursuit_slows_down_before_a_bend_it_cannot_take_at_speed() -> None
     assert unhurried[-1] == pytest.approx(14.0, abs=0.1)
 
 
-def test_pure_pursuit_sets_off_from_standstill_and_keeps_its_first_speed_as_cruise() -> None:
+def test_pure_pursuit_sets_off_from_standstill_and_keeps_its_first_speed_as_cruise():
     policy = make_policy("pure-pursuit", SCENARIO)
     policy.reset(0, Route(np.zeros((2, 3))))
     plan = policy.act(blind(EgoState(START_US, np.eye(4), 0.0), arc_route(1e6)))
@@ -114,7 +114,7 @@ def test_pure_pursuit_sets_off_from_standstill_and_keeps_its_first_speed_as_crui
 
 
 @pytest.mark.parametrize("route", [NO_ROUTE, np.where(np.arange(20)[:, None] < 1, 0.0, NO_ROUTE)])
-def test_pure_pursuit_without_a_route_goes_straight(route: np.ndarray) -> None:
+def test_pure_pursuit_without_a_route_goes_straight(route):
     plan = pursue(route, 7.0)
     assert np.abs(plan.xy[:, 1]).max() < 1e-9
     assert plan.xy[-1, 0] == pytest.approx(35.0, abs=0.5)  # 5 s at 7 m/s
@@ -148,7 +148,7 @@ class NotAPolicy:
     def act(self, observation: Observation) -> None: ...
 
 
-def test_import_form_makes_a_class_with_or_without_the_scenario() -> None:
+def test_import_form_makes_a_class_with_or_without_the_scenario():
     assert isinstance(make_policy(f"{__name__}:Bare", SCENARIO), Bare)
     made = make_policy(f"{__name__}:WithScenario", SCENARIO)
     assert isinstance(made, WithScenario)
@@ -164,7 +164,7 @@ def test_import_form_makes_a_class_with_or_without_the_scenario() -> None:
         (f"{__name__}:NotAPolicy", "without sensors, reset"),
     ],
 )
-def test_wrong_name_says_what_is_wrong(name: str, text: str) -> None:
+def test_wrong_name_says_what_is_wrong(name, text):
     with pytest.raises((InputError, PolicyError), match="policy") as caught:
         make_policy(name, SCENARIO)
     assert text in str(caught.value)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from tests.gaussians.scene_maps import straight
 
 
 @pytest.fixture(scope="module")
-def scenario() -> Iterator[Scenario]:
+def scenario():
     yield straight(actors=())
     clear_cache()
 
@@ -39,8 +38,8 @@ def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
 
 
 def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(
-    scenario: Scenario,
-) -> None:
+    scenario,
+):
     names = [name for name in known("renderer") if name.startswith("broken-")]
     assert len(names) == 6
     views = requests(scenario, LATE_FRAMES + 2)
@@ -57,8 +56,8 @@ def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(
 
 
 def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(
-    scenario: Scenario,
-) -> None:
+    scenario,
+):
     views = requests(scenario, LATE_FRAMES + 3)
     clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
     frozen, late = make_renderer("broken-frozen", scenario), make_renderer("broken-late", scenario)
@@ -68,8 +67,8 @@ def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(
 
 
 def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the_right(
-    scenario: Scenario,
-) -> None:
+    scenario,
+):
     r = requests(scenario, 1)[0]
     clean = make_renderer("clean", scenario)
     np.testing.assert_array_equal(
@@ -84,8 +83,8 @@ def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the
 
 
 def test_late_shows_the_newest_picture_that_is_a_second_old_at_any_frame_rate(
-    scenario: Scenario,
-) -> None:
+    scenario,
+):
     views = requests(scenario, 21)[::3]
     t_us = [r.t_us for r in views]
     assert LATE_US % (t_us[1] - t_us[0])  # a second falls between two frames

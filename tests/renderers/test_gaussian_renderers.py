@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,7 @@ from tests.gaussians.scene_maps import parked, straight
 
 
 @pytest.fixture(scope="module")
-def scenario() -> Iterator[Scenario]:
+def scenario():
     moving = parked("moving", 30.0, -5.4)
     t = np.array([0, 10_000_000])
     drive = Trajectory(
@@ -59,7 +58,7 @@ def psnr(a: Frame, b: Frame) -> float:
     return float(10 * np.log10(255.0**2 / np.mean((a.rgb.astype(float) - b.rgb) ** 2)))
 
 
-def test_frame_has_the_shapes_types_and_ranges_of_the_contract(scenario: Scenario) -> None:
+def test_frame_has_the_shapes_types_and_ranges_of_the_contract(scenario):
     renderer = make_renderer("clean", scenario)
     assert isinstance(renderer, Renderer)
     frame = renderer.render(request(scenario))
@@ -76,7 +75,7 @@ def test_frame_has_the_shapes_types_and_ranges_of_the_contract(scenario: Scenari
     assert frame.events == ()
 
 
-def test_depth_of_the_road_is_that_of_the_plane(scenario: Scenario) -> None:
+def test_depth_of_the_road_is_that_of_the_plane(scenario):
     frame = make_renderer("clean", scenario).render(request(scenario))
     camera = scenario.cameras[0]
     for row in (100, 120, 140):
@@ -84,7 +83,7 @@ def test_depth_of_the_road_is_that_of_the_plane(scenario: Scenario) -> None:
         assert frame.depth[row, 100:120] == pytest.approx(expected, rel=0.06)
 
 
-def test_same_request_gives_the_same_frame_whatever_came_before(scenario: Scenario) -> None:
+def test_same_request_gives_the_same_frame_whatever_came_before(scenario):
     a, b = make_renderer("clean", scenario, seed=3), make_renderer("clean", scenario, seed=3)
     for i in (30, 5, 17):
         a.render(request(scenario, i, 1.7))
@@ -96,13 +95,13 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario: Scenar
     np.testing.assert_array_equal(first.alpha, second.alpha)
 
 
-def test_renderers_of_one_scenario_share_the_scene(scenario: Scenario) -> None:
+def test_renderers_of_one_scenario_share_the_scene(scenario):
     assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation("cycle")))
     assert scene_key(scenario) != scene_key(replace(scenario, seed=1))
     assert scene_key(scenario) != scene_key(replace(scenario, actors=()))
 
 
-def test_actor_hides_the_road_where_it_stands(scenario: Scenario) -> None:
+def test_actor_hides_the_road_where_it_stands(scenario):
     renderer = make_renderer("clean", scenario)
     r = request(scenario)
     with_car, without = renderer.render(r), renderer.render(replace(r, actors={}))
@@ -111,7 +110,7 @@ def test_actor_hides_the_road_where_it_stands(scenario: Scenario) -> None:
     assert with_car.depth[changed].mean() < without.depth[changed].mean()
 
 
-def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario: Scenario) -> None:
+def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario):
     r = request(scenario)
     moved = replace(
         r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]])
@@ -120,9 +119,7 @@ def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario: Scenario) -> N
     np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)
 
 
-def test_file_background_replaces_the_street_and_keeps_actors_and_sky(
-    scenario: Scenario, tmp_path: object
-) -> None:
+def test_file_background_replaces_the_street_and_keeps_actors_and_sky(scenario, tmp_path):
     wall = scene_of(scenario).actors["car"].levels[0].cloud
     path = f"{tmp_path}/model.ply"
     write_ply(path, wall)

@@ -5,14 +5,13 @@ recording's exposure and frames.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.reconstruction import ImportedRenderer, exposure_near
@@ -22,12 +21,12 @@ from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, reco
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+def drive(tmp_path_factory):
     return recorded_drive(tmp_path_factory.mktemp("drive"))
 
 
 @pytest.fixture(scope="module")
-def frame(drive: Scenario) -> Frame:
+def frame(drive):
     camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     return make_renderer("3dgs", drive, threads=1).render(
@@ -35,13 +34,13 @@ def frame(drive: Scenario) -> Frame:
     )
 
 
-def test_3dgs_of_an_imported_drive_is_its_model(drive: Scenario, frame: Frame) -> None:
+def test_3dgs_of_an_imported_drive_is_its_model(drive, frame):
     assert isinstance(make_renderer("3dgs", drive), ImportedRenderer)
     road = frame.rgb[-8:, 20:44].astype(float)
     assert abs(road.mean() - 0.4 * 255 * EXPOSURE) < 6, "in the exposure of the recording"
 
 
-def test_the_sky_is_opaque_and_has_no_depth(frame: Frame) -> None:
+def test_the_sky_is_opaque_and_has_no_depth(frame):
     up = slice(0, HIGH // 2 - 4)
     assert np.all(frame.alpha[up] == 1)
     assert np.all(frame.depth[up] == 0)
@@ -49,7 +48,7 @@ def test_the_sky_is_opaque_and_has_no_depth(frame: Frame) -> None:
     assert frame.depth[-1, WIDE // 2] > 1
 
 
-def test_fog_hides_the_sky_of_an_imported_drive(drive: Scenario) -> None:
+def test_fog_hides_the_sky_of_an_imported_drive(drive):
     foggy = replace(drive, environment=replace(drive.environment, fog_visibility_m=50.0))
     camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
@@ -58,7 +57,7 @@ def test_fog_hides_the_sky_of_an_imported_drive(drive: Scenario) -> None:
     assert (shown.rgb[: HIGH // 2 - 4] == FOG_SRGB).all()
 
 
-def test_a_hole_below_the_horizon_stays_a_hole(drive: Scenario) -> None:
+def test_a_hole_below_the_horizon_stays_a_hole(drive):
     camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0])
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     T[:3, 3] += [0.0, 200.0, 0.0]  # far beside the road, where there is nothing
@@ -69,19 +68,19 @@ def test_a_hole_below_the_horizon_stays_a_hole(drive: Scenario) -> None:
     assert shown.alpha[0].min() == 1
 
 
-def test_what_stands_in_the_model_is_not_drawn_once_more(drive: Scenario) -> None:
+def test_what_stands_in_the_model_is_not_drawn_once_more(drive):
     renderer = make_renderer("3dgs", drive)
     assert isinstance(renderer, ImportedRenderer)
     assert "obstacle-001" in log_actors(drive, int(drive.ego_log.t_us[0]))
     assert not renderer.graph.actors
 
 
-def test_a_missing_model_names_the_folder(drive: Scenario, tmp_path: Path) -> None:
+def test_a_missing_model_names_the_folder(drive, tmp_path):
     with pytest.raises(InputError):
         make_renderer("3dgs", replace(drive, model=str(tmp_path / "nowhere")))
 
 
-def test_recorded_frames_are_those_of_the_fit_alone(drive: Scenario) -> None:
+def test_recorded_frames_are_those_of_the_fit_alone(drive):
     frames = make_renderer("3dgs", drive, threads=1).recorded()
     assert [one.camera for one in frames] == ["front"] * 8
     held = next(one for one in drive.recording if one.use == "held-out")
@@ -96,13 +95,13 @@ def test_recorded_frames_are_those_of_the_fit_alone(drive: Scenario) -> None:
     assert np.allclose(first.T_world_camera, drive.recording[0].T_world_camera)
 
 
-def test_a_missing_photograph_is_named(drive: Scenario, tmp_path: Path) -> None:
+def test_a_missing_photograph_is_named(drive, tmp_path):
     gone = replace(drive.recording[0], path=str(tmp_path / "gone.png"))
     with pytest.raises(InputError):
         photograph_image(gone, photograph_camera(gone, WIDE))
 
 
-def test_exposure_follows_the_place_and_the_camera(drive: Scenario) -> None:
+def test_exposure_follows_the_place_and_the_camera(drive):
     one, other = drive.recording[0], drive.recording[8]
     recording = (replace(one, exposure=(1.0, 1.0, 1.0)), replace(other, exposure=(2.0, 1.0, 0.5)))
     assert np.allclose(exposure_near(recording, "front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)

@@ -22,9 +22,7 @@ def street(degradation: Degradation) -> Scenario:
     return with_camera(straight(degradation=degradation), 64, 36)
 
 
-def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one() -> (
-    None
-):
+def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one():
     scenario = street(Degradation("none"))
     scene = scene_of(scenario)
     frames = built_recording(scenario, scene, scene.render, None)
@@ -41,7 +39,7 @@ def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_t
         assert (depth[-4:] > 0).all()
 
 
-def test_a_recorded_frame_is_believed_where_registration_put_the_views_beside_it() -> None:
+def test_a_recorded_frame_is_believed_where_registration_put_the_views_beside_it():
     damage = Degradation("reconstruction", pose_error_m=0.1, views_per_s=12.0)
     scenario = street(damage)
     recipe = recipe_of(scenario)

@@ -4,7 +4,7 @@ rig, a passing car.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.shutter import Along, at_share, bands_of, rolling
+from alpasim_plugin.core.shutter import at_share, bands_of, rolling
 from alpasim_plugin.core.types import F64, Behaviour, Exposure, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
@@ -46,14 +46,14 @@ def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
 
 
 @pytest.fixture(scope="module")
-def scenario() -> Iterator[Scenario]:
+def scenario():
     car = replace(parked("car", 27.0, 1.8), is_static=False, behaviour=Behaviour())
     yield straight(actors=(car,))
     clear_cache()
 
 
 @pytest.fixture(scope="module")
-def draw(scenario: Scenario) -> Draw:
+def draw(scenario):
     def drawn(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
         return scene_of(scenario).render(camera, actors, 1, sky_in_alpha=True)
 
@@ -77,7 +77,7 @@ def psnr(a: RasterOutput, b: RasterOutput) -> float:
 
 
 @pytest.fixture(scope="module")
-def truth_of(scenario: Scenario, draw: Draw) -> Callable[[str], RasterOutput]:
+def truth_of(scenario, draw):
     """Return a function from the name of a hard case to its frame by the definition."""
     return cache(lambda name: plain_draw_request(case(scenario, **HARD[name]), draw))
 
@@ -104,12 +104,12 @@ HARD = {
     ],
 )
 def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
-    scenario: Scenario,
-    draw: Draw,
-    truth_of: Callable[[str], RasterOutput],
-    name: str,
-    device: str,
-) -> None:
+    scenario,
+    draw,
+    truth_of,
+    name,
+    device,
+):
     request = case(scenario, **HARD[name])
     truth, rolled = truth_of(name), draw_request(request, draw, device)
     at_end = draw_request(replace(request, exposure=None), draw, device)
@@ -122,9 +122,7 @@ def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
 
 
 @pytest.mark.parametrize(("along", "backwards"), [("rows", True), ("columns", False)])
-def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(
-    scenario: Scenario, draw: Draw, along: Along, backwards: bool
-) -> None:
+def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(scenario, draw, along, backwards):
     request = case(with_camera(scenario, 128, 72), **HARD["all"])
     assert request.exposure is not None
     share = rolling(request.camera.width, request.camera.height, along, backwards)
@@ -134,11 +132,11 @@ def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(
 
 
 def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
-    scenario: Scenario,
-    draw: Draw,
-    truth_of: Callable[[str], RasterOutput],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    scenario,
+    draw,
+    truth_of,
+    monkeypatch,
+):
     request = case(scenario, **HARD["all"])
     truth, errors = truth_of("all"), []
     for count in (1, 4, 16, request.camera.height):
@@ -153,7 +151,7 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
     )  # windows begin at other places than the picture, so sums round otherwise
 
 
-def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario: Scenario, draw: Draw) -> None:
+def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario, draw):
     request = case(scenario)
     np.testing.assert_array_equal(
         draw_request(request, draw, "cpu").rgb,
@@ -161,7 +159,7 @@ def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario: Scenario, 
     )
 
 
-def test_a_window_shows_what_the_whole_picture_does(scenario: Scenario, draw: Draw) -> None:
+def test_a_window_shows_what_the_whole_picture_does(scenario, draw):
     """Splats that reach into a window from far outside of it keep their shape."""
     spec = scenario.cameras[0]
     camera = PinholeCamera.from_pose(spec.width, spec.height, spec.K, STANDS @ spec.T_rig_camera)
@@ -176,7 +174,7 @@ def test_a_window_shows_what_the_whole_picture_does(scenario: Scenario, draw: Dr
 
 
 @pytest.mark.parametrize("name", ["clean", "3dgs"])
-def test_renderers_roll_when_the_request_does(scenario: Scenario, name: str) -> None:
+def test_renderers_roll_when_the_request_does(scenario, name):
     renderer = make_renderer(name, scenario)
     request = case(scenario, **HARD["all"])
     rolled, still = renderer.render(request), renderer.render(replace(request, exposure=None))

@@ -22,7 +22,7 @@ def depth_of_wall(distance_m: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 20.0, 60.0, 150.0])
-def test_transmittance_falls_by_the_distance_along_the_ray(distance_m: float) -> None:
+def test_transmittance_falls_by_the_distance_along_the_ray(distance_m):
     found = transmittance(depth_of_wall(distance_m), K, AHEAD, 120.0)
     for row, column in ((30, 50), (0, 0), (59, 99)):
         ray = np.array([(column + 0.5 - 50) / 100, (row + 0.5 - 30) / 100, 1.0])
@@ -30,7 +30,7 @@ def test_transmittance_falls_by_the_distance_along_the_ray(distance_m: float) ->
         assert found[row, column] == pytest.approx(due, rel=0.02)
 
 
-def test_fog_mixes_linear_light_and_hides_the_sky() -> None:
+def test_fog_mixes_linear_light_and_hides_the_sky():
     dark = np.zeros((60, 100, 3), np.uint8)
     depth = depth_of_wall(50.0)
     depth[:20] = 0
@@ -42,7 +42,7 @@ def test_fog_mixes_linear_light_and_hides_the_sky() -> None:
     np.testing.assert_allclose(found[40, 50], due, atol=1.0)
 
 
-def test_a_hole_in_the_ground_is_as_far_as_the_ground_around_it() -> None:
+def test_a_hole_in_the_ground_is_as_far_as_the_ground_around_it():
     depth = depth_of_wall(10.0)
     depth[45:50, 40:60] = 0
     found = transmittance(depth, K, AHEAD, 100.0)
@@ -51,7 +51,7 @@ def test_a_hole_in_the_ground_is_as_far_as_the_ground_around_it() -> None:
 
 
 @pytest.mark.parametrize("renderer", ["clean", "onefixer"])  # the fixer repairs what 3dgs shows
-def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer: str) -> None:
+def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer):
     short = ["timing.duration_us=1500000", "timing.warmup_us=200000"]
     fog = (short, [*short, "environment.fog_visibility_m=80"])
     scenarios = [load_scenario("smoke/curve", overrides=overrides) for overrides in fog]
@@ -68,7 +68,7 @@ def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer: str) -> Non
     clear_cache()
 
 
-def test_a_renderer_without_depth_cannot_be_put_into_fog() -> None:
+def test_a_renderer_without_depth_cannot_be_put_into_fog():
     scenario = load_scenario("smoke/curve")
     request = frame_request(scenario, 32, 16)
 
@@ -84,6 +84,6 @@ def test_a_renderer_without_depth_cannot_be_put_into_fog() -> None:
 
 
 @pytest.mark.parametrize("visibility_m", ["0", "-5", "nan", "thick"])
-def test_a_visibility_that_is_none_is_refused(visibility_m: str) -> None:
+def test_a_visibility_that_is_none_is_refused(visibility_m):
     with pytest.raises(InputError):
         load_scenario("smoke/curve", overrides=[f"environment.fog_visibility_m={visibility_m}"])

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from tests.report.make_run import Plan, make_run
@@ -10,7 +8,7 @@ HOSTILE = "<img src=x onerror=alert(1)>\"'&|{{7*7}}"
 
 
 @pytest.fixture(scope="session")
-def usual_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def usual_run(tmp_path_factory):
     """Make three renderers x two policies x four scenes x three seeds, two failures, one metric
     invalid in one scene.
     """
@@ -22,7 +20,7 @@ def usual_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def hostile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hostile_run(tmp_path_factory):
     """Make a run whose every name is markup."""
     plan = Plan(
         renderers=("clean", f"nre://{HOSTILE}:50051"),

@@ -49,11 +49,11 @@ def with_pairs(folder: Path, **tables: Any) -> Run:
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def three(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("three"), Plan(steps=40, clips=False))
 
 
-def test_every_rollout_is_counted_once_under_its_variant(usual_run: Path) -> None:
+def test_every_rollout_is_counted_once_under_its_variant(usual_run):
     shown = overview_of(read_run(usual_run))
     assert [row.n_rollouts for row in shown.rows] == [12] * 6
     for row in shown.rows:
@@ -70,7 +70,7 @@ def test_every_rollout_is_counted_once_under_its_variant(usual_run: Path) -> Non
     assert all(row.where.endswith("not run") for row in shown.rows if row.endings.get("not run"))
 
 
-def test_terminal_markdown_and_page_print_the_same_cells(three: Path) -> None:
+def test_terminal_markdown_and_page_print_the_same_cells(three):
     shown = overview_of(read_run(three))
     terminal = "\n".join(line.plain for line in overview_lines(shown, 100))
     markdown = overview_md(shown)
@@ -91,9 +91,7 @@ def test_terminal_markdown_and_page_print_the_same_cells(three: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
-    tmp_path: Path, width: int
-) -> None:
+def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(tmp_path, width):
     names = [f"drivers.py:PurePursuitWithALongName{letter * 12}" for letter in "abcd"]
     plan = Plan(("clean",), ("log-replay", *names), seeds=(0,), steps=30)
     shown = overview_of(read_run(make_run(tmp_path, plan)))
@@ -103,8 +101,8 @@ def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(
 
 
 def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
-    three: Path,
-) -> None:
+    three,
+):
     entry = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
     run = with_pairs(three, paired={"3dgs": entry, "onefixer": entry | {"more_scenes": 180}})
     shown = overview_of(run)
@@ -118,7 +116,7 @@ def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal
     assert "29" not in shown.decision
 
 
-def test_what_is_decided_is_named_beside_what_is_not(three: Path) -> None:
+def test_what_is_decided_is_named_beside_what_is_not(three):
     run = with_pairs(
         three,
         paired={
@@ -139,8 +137,8 @@ def test_what_is_decided_is_named_beside_what_is_not(three: Path) -> None:
 
 
 def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_own_policy(
-    usual_run: Path,
-) -> None:
+    usual_run,
+):
     shown = overview_of(read_run(usual_run))
     assert shown.baselines == "clean"
     assert {row.name for row in shown.rows if row.difference} == {
@@ -150,7 +148,7 @@ def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_o
     }
 
 
-def test_a_distance_that_an_event_cut_short_says_so(three: Path) -> None:
+def test_a_distance_that_an_event_cut_short_says_so(three):
     run = read_run(three)
     ledger = {name: {"steps_after_event": 5 * (name == "3dgs")} for name in run.renderers}
     shown = overview_of(dataclasses.replace(run, summary=run.summary | {"censoring": ledger}))
@@ -172,13 +170,13 @@ def test_a_distance_that_an_event_cut_short_says_so(three: Path) -> None:
         ({"verdict": "non-inferior"}, "lower", "neutral"),
     ],
 )
-def test_tone_of_a_difference(entry: dict[str, Any], direction: str, tone: str) -> None:
+def test_tone_of_a_difference(entry, direction, tone):
     assert tone_of(entry, direction) == tone
 
 
 def test_identical_variants_are_called_better_or_worse_in_no_more_runs_than_one_question_allows(
-    three: Path,
-) -> None:
+    three,
+):
     rng = np.random.default_rng(0)
     drawn = (rng.random((2, 150, 40, 1)) < 0.3).astype(float)  # variant, comparison, scene, seed
     pool = [
@@ -199,7 +197,7 @@ def test_identical_variants_are_called_better_or_worse_in_no_more_runs_than_one_
     assert uncorrected > 0.2 * runs  # what the rule is for
 
 
-def test_an_evaluator_declares_no_second_primary_question() -> None:
+def test_an_evaluator_declares_no_second_primary_question():
     with pytest.raises(EvaluatorError, match=f"'{PRIMARY}' is primary"):
         METRICS.adding({"mine": dataclasses.replace(METRICS.info(PRIMARY), name="mine")})
 
@@ -208,9 +206,7 @@ def grey(value: int) -> bytes:
     return encode_image(np.full((9, 16, 3), value, np.uint8), "jpeg", 95)
 
 
-def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(
-    three: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, monkeypatch):
     run = read_run(three)
     first, scene = run.rollouts[0], run.scenes[0]
     rollouts = []

@@ -46,7 +46,7 @@ coordinates = st.lists(
 
 @given(coordinates)
 @settings(deadline=None)
-def test_path_data_stays_near_the_line(points: list[tuple[float, float]]) -> None:
+def test_path_data_stays_near_the_line(points):
     line = np.array(points)
     d = path_data(line, tolerance=1.5)
     if d:
@@ -59,7 +59,7 @@ def test_path_data_stays_near_the_line(points: list[tuple[float, float]]) -> Non
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi / 2, 3.0, -2.2])
-def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
+def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw):
     s = np.linspace(0, 100, 50)
     x, y = np.cos(yaw) * s, np.sin(yaw) * s
     left = (x - 2.0 * np.sin(yaw), y + 2.0 * np.cos(yaw))
@@ -81,7 +81,7 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     assert (log[:, 1] <= view.height).all()
 
 
-def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
+def test_rollout_that_drives_away_does_not_shrink_the_scene():
     x = np.linspace(0, 100, 50).tolist()
     rollout = Rollout("a", "p", "s", 0, "ok")
     stray = series_of(x, np.linspace(0, 5000, 50).tolist())
@@ -89,7 +89,7 @@ def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
     assert view.height / view.unit_per_m < 70.0
 
 
-def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
+def test_overlapping_lanes_of_both_directions_do_not_cut_holes():
     there = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]]}
     back = {"left": [[100, -3], [0, -3]], "right": [[100, 1], [0, 1]]}
     view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[there, back]), [], {}, VARIANTS)
@@ -102,7 +102,7 @@ def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
     assert areas[0] == areas[1]
 
 
-def test_event_is_marked_where_and_when_it_happened() -> None:
+def test_event_is_marked_where_and_when_it_happened():
     x = np.linspace(0, 50, 51).tolist()
     rollout = Rollout(
         "a",
@@ -127,7 +127,7 @@ def test_event_is_marked_where_and_when_it_happened() -> None:
     assert mark.footprint.endswith("z")
 
 
-def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
+def test_event_that_no_step_shows_is_listed_without_a_place():
     rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
     view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, VARIANTS)
     assert view.marks[0].x is None

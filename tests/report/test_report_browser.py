@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from evaluators.report import write_report
@@ -23,9 +21,7 @@ def column(browser: Browser, table: str, index: int) -> list[str]:
 
 @pytest.mark.parametrize("name", ["usual_run", "hostile_run"])
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])
-def test_no_complaint_and_no_outside_request(
-    browser: Browser, request: pytest.FixtureRequest, name: str, width: int, dark: bool
-) -> None:
+def test_no_complaint_and_no_outside_request(browser, request, name, width, dark):
     report = write_report(request.getfixturevalue(name))
     browser.requests.clear()
     browser.complaints.clear()
@@ -43,7 +39,7 @@ def test_no_complaint_and_no_outside_request(
     )  # tables scroll, the page does not
 
 
-def test_changed_outcomes_lead_to_their_frames(browser: Browser, usual_run: Path) -> None:
+def test_changed_outcomes_lead_to_their_frames(browser, usual_run):
     browser.open(write_report(usual_run), width=390)
     opened = "[...document.querySelectorAll('.flip-card')].map(d => d.open)"
     assert browser.evaluate(opened)[0]
@@ -62,9 +58,7 @@ def test_changed_outcomes_lead_to_their_frames(browser: Browser, usual_run: Path
     assert all((usual_run / link).exists() for link in links)
 
 
-def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
-    browser: Browser, usual_run: Path
-) -> None:
+def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(browser, usual_run):
     browser.open(write_report(usual_run))
     head = "[...document.querySelectorAll('#table-flips th .sort')].find(b => b.textContent.startsWith('Plans part')).click()"
     for _ in range(2):
@@ -75,7 +69,7 @@ def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
         assert times[-1] == "\u2014"
 
 
-def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run: Path) -> None:
+def test_theme_follows_the_system_until_it_is_chosen(browser, usual_run):
     shade = "getComputedStyle(document.body).backgroundColor"
     report = write_report(usual_run)
     browser.open(report, dark=False)

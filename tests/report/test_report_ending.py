@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.opening import Run, read_run
@@ -21,7 +20,7 @@ def words_of(run: Run) -> list[str]:
     return words
 
 
-def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run: Path) -> None:
+def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run):
     run = read_run(usual_run)
     assert words_of(run)[1] == "check"  # some rollouts failed: that comes first
     run = dataclasses.replace(
@@ -37,8 +36,8 @@ def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run: Path) ->
 
 
 def test_a_quiet_run_leads_to_its_replay_and_a_failing_policy_to_its_check(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     alone = read_run(make_run(tmp_path / "a", Plan(renderers=("clean",), seeds=(0,), steps=30)))
     alone = dataclasses.replace(
         alone, rollouts=tuple(one for one in alone.rollouts if not outcomes_of(one))

@@ -31,7 +31,7 @@ SUMMARY = {
 }
 
 
-def test_untrained_weights_and_refused_frames_are_cautions() -> None:
+def test_untrained_weights_and_refused_frames_are_cautions():
     untrained, refused = fixer_cautions(SUMMARY)
     assert (
         untrained
@@ -42,7 +42,7 @@ def test_untrained_weights_and_refused_frames_are_cautions() -> None:
     )
 
 
-def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
+def test_what_only_drafts_have_is_a_dash_for_whole_blocks():
     drafted, blocks = fixer_rows(SUMMARY)
     assert [cell.text.replace("\u00a0", " ") for cell in drafted["cells"][3:]] == [
         "75.0 %",

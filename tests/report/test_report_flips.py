@@ -45,23 +45,21 @@ def run_of(*rollouts: Rollout) -> Run:
         ),
     ],
 )
-def test_a_flip_has_a_side_and_words(
-    was: dict[str, float], now: dict[str, float], tone: str, words: tuple[str, str]
-) -> None:
+def test_a_flip_has_a_side_and_words(was, now, tone, words):
     flips, compared = find_flips(run_of(rollout("clean", **was), rollout("3dgs", **now)))
     assert compared == 1
     (flip,) = flips
     assert (flip.tone, (flip.was, flip.now)) == (tone, words)
 
 
-def test_equal_outcomes_failed_sides_and_missing_partners_are_no_flips() -> None:
+def test_equal_outcomes_failed_sides_and_missing_partners_are_no_flips():
     same = (rollout("clean", 0, offroad=1.0), rollout("3dgs", 0, offroad=1.0))
     failed = (rollout("clean", 1), rollout("3dgs", 1, "failed", offroad=1.0))
     alone = (rollout("3dgs", 2, offroad=1.0),)
     assert find_flips(run_of(*same, *failed, *alone)) == ([], 1)
 
 
-def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
+def test_rows_show_both_frames_the_time_and_both_clips(usual_run):
     rows, more, compared = flip_rows(read_run(usual_run), 10**7)
     assert (more, compared) == (
         0,
@@ -80,7 +78,7 @@ def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
     assert all(clip is not None and clip.endswith("front.mp4") for _, _, clip, _ in with_clip.links)
 
 
-def test_policies_behind_one_renderer_flip_as_renderers_do() -> None:
+def test_policies_behind_one_renderer_flip_as_renderers_do():
     rollouts = [
         Rollout("clean", policy, "s", 0, "ok", metrics={"offroad": value})
         for policy, value in (("a", 0.0), ("b", 1.0))
@@ -92,15 +90,13 @@ def test_policies_behind_one_renderer_flip_as_renderers_do() -> None:
     assert flip.key == ("clean", "b", "s", 0, "clean/a")
 
 
-def test_a_drive_that_the_policy_broke_off_is_an_outcome() -> None:
+def test_a_drive_that_the_policy_broke_off_is_an_outcome():
     broken = Rollout("3dgs", "p", "s", 0, "failed", "policy")
     (flip,), _ = find_flips(run_of(rollout("clean"), broken))
     assert (flip.was, flip.now, flip.tone) == ("no event", "policy fault", "worse")
 
 
-def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(
-    usual_run: Path, tmp_path: Path
-) -> None:
+def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(usual_run, tmp_path):
     for name in ("run.json", "summary.json", "rollouts.parquet"):
         shutil.copy(usual_run / name, tmp_path / name)
     rows, _, _ = flip_rows(read_run(tmp_path), 10**7)
@@ -109,7 +105,7 @@ def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(
     assert "No frames: the run folder has no logs to look for it in." in text
 
 
-def test_frames_outside_the_run_folder_are_not_read(usual_run: Path, tmp_path: Path) -> None:
+def test_frames_outside_the_run_folder_are_not_read(usual_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(usual_run, folder)
     told = json.loads((folder / "flips.json").read_text())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pyarrow.parquet as pq
 
@@ -16,9 +15,7 @@ from evaluators.statistics.baselines import table_of_run
 from evaluators.statistics.gate import judge, load_gate
 
 
-def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
-    usual_run: Path, tmp_path: Path
-) -> None:
+def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usual_run, tmp_path):
     root = tmp_path / "run"
     shutil.copytree(usual_run, root)
     run = read_run(root)
@@ -43,7 +40,7 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
     assert gate_section(read_run(root)) is None
 
 
-def test_what_breaks_a_rule_is_named_once_and_before_what_is_undecided() -> None:
+def test_what_breaks_a_rule_is_named_once_and_before_what_is_undecided():
     pair = {"scene": "bend", "seed": 0, "was": 0.0, "now": 1.0}
     undecided = {"metric": "progress", "renderer": "r", "policy": "p", "cause": "undecided"}
     broken = undecided | {"metric": "collision_any", "cause": "regression"}

@@ -65,14 +65,12 @@ def page_of(folder: Path) -> Page:
 
 
 @pytest.fixture(scope="module")
-def usual_page(usual_run: Path) -> Page:
+def usual_page(usual_run):
     """Give the page of the usual run; it stays beside its tables as ``report.html``."""
     return page_of(usual_run)
 
 
-def test_report_is_one_well_formed_file_without_outside_addresses(
-    usual_run: Path, usual_page: Page
-) -> None:
+def test_report_is_one_well_formed_file_without_outside_addresses(usual_run, usual_page):
     page = usual_page
     assert all(LOCAL.match(address) for address in page.addresses)
     assert len(page.ids) == len(set(page.ids))
@@ -83,9 +81,7 @@ def test_report_is_one_well_formed_file_without_outside_addresses(
     assert "@import" not in text
 
 
-def test_every_link_leads_to_a_file_or_a_place_in_the_page(
-    usual_run: Path, usual_page: Page
-) -> None:
+def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run, usual_page):
     page = usual_page
     for address in page.addresses:
         if address.startswith("#"):
@@ -94,7 +90,7 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(
             assert (usual_run / unquote(address)).exists(), address
 
 
-def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
+def test_verdict_comes_first(usual_run, usual_page):
     page = usual_page
     heads = ["Changed outcomes", "From above"]
     heads += [
@@ -109,7 +105,7 @@ def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
     assert page.tags.index("h1") < page.tags.index("table")
 
 
-def test_hostile_names_stay_text(hostile_run: Path) -> None:
+def test_hostile_names_stay_text(hostile_run):
     page = page_of(hostile_run)
     assert not page.handlers
     assert page.tags.count("script") == 1
@@ -121,9 +117,7 @@ def test_hostile_names_stay_text(hostile_run: Path) -> None:
             assert (hostile_run / unquote(address)).resolve().is_relative_to(hostile_run.resolve())
 
 
-def test_numbers_that_are_missing_are_dashes_with_a_reason(
-    usual_run: Path, usual_page: Page
-) -> None:
+def test_numbers_that_are_missing_are_dashes_with_a_reason(usual_run, usual_page):
     text = (usual_run / "report.html").read_text()
     reasons = re.findall(r'<span class="missing" title="([^"]*)"[^>]*>([^<]*)</span>', text)
     assert reasons
@@ -131,13 +125,13 @@ def test_numbers_that_are_missing_are_dashes_with_a_reason(
     assert ("the policy gives no plan of 1.0 s", "\u2014") in reasons
 
 
-def test_run_without_rollouts_has_a_report(tmp_path: Path) -> None:
+def test_run_without_rollouts_has_a_report(tmp_path):
     page = page_of(make_run(tmp_path, Plan(renderers=(), scenes=())))
     assert "Nothing was run" in page.text
     assert "There is no metric" in page.text
 
 
-def test_run_whose_every_rollout_failed_has_a_report(tmp_path: Path) -> None:
+def test_run_whose_every_rollout_failed_has_a_report(tmp_path):
     page = page_of(
         make_run(
             tmp_path,
@@ -148,14 +142,12 @@ def test_run_whose_every_rollout_failed_has_a_report(tmp_path: Path) -> None:
     assert "1204 NaN pixels <b>&" in page.text
 
 
-def test_same_folder_gives_the_same_bytes(usual_run: Path, usual_page: Page) -> None:
+def test_same_folder_gives_the_same_bytes(usual_run, usual_page):
     first = (usual_run / "report.html").read_bytes()
     assert write_report(usual_run).read_bytes() == first
 
 
-def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path, monkeypatch):
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     before = write_report(folder).read_bytes()
 
@@ -170,7 +162,7 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(
     assert not list(folder.glob(".*.tmp"))
 
 
-def test_a_gap_interrupts_a_line_and_a_band() -> None:
+def test_a_gap_interrupts_a_line_and_a_band():
     x, y = np.arange(5.0), np.array([1.0, 2.0, np.nan, 3.0, 2.0])
     axes = Axes()
     axes.band(x, y - 1, y + 1, "var(--variant-0)")
@@ -184,7 +176,7 @@ def test_a_gap_interrupts_a_line_and_a_band() -> None:
 @pytest.mark.parametrize(
     ("low", "high"), [(0.0, 1.0), (-3e-7, 2e-7), (-1234.5, 99999.0), (0.98, 1.02)]
 )
-def test_ticks_are_round_few_and_inside(low: float, high: float) -> None:
+def test_ticks_are_round_few_and_inside(low, high):
     ticks = round_ticks(low, high)
     assert 2 <= len(ticks) <= 10
     for value, text in ticks:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +10,7 @@ from evaluators.report import write_junit
 from evaluators.report.ci import clean, junit
 
 
-def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
+def test_one_case_per_rollout_and_an_error_per_failure(usual_run):
     suite = ET.parse(write_junit(usual_run)).getroot().find("testsuite")
     cases = suite.findall("testcase")
     assert len(cases) == int(suite.attrib["tests"]) == 72
@@ -28,7 +27,7 @@ def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
     assert error.attrib["message"] == "1204 NaN pixels <b>&"
 
 
-def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -> None:
+def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run):
     root = ET.parse(write_junit(usual_run)).getroot()
     case = next(
         c
@@ -42,8 +41,8 @@ def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -
 
 
 def test_an_outcome_is_a_failed_case_of_the_run_and_a_property_of_the_case_in_a_gate(
-    usual_run: Path,
-) -> None:
+    usual_run,
+):
     for root, fails in (
         (junit(read_run(usual_run)), True),
         (junit(read_run(usual_run), outcomes_fail=False), False),
@@ -67,7 +66,7 @@ def test_an_outcome_is_a_failed_case_of_the_run_and_a_property_of_the_case_in_a_
         assert (root.attrib["failures"] == "0") != fails
 
 
-def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Path) -> None:
+def test_hostile_names_and_control_characters_give_readable_xml(hostile_run):
     root = ET.parse(write_junit(hostile_run)).getroot()
     error = next(root.iter("error"))
     assert error.attrib["message"] == "</script><script>alert(1)</script>"
@@ -75,6 +74,6 @@ def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Pat
 
 
 @given(st.text(st.characters(codec="utf-8")))
-def test_any_text_survives_a_round_trip_through_xml(text: str) -> None:
+def test_any_text_survives_a_round_trip_through_xml(text):
     element = ET.Element("a", {"b": clean(text)})
     assert ET.fromstring(ET.tostring(element, encoding="unicode")).attrib["b"] == clean(text)

@@ -25,18 +25,18 @@ from evaluators.numbers import (
         (-1e9, 0, False, "\u22121\u202f000\u202f000\u202f000"),
     ],
 )
-def test_fixed_decimals(value: float, places: int, sign: bool, text: str) -> None:
+def test_fixed_decimals(value, places, sign, text):
     assert fixed(value, places, sign) == text
 
 
 @given(st.floats(-1e6, 1e6), st.integers(0, 4))
-def test_printed_number_reads_back_within_half_a_unit(value: float, places: int) -> None:
+def test_printed_number_reads_back_within_half_a_unit(value, places):
     read = float(fixed(value, places).replace("\u2212", "-").replace("\u202f", ""))
     assert abs(read - value) <= 0.5 * 10.0**-places * (1 + 1e-9)
 
 
 @given(st.floats(1e-3, 1e5))
-def test_three_significant_digits_are_kept(value: float) -> None:
+def test_three_significant_digits_are_kept(value):
     places = decimals(value)
     assert 0 <= places <= 4
     if places < 4:
@@ -44,11 +44,11 @@ def test_three_significant_digits_are_kept(value: float) -> None:
 
 
 @pytest.mark.parametrize("value", [None, math.nan, math.inf, -math.inf, "0.5", True, [1.0]])
-def test_only_finite_numbers_are_numbers(value: object) -> None:
+def test_only_finite_numbers_are_numbers(value):
     assert finite(value) is None
 
 
-def test_interval_from_bounds_from_half_width_and_from_nothing() -> None:
+def test_interval_from_bounds_from_half_width_and_from_nothing():
     assert interval([0.1, 0.3]) == (0.1, 0.3)
     assert interval(0.5, 2.0) == (1.5, 2.5)
     assert interval(0.5) is None

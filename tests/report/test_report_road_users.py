@@ -20,7 +20,7 @@ def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
     return {one["text"].split(",")[0]: (one["body"], one["way"]) for one in found}
 
 
-def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
+def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way():
     scenario = load_scenario("smoke/lead_car")
     (lead,) = [actor for actor in scenario.actors if actor.actor_id == "lead"]
     early, late = (

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -16,14 +15,14 @@ from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
 
 
-def test_reads_every_rollout_with_its_key(usual_run: Path) -> None:
+def test_reads_every_rollout_with_its_key(usual_run):
     run = read_run(usual_run)
     assert len(run.rollouts) == len({r.cell for r in run.rollouts}) == 3 * 2 * 4 * 3
     assert run.renderers == ["clean", "3dgs", "onefixer"]
     assert sum(not r.ok for r in run.rollouts) == 4  # both policies of two cells
 
 
-def test_invalid_metric_is_none_even_where_a_number_stands(usual_run: Path, tmp_path: Path) -> None:
+def test_invalid_metric_is_none_even_where_a_number_stands(usual_run, tmp_path):
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     table = pq.read_table(usual_run / "rollouts.parquet")
     zeros, no = pa.array(np.zeros(table.num_rows)), pa.array(np.zeros(table.num_rows, bool))
@@ -33,7 +32,7 @@ def test_invalid_metric_is_none_even_where_a_number_stands(usual_run: Path, tmp_
     assert all(r.metrics["offroad"] is None for r in read_run(tmp_path / "run").rollouts)
 
 
-def test_summary_key_with_policy_stands_for_that_policy_only(usual_run: Path) -> None:
+def test_summary_key_with_policy_stands_for_that_policy_only(usual_run):
     run = read_run(usual_run)
     assert len(run.rollouts_of("3dgs")) == 24
     assert {r.policy for r in run.rollouts_of("3dgs/lane-camera")} == {"lane-camera"}
@@ -43,9 +42,7 @@ def test_summary_key_with_policy_stands_for_that_policy_only(usual_run: Path) ->
 
 
 @pytest.mark.parametrize("path", ["../outside", "/etc", "rollouts/../../outside", ""])
-def test_paths_that_leave_the_run_folder_are_not_followed(
-    tmp_path: Path, usual_run: Path, path: str
-) -> None:
+def test_paths_that_leave_the_run_folder_are_not_followed(tmp_path, usual_run, path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "strip.jpg").write_bytes(b"secret")
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
@@ -74,9 +71,7 @@ def test_paths_that_leave_the_run_folder_are_not_followed(
         ),
     ],
 )
-def test_broken_folder_is_a_four_part_error(
-    tmp_path: Path, usual_run: Path, break_it, found: str
-) -> None:  # type: ignore[no-untyped-def]
+def test_broken_folder_is_a_four_part_error(tmp_path, usual_run, break_it, found):  # type: ignore[no-untyped-def]
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     break_it(tmp_path / "run")
     with pytest.raises(InputError) as caught:
@@ -86,9 +81,7 @@ def test_broken_folder_is_a_four_part_error(
     assert caught.value.hint
 
 
-def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(
-    tmp_path: Path, usual_run: Path
-) -> None:
+def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(tmp_path, usual_run):
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     summary = json.loads((usual_run / "summary.json").read_text())
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary | {"censoring": {}}))
@@ -124,8 +117,8 @@ rows = st.lists(
 
 @given(rows, st.booleans())
 @settings(deadline=None)
-def test_series_agree_with_a_plain_loop(made: list[dict], coded: bool) -> None:  # type: ignore[type-arg]
-    slow: dict = {}  # type: ignore[type-arg]
+def test_series_agree_with_a_plain_loop(made, coded):  # type: ignore[type-arg]
+    slow = {}  # type: ignore[type-arg]
     for row in sorted(made, key=lambda r: r["t_us"]):
         if row["valid"]:
             cell = (row["renderer"], row["policy"], row["scene"], row["seed"])

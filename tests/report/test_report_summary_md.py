@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,7 +9,7 @@ from evaluators.report.ci import CUT_NOTE, cut, escape, overview_md, table
 from evaluators.report.overview import overview_of
 
 
-def test_summary_has_the_first_screen_all_metrics_and_the_command(usual_run: Path) -> None:
+def test_summary_has_the_first_screen_all_metrics_and_the_command(usual_run):
     text = write_summary_md(usual_run).read_text(encoding="utf-8")
     assert text.startswith(overview_md(overview_of(read_run(usual_run))))
     assert text.count("<details>") == text.count("</details>") == 2
@@ -19,9 +17,9 @@ def test_summary_has_the_first_screen_all_metrics_and_the_command(usual_run: Pat
     assert "\u2014 (the policy gives no plan of 1.0 s)" in text
 
 
-def test_every_table_row_has_as_many_cells_as_its_head(hostile_run: Path) -> None:
+def test_every_table_row_has_as_many_cells_as_its_head(hostile_run):
     lines = write_summary_md(hostile_run).read_text(encoding="utf-8").splitlines()
-    widths: list[int] = []
+    widths = []
     for before, line in zip(["", *lines], lines, strict=False):
         if line.startswith("|"):
             cells = line.replace("\\|", "").count("|")
@@ -33,7 +31,7 @@ def test_every_table_row_has_as_many_cells_as_its_head(hostile_run: Path) -> Non
     assert not any("<img" in text or "<script" in text for text in outside)
 
 
-def test_table_escapes_columns_and_new_lines() -> None:
+def test_table_escapes_columns_and_new_lines():
     assert (
         table(["a|b"], [["one\ntwo"], ["<i>"]])
         == "| a\\|b |\n| --- |\n| one two |\n| &lt;i&gt; |\n"
@@ -42,7 +40,7 @@ def test_table_escapes_columns_and_new_lines() -> None:
 
 
 @given(st.text(st.characters(codec="utf-8"), min_size=200, max_size=2000), st.integers(150, 1000))
-def test_cut_keeps_within_the_limit_and_stays_text(text: str, limit: int) -> None:
+def test_cut_keeps_within_the_limit_and_stays_text(text, limit):
     done = cut(text, limit)
     assert len(done.encode()) <= max(limit, len(CUT_NOTE.encode()))
     if len(text.encode()) <= limit:

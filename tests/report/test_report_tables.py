@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 from evaluators.numbers import DASH
@@ -24,7 +23,7 @@ def entry(mean: float | None, **more: Any) -> dict[str, Any]:
     return base | {"unit": "", "direction": "lower"} | more
 
 
-def test_rate_is_percent_with_its_count_and_one_interval() -> None:
+def test_rate_is_percent_with_its_count_and_one_interval():
     (row,) = metric_rows({"metrics": {"3dgs": {"offroad": entry(7 / 300)}}})
     (cell,) = row.cells
     assert (cell.text, row.unit, row.arrow) == ("2.3", "%", "\u2193")
@@ -32,7 +31,7 @@ def test_rate_is_percent_with_its_count_and_one_interval() -> None:
     assert "300\u00a0rollouts, 60\u00a0scenes" in cell.note
 
 
-def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
+def test_missing_mean_is_a_dash_with_its_reason_never_zero():
     summary = {
         "metrics": {
             "a": {"offroad": entry(None, reason="valid in none of 4 rollouts")},
@@ -48,7 +47,7 @@ def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
     assert distance.cells[1].text == "0.000"
 
 
-def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
+def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval():
     one = entry(
         0.4,
         unit="m",
@@ -64,14 +63,14 @@ def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
     assert "no interval over scenes" in row.cells[0].note
 
 
-def test_no_event_says_which_rates_are_excluded_and_which_not() -> None:
+def test_no_event_says_which_rates_are_excluded_and_which_not():
     none = entry(0.0, ci95=0.0, ci95_clustered=[0.0, 0.7076], n_rollouts=3, n_scenes=3)
     (row,) = metric_rows({"metrics": {"a": {"offroad": none}}})
     assert row.cells[0].detail == "0/3 (0.0 to 70.8\u202f%)"
     assert "no event in 3: only rates above 70.8 % are excluded" in row.cells[0].note
 
 
-def test_pair_without_shared_cells_keeps_its_reason() -> None:
+def test_pair_without_shared_cells_keeps_its_reason():
     pair = {
         "baseline": "clean",
         "diff": None,
@@ -87,7 +86,7 @@ def test_pair_without_shared_cells_keeps_its_reason() -> None:
     assert row.verdict == "undecided"
 
 
-def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> None:
+def test_speed_keeps_stages_that_only_some_renderers_have(usual_run):
     run = read_run(usual_run)
     table = speed(run)
     assert table.stages == ("render", "policy", "log", "control", "actors")
@@ -96,7 +95,7 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
     )
 
 
-def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:
+def test_ledger_bounds_cover_what_failed(usual_run):
     rows = {row["renderer"]: row for row in ledger(read_run(usual_run), ("offroad",))}
     assert rows["clean/lane-camera"]["bounds"][0].text == "0.0\u00a0%"
     assert rows["onefixer/lane-camera"]["bounds"][0].text == "0.0 to 8.3\u00a0%"
@@ -104,8 +103,8 @@ def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:
 
 
 def test_the_terminal_prints_means_intervals_and_counts_and_breaks_no_name(
-    usual_run: Path,
-) -> None:
+    usual_run,
+):
     summary = json.loads((usual_run / "summary.json").read_text())
     lines = metric_lines(summary)
     assert sum(line.startswith("  ") for line in lines) == 14 * 6

@@ -58,7 +58,7 @@ def count(browser: Browser) -> str:
     return str(browser.evaluate("document.getElementById('rollouts-count').textContent"))
 
 
-def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
+def test_rows_sort_filter_and_open(browser, usual_run):
     opened(browser, write_report(usual_run))
     assert count(browser) == "72 rollouts"
     sort(browser, "lateral_distance_m")
@@ -96,7 +96,7 @@ def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
     assert browser.complaints == []
 
 
-def test_names_that_are_markup_stay_text(browser: Browser, hostile_run: Path) -> None:
+def test_names_that_are_markup_stay_text(browser, hostile_run):
     opened(browser, write_report(hostile_run))
     browser.evaluate(f"{ROWS}[0].click()")
     assert "<img src=x" in "".join(column(browser, "scene"))

@@ -60,7 +60,7 @@ def straight_track(
 
 
 @pytest.fixture
-def straight_road() -> Scenario:
+def straight_road():
     """Give 3 s at 10 m/s in the right lane of a straight road; 1 s of it is warm-up."""
     x = np.linspace(-50.0, 250.0, 151)
 
@@ -152,7 +152,7 @@ class Watched:
 
 
 @pytest.fixture(scope="session")
-def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
+def watched(tmp_path_factory):
     folder = make_watched(
         tmp_path_factory.mktemp("recorded"), SMALL, actors=4, cameras=("front", "side")
     )

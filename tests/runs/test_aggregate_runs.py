@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -16,7 +15,7 @@ from tests.runs.make_many import SCENES, Many, make_one
 
 
 @pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def night(tmp_path_factory):
     """Make a run, and the same rollouts in two runs of three scenes."""
     root = tmp_path_factory.mktemp("night")
     whole = Many("whole", shift_m={"onefixer": 0.4})
@@ -30,7 +29,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path) -> None:
+def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night):
     whole = aggregate_runs([night / "whole"])
     # All six scenes differ by exactly 0.4 m: there is no spread to go by.
     assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
@@ -43,7 +42,7 @@ def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path) -> None
     assert parts["metrics"] == whole["metrics"] == stored
 
 
-def test_runs_that_do_not_belong_together_are_refused(night: Path, tmp_path: Path) -> None:
+def test_runs_that_do_not_belong_together_are_refused(night, tmp_path):
     changed = make_one(tmp_path, Many("changed", scenes={**SCENES, "smoke-curve": "ff" * 32}))
     with pytest.raises(InputError):
         aggregate_runs([night / "whole", changed])

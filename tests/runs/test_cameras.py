@@ -30,25 +30,25 @@ def replace_end(state: LoopState, t_us: int):  # type: ignore[no-untyped-def]
     return type(log)(log.t_us[:upto], log.xyz[:upto], log.quat[:upto])
 
 
-def test_a_policy_without_cameras_costs_no_frame(straight_road: Scenario) -> None:
+def test_a_policy_without_cameras_costs_no_frame(straight_road):
     assert rendered_steps(straight_road, Rates(), []) == []
 
 
-def test_frames_that_a_slower_policy_never_sees_are_skipped(straight_road: Scenario) -> None:
+def test_frames_that_a_slower_policy_never_sees_are_skipped(straight_road):
     rates = Rates(control_us=100_000, camera_us=100_000, policy_us=500_000)
     assert rendered_steps(straight_road, rates, [SensorSpec("front")]) == [0, 5, 10, 15, 20, 25]
 
 
-def test_a_slow_camera_is_rendered_at_its_own_times(straight_road: Scenario) -> None:
+def test_a_slow_camera_is_rendered_at_its_own_times(straight_road):
     rates = Rates(control_us=100_000, camera_us=300_000, policy_us=100_000)
     assert rendered_steps(straight_road, rates, [SensorSpec("front")]) == list(range(0, 30, 3))
 
 
-def test_the_sensor_may_ask_for_a_period_of_its_own(straight_road: Scenario) -> None:
+def test_the_sensor_may_ask_for_a_period_of_its_own(straight_road):
     assert rendered_steps(straight_road, Rates(), [SensorSpec("front", 1_000_000)]) == [0, 10, 20]
 
 
-def test_shutter_start_and_end_poses_follow_the_motion(straight_road: Scenario) -> None:
+def test_shutter_start_and_end_poses_follow_the_motion(straight_road):
     camera = replace(straight_road.cameras[0], shutter_us=50_000)
     scenario = replace(straight_road, cameras=(camera,))
     clock = Clock(scenario.start_us, scenario.end_us, Rates())
@@ -60,8 +60,8 @@ def test_shutter_start_and_end_poses_follow_the_motion(straight_road: Scenario) 
 
 
 def test_a_rolling_shutter_exposes_rows_and_road_users_at_their_own_times(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     camera = replace(straight_road.cameras[0], shutter_us=30_000)
     scenario = replace(straight_road, cameras=(camera,))
     clock = Clock(scenario.start_us, scenario.end_us, Rates())

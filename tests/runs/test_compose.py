@@ -12,7 +12,6 @@ from alpasim_plugin.block_fixers.chunk import ChunkRenderer
 from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve_renderer, spec
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import expand
@@ -28,7 +27,7 @@ from scenarios.suite import expand
         ("onefixer-dit-tiny@2+broken-black", "onefixer-dit-tiny@2+broken-black"),
     ],
 )
-def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None:
+def test_a_name_is_a_renderer_or_a_fixer_over_one(name, meant):
     assert str(resolve_renderer(name)) == meant
 
 
@@ -49,20 +48,20 @@ def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None
         ("onefixer+", "known"),
     ],
 )
-def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(name: str, hint: str) -> None:
+def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(name, hint):
     with pytest.raises(InputError) as caught:
         resolve_renderer(name)
     assert hint in caught.value.hint
 
 
-def test_the_mode_decides_the_kind_of_session(straight_road: Scenario) -> None:
+def test_the_mode_decides_the_kind_of_session(straight_road):
     assert isinstance(make_renderer("identity+clean", straight_road), SpeculativeRenderer)
     assert isinstance(
         make_renderer("identity+clean", straight_road, overrides=("mode=chunk",)), ChunkRenderer
     )
 
 
-def test_resolving_a_renderer_or_a_fixer_does_not_load_torch() -> None:
+def test_resolving_a_renderer_or_a_fixer_does_not_load_torch():
     code = (
         "import sys; from alpasim_plugin.core.parts import resolve_renderer;"
         "resolve_renderer('3dgs'); resolve_renderer('onefixer'); print('torch' in sys.modules)"
@@ -84,7 +83,7 @@ def keys(renderers: tuple[str, ...], fixer: tuple[str, ...] = ()) -> list[str]:
     return [cell.rollout_key for cell in plan(renderers, fixer).cells]
 
 
-def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
+def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other():
     plain, fixed = keys(("3dgs", "onefixer-dit-tiny"))
     plain_too, changed = keys(("3dgs", "onefixer-dit-tiny"), ("tolerance_m=0.5",))
     assert plain == plain_too
@@ -95,8 +94,8 @@ def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
 
 
 def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     before = keys(("clean", "3dgs", "identity", "identity+clean"))
     digest = spec.code_digest
     monkeypatch.setattr(
@@ -110,12 +109,12 @@ def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, False, True]
 
 
-def test_one_renderer_under_two_names_is_refused() -> None:
+def test_one_renderer_under_two_names_is_refused():
     with pytest.raises(InputError):
         plan(("onefixer", "onefixer+3dgs"))
 
 
-def test_a_setting_for_one_renderer_is_that_of_its_fixer_alone() -> None:
+def test_a_setting_for_one_renderer_is_that_of_its_fixer_alone():
     names = ("identity+clean", "identity")
     settings = [
         spec.fixer.settings
@@ -136,7 +135,7 @@ def test_a_setting_for_one_renderer_is_that_of_its_fixer_alone() -> None:
         ("window=0", "0", ""),
     ],
 )
-def test_a_bad_setting_is_named_with_the_nearest(override: str, found: str, do: str) -> None:
+def test_a_bad_setting_is_named_with_the_nearest(override, found, do):
     with pytest.raises(InputError) as caught:
         plan(("onefixer-dit-tiny",), (override,))
     assert found in str(caught.value)

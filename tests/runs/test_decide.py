@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,7 +71,7 @@ def decide(
 
 
 @pytest.fixture(autouse=True, scope="module")
-def two_scenes_per_look() -> Iterator[None]:
+def two_scenes_per_look():
     """Look after every two scenes, and search among fewer scenes for how many would decide."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(decide_module, "SCENES_PER_LOOK", 2)
@@ -81,9 +80,7 @@ def two_scenes_per_look() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def decided_run(
-    tmp_path_factory: pytest.TempPathFactory, two_scenes_per_look: None
-) -> tuple[Path, Decided, Looks]:
+def decided_run(tmp_path_factory, two_scenes_per_look):
     """Drive until the darker renderer is shown to be non-inferior."""
     root = tmp_path_factory.mktemp("decided_run") / "run"
     return root, *decide(root, SAME, plan_of())
@@ -93,7 +90,7 @@ def told(root: Path) -> dict:
     return {key: value for key, value in (read_decision(root) or {}).items()}
 
 
-def test_a_question_is_decided_before_all_scenes_are_driven(decided_run) -> None:
+def test_a_question_is_decided_before_all_scenes_are_driven(decided_run):
     root, decided, announced = decided_run
     assert (decided.outcome.exit_code, decided.record["verdict"]) == (0, "non-inferior")
     assert decided.record["stopped"] == "decided"
@@ -105,15 +102,13 @@ def test_a_question_is_decided_before_all_scenes_are_driven(decided_run) -> None
     assert decided.record["ceiling"] == {"scenes": 16, "rollouts": 32}
 
 
-def test_the_order_depends_on_the_names_alone() -> None:
+def test_the_order_depends_on_the_names_alone():
     names = [f"s{i}" for i in range(20)]
     assert drawing_order(names) == drawing_order(names[::-1])
     assert sorted(drawing_order(names)) == sorted(names)
 
 
-def test_an_interrupted_decision_continues_and_decides_the_same(
-    decided_run, tmp_path: Path
-) -> None:
+def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp_path):
     before = told(decided_run[0])
     root = tmp_path / "again"
     shutil.copytree(decided_run[0], root)
@@ -128,12 +123,12 @@ def test_an_interrupted_decision_continues_and_decides_the_same(
     assert decided.record == before
 
 
-def test_another_question_in_the_same_folder_is_refused(decided_run) -> None:
+def test_another_question_in_the_same_folder_is_refused(decided_run):
     with pytest.raises(InputError):
         decide(decided_run[0], CLOSER, plan_of())
 
 
-def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_run, capsys) -> None:
+def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_run, capsys):
     root = str(decided_run[0])
     assert run_command(["check", "run", root]) == 0
     assert run_command(["compare", root]) == 0
@@ -145,16 +140,14 @@ def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_r
     assert page.count("<svg") >= 2
 
 
-def test_a_damaged_record_is_refused(decided_run, tmp_path: Path) -> None:
+def test_a_damaged_record_is_refused(decided_run, tmp_path):
     text = (decided_run[0] / DECISION).read_text()
     (tmp_path / DECISION).write_text(text[: len(text) // 2])
     with pytest.raises(InputError):
         read_decision(tmp_path)
 
 
-def test_when_all_scenes_are_driven_the_decision_is_undecided(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_when_all_scenes_are_driven_the_decision_is_undecided(tmp_path, monkeypatch):
     with pytest.raises(InputError):
         decide(tmp_path, CLOSER, plan_of(2))
     monkeypatch.setattr(decide_module, "least_scenes", lambda question, most: most)
@@ -163,7 +156,7 @@ def test_when_all_scenes_are_driven_the_decision_is_undecided(
     assert announced.looks == [(2, "open")]
 
 
-def test_a_failed_rollout_ends_the_decision(tmp_path: Path) -> None:
+def test_a_failed_rollout_ends_the_decision(tmp_path):
     broken = "tests.runs.broken_policies:Raises"
     decided, announced = decide(tmp_path, SAME, plan_of(policy=broken))
     assert decided.outcome.exit_code == 2  # the policy's own fault
@@ -171,7 +164,7 @@ def test_a_failed_rollout_ends_the_decision(tmp_path: Path) -> None:
     assert "rollouts failed" in decided.record["stopped"]
 
 
-def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, capsys) -> None:
+def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path, capsys):
     words = ["--renderer", f"{GREY},{DARKER}", "--policy", BY_GREY, "--images", "none"]
     words += ["--until-decided", "--metric", "offroad=0.6", "--no-report", "--workers", "1"]
     words += [word for text in SHORT for word in ("--set", text)]
@@ -194,7 +187,7 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
         ["--renderer", f"{GREY},{DARKER}"],  # the default gate wants more scenes
     ],
 )
-def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_path: Path) -> None:
+def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_path):
     scenes = ["smoke/straight", "smoke/curve"]
     more = ["--until-decided", "--policy", "log-replay", "--out", str(tmp_path / "run")]
     assert run_command([*words, *more, *scenes]) == 2
@@ -202,7 +195,7 @@ def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_pa
 
 
 @pytest.mark.slow
-def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path: Path) -> None:
+def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path):
     decide(tmp_path / "two", SAME, plan_of(), workers=2)
     assert told(tmp_path / "two") == told(decided_run[0])
 
@@ -230,7 +223,7 @@ def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path: Path
         ),
     ],
 )
-def test_any_two_variants_can_be_asked_about(renderers, policies, baseline, variants) -> None:
+def test_any_two_variants_can_be_asked_about(renderers, policies, baseline, variants):
     options = RunOptions(images="none", baseline=baseline)
     one = replace(SAME, alpha=0.7)  # of which one scene is enough
     plan = make_plan(expand("smoke/straight", SHORT), renderers, policies, (0,), options)
@@ -238,7 +231,7 @@ def test_any_two_variants_can_be_asked_about(renderers, policies, baseline, vari
     assert {f"{cell.renderer.name}/{cell.policy.name}" for cell in part.cells} == variants
 
 
-def test_four_variants_without_one_of_them_as_baseline_are_refused() -> None:
+def test_four_variants_without_one_of_them_as_baseline_are_refused():
     for baseline in (None, "clean"):
         plan = make_plan(
             expand("smoke/straight", SHORT),

@@ -134,9 +134,7 @@ def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
 
 
 @pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
-def test_the_streaming_network_has_the_history_of_the_true_frames(
-    straight_road: Scenario, mode: str
-) -> None:
+def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road, mode):
     sizes = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32")
     small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
 
@@ -161,9 +159,7 @@ def test_the_streaming_network_has_the_history_of_the_true_frames(
 
 
 @pytest.mark.parametrize("tolerance_m", first_of([0.02, 0.0, 100.0]))
-def test_the_history_is_of_true_frames_whatever_the_forecasts_were(
-    straight_road: Scenario, tolerance_m: float
-) -> None:
+def test_the_history_is_of_true_frames_whatever_the_forecasts_were(straight_road, tolerance_m):
     run = drive(straight_road, Zigzag, tolerance_m=tolerance_m, tolerance_deg=180.0)
     facts = run.session.facts()
     assert facts["forecast_error"]["camera_m"]["max"] > 0.05
@@ -178,7 +174,7 @@ def test_the_history_is_of_true_frames_whatever_the_forecasts_were(
         assert_same_pictures(run.frames[last : last + 1], offline[last : last + 1])
 
 
-def test_a_frame_is_never_further_off_than_the_tolerance(straight_road: Scenario) -> None:
+def test_a_frame_is_never_further_off_than_the_tolerance(straight_road):
     run = drive(straight_road, Zigzag, tolerance_m=0.02, tolerance_deg=0.2)
     errors = [frame.facts["pose_error_m"] for frame in run.frames]
     assert 0.0 < max(errors) <= 0.02
@@ -188,8 +184,8 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road: Scenario
 
 @pytest.mark.slow
 def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     def digest(renderer: object) -> str:
         recorder = Recorder(straight_road, 0)
         run_rollout(straight_road, renderer, make_policy("lane-camera", straight_road), 0, recorder)  # type: ignore[arg-type]
@@ -205,7 +201,7 @@ def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_l
 
 
 @pytest.mark.slow
-def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road: Scenario) -> None:
+def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road):
     ahead, parked = straight_road.actors
     idm = replace(
         ahead, behaviour=replace(ahead.behaviour, kind="idm", params={"desired_speed_mps": 3.0})
@@ -217,8 +213,8 @@ def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road
 
 
 def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     scenario = replace(straight_road, warmup_us=0, latency=Latency("fixed", 400_000))
     run = drive(scenario, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     errors = [frame.facts.get("forecast_error_m") for frame in run.frames]
@@ -233,7 +229,7 @@ def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(
     assert max(errors[6:10]) < 1e-9 < min(errors[10:13])
 
 
-def test_a_slower_camera_has_its_own_blocks(straight_road: Scenario) -> None:
+def test_a_slower_camera_has_its_own_blocks(straight_road):
     class Slow(Watching):
         sensors = (SensorSpec("front", 200_000),)
 
@@ -258,9 +254,7 @@ class BothWays(Watching):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["chunk", "speculative"])
-def test_cameras_in_step_share_a_fixer_and_not_their_histories(
-    straight_road: Scenario, mode: str
-) -> None:
+def test_cameras_in_step_share_a_fixer_and_not_their_histories(straight_road, mode):
     scenario = with_rear_camera(straight_road)
     run = drive(scenario, BothWays, mode=mode)
     assert len(run.fixers) == 1
@@ -272,8 +266,8 @@ def test_cameras_in_step_share_a_fixer_and_not_their_histories(
 
 
 def test_the_session_of_a_finished_rollout_is_not_taken_for_another(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     run = drive(straight_road)
     with pytest.raises(RendererError):
         run.session.render_batch(run.calls[0])
@@ -283,9 +277,7 @@ def test_the_session_of_a_finished_rollout_is_not_taken_for_another(
 
 
 @pytest.mark.parametrize("policy", first_of([Zigzag, Watching]))
-def test_whole_blocks_of_true_frames_equal_the_offline_result(
-    straight_road: Scenario, policy: type[Watching]
-) -> None:
+def test_whole_blocks_of_true_frames_equal_the_offline_result(straight_road, policy):
     run = drive(straight_road, policy, mode="chunk")
     assert [len(call) for call in run.calls] == [5, 8, 8, 8]
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
@@ -295,12 +287,12 @@ def test_whole_blocks_of_true_frames_equal_the_offline_result(
     )  # the block that the end cuts off is not made: nobody would look
 
 
-def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road: Scenario) -> None:
+def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road):
     with pytest.raises(InputError):
         drive(replace(straight_road, warmup_us=300_000), mode="chunk")
 
 
-def test_cameras_of_different_periods_make_no_common_block(straight_road: Scenario) -> None:
+def test_cameras_of_different_periods_make_no_common_block(straight_road):
     class Uneven(Watching):
         sensors = (SensorSpec("front"), SensorSpec("rear", 200_000))
 
@@ -321,9 +313,7 @@ def test_cameras_of_different_periods_make_no_common_block(straight_road: Scenar
         (GivesFloats, r"rgb came back as float32 \(64, 96, 3\), not uint8"),
     ],
 )
-def test_a_fixer_that_breaks_its_contract_is_named(
-    straight_road: Scenario, mode: str, fixer: type[Blend], found: str
-) -> None:
+def test_a_fixer_that_breaks_its_contract_is_named(straight_road, mode, fixer, found):
     with pytest.raises(FixerError, match=found) as caught:
         drive(straight_road, fixer=fixer, mode=mode)
     assert caught.value.failure_class == "fixer"
@@ -332,8 +322,8 @@ def test_a_fixer_that_breaks_its_contract_is_named(
 
 @pytest.mark.parametrize(("mode", "refused"), [("speculative", 12), ("chunk", 11)])
 def test_frames_that_the_guard_refused_are_counted_and_the_rollout_goes_on(
-    straight_road: Scenario, mode: str, refused: int
-) -> None:
+    straight_road, mode, refused
+):
     facts = drive(straight_road, fixer=GuardSteps, mode=mode).recorder.facts()
     assert facts["steps"] == 30
     assert facts["frame_events"] == {
@@ -342,9 +332,7 @@ def test_frames_that_the_guard_refused_are_counted_and_the_rollout_goes_on(
 
 
 @pytest.mark.parametrize("mode", ["speculative", "chunk"])
-def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(
-    straight_road: Scenario, mode: str
-) -> None:
+def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(straight_road, mode):
     run = drive(straight_road, mode=mode, uses_map=True)
     facts = run.recorder.facts()
     frames = facts["frames"]
@@ -358,7 +346,7 @@ def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(
     assert all(ms >= 0 for stage in ("render", "map", "fix") for ms in facts["stage_ms"][stage])
 
 
-def test_maps_are_drawn_at_the_poses_of_the_frames(straight_road: Scenario) -> None:
+def test_maps_are_drawn_at_the_poses_of_the_frames(straight_road):
     class KeepsMaps(Blend):
         def step(self, block: Sequence[Frame], maps: Sequence[np.ndarray]) -> Sequence[Frame]:
             self.maps = [*getattr(self, "maps", []), *maps]

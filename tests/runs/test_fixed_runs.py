@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -50,7 +49,7 @@ def run(
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _one_core() -> Iterator[None]:
+def _one_core():
     """Keep runs of one worker at one thread: two wait for each other on a busy machine."""
     if not hasattr(os, "sched_setaffinity"):
         yield
@@ -62,7 +61,7 @@ def _one_core() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     """Give a finished run of one worker."""
     root = tmp_path_factory.mktemp("run")
     run(plan_of(), root, report=True)
@@ -70,9 +69,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_one_and_two_workers_give_the_same_frames_and_scores(
-    finished: Path, tmp_path: Path
-) -> None:
+def test_one_and_two_workers_give_the_same_frames_and_scores(finished, tmp_path):
     run(plan_of(), tmp_path, workers=2)
     assert comparable(tmp_path) == comparable(finished)
     for path in finished.rglob("frames.jsonl"):
@@ -80,9 +77,7 @@ def test_one_and_two_workers_give_the_same_frames_and_scores(
 
 
 @pytest.mark.slow
-def test_the_same_command_continues_and_another_setting_does_not_reuse(
-    finished: Path, tmp_path: Path
-) -> None:
+def test_the_same_command_continues_and_another_setting_does_not_reuse(finished, tmp_path):
     plan = plan_of()
     root = tmp_path / "run"
     shutil.copytree(finished, root)
@@ -95,7 +90,7 @@ def test_the_same_command_continues_and_another_setting_does_not_reuse(
     assert again == [("ok", True), ("ok", False)]  # the plain renderer's is reused
 
 
-def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
+def test_an_untrained_fixer_is_called_so_everywhere(finished):
     said = "untrained (random)"
     info = json.loads((finished / "run.json").read_text())
     assert said in info["fixers"]["onefixer-dit-tiny+clean"]["label"]
@@ -121,7 +116,7 @@ def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
     assert said in log.info["versions"]["sensorsim"]
 
 
-def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
+def test_hits_and_pose_errors_are_in_the_tables(finished):
     summary = json.loads((finished / "summary.json").read_text())
     entry = summary["fixers"]["onefixer-dit-tiny+clean"]
     assert entry["frames"] == 15
@@ -142,7 +137,7 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     assert max(shown) == pytest.approx(entry["shown_error"]["camera_m"])
 
 
-def test_time_is_counted_where_it_was_spent() -> None:
+def test_time_is_counted_where_it_was_spent():
     draft = {"render": [9.0, 6.0, 2.0, 2.0, 6.0, 2.0], "fix": [30.0, 12.0, 0.0, 0.0, 12.0, 0.0]}
     told = speed([{"frames": 6, "first_call_frames": 1, "stage_ms": draft}])
     assert told["first_frame_ms"] == 39.0
@@ -156,7 +151,7 @@ def test_time_is_counted_where_it_was_spent() -> None:
     }
 
 
-def test_the_frames_of_a_block_share_its_time_and_the_first_block_stands_apart() -> None:
+def test_the_frames_of_a_block_share_its_time_and_the_first_block_stands_apart():
     blocks = {"render": [100.0] * 5 + [3.0] * 8, "policy": [50.0, 8.0]}
     told = speed([{"frames": 13, "first_call_frames": 5, "stage_ms": blocks}])
     assert told["stages"]["render"]["p50_ms"] == 3.0

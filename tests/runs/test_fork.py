@@ -37,7 +37,7 @@ AT_US = 600_000
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """Make a run of a scene with a reactive car ahead behind two renderers, one of which makes the
     policy lose its lane.
     """
@@ -54,12 +54,12 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def past(root: Path) -> LoggedRollout:
+def past(root):
     return find_rollout(root, CELL)
 
 
 @pytest.fixture(scope="module")
-def changed(past: LoggedRollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def changed(past, tmp_path_factory):
     """Continue behind the frozen renderer."""
     folder = tmp_path_factory.mktemp("changed")
     go(past, folder, renderer="broken-frozen")
@@ -74,9 +74,7 @@ def forked(root: Path) -> Path:
     return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
 
 
-def test_an_untouched_continuation_is_the_log_to_the_byte(
-    past: LoggedRollout, tmp_path: Path
-) -> None:
+def test_an_untouched_continuation_is_the_log_to_the_byte(past, tmp_path):
     go(past, tmp_path)
     told = read_json(tmp_path / "run.json")["fork"]
     assert (told["of"], told["replay"], told["continuation"]) == (CELL, "equal", "equal")
@@ -91,9 +89,7 @@ def test_an_untouched_continuation_is_the_log_to_the_byte(
 
 
 @pytest.mark.parametrize("change", first_of([{"policy": "pure-pursuit", "seed": 5}, {}]))
-def test_a_change_takes_effect_at_its_instant_and_not_before(
-    past: LoggedRollout, changed: Path, tmp_path: Path, change: dict[str, object]
-) -> None:
+def test_a_change_takes_effect_at_its_instant_and_not_before(past, changed, tmp_path, change):
     if change:
         go(past, tmp_path, **change)
     one, other = (
@@ -112,9 +108,7 @@ def test_a_change_takes_effect_at_its_instant_and_not_before(
     assert not np.array_equal(one.ego.xyz[~before], other.ego.xyz[~before])
 
 
-def test_the_run_folder_pairs_the_continuation_with_the_original(
-    past: LoggedRollout, changed: Path
-) -> None:
+def test_the_run_folder_pairs_the_continuation_with_the_original(past, changed):
     rows = pq.read_table(changed / "rollouts.parquet").to_pylist()
     assert [row["renderer"] for row in rows] == ["clean", "broken-frozen from 0.6 s"]
     here, there = (read_json(folder / "summary.json") for folder in (changed, past.root))
@@ -124,9 +118,7 @@ def test_the_run_folder_pairs_the_continuation_with_the_original(
     assert "broken-frozen from 0.6 s" in (changed / "report.html").read_text()
 
 
-def test_a_replay_that_leaves_the_log_names_component_and_step(
-    past: LoggedRollout, tmp_path: Path
-) -> None:
+def test_a_replay_that_leaves_the_log_names_component_and_step(past, tmp_path):
     copy = tmp_path / "copy" / str(past.manifest["path"])
     copy.mkdir(parents=True)
     for file in past.folder.iterdir():
@@ -140,9 +132,7 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(
     assert not (tmp_path / "out" / "run.json").exists()
 
 
-def test_instants_outside_and_folders_in_use_are_refused(
-    past: LoggedRollout, root: Path, tmp_path: Path
-) -> None:
+def test_instants_outside_and_folders_in_use_are_refused(past, root, tmp_path):
     for after_us in (-1, 1_200_000, 10**12):
         with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
             fork_rollout(past, Change(after_us), tmp_path, [])
@@ -150,18 +140,14 @@ def test_instants_outside_and_folders_in_use_are_refused(
         fork_rollout(past, Change(AT_US), root, [])
 
 
-def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(
-    root: Path, past: LoggedRollout
-) -> None:
+def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root, past):
     assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
     with pytest.raises(InputError, match="no such rollout among its 2") as caught:
         find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
     assert CELL in caught.value.hint
 
 
-def test_a_scenario_that_has_changed_is_refused(
-    root: Path, past: LoggedRollout, tmp_path: Path
-) -> None:
+def test_a_scenario_that_has_changed_is_refused(root, past, tmp_path):
     info = read_json(root / "run.json")
     info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
     for name in ("rollouts.parquet", str(past.manifest["path"])):

@@ -10,12 +10,12 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.runs import gpu_check
 
 
-def test_a_section_runs_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_section_runs_in_a_process_of_its_own(monkeypatch):
     monkeypatch.setattr(gpu_check, "SECTIONS", {"card": gpu_check.card})
     assert dict(gpu_check.check_gpu("cpu")) == {"card": {"ok": True, "torch": torch.__version__}}
 
 
-def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch):
     monkeypatch.setattr(gpu_check, "SECTIONS", {"unknown": gpu_check.card, "card": gpu_check.card})
     facts = dict(gpu_check.check_gpu("cpu"))
     assert not facts["unknown"]["ok"]
@@ -25,7 +25,7 @@ def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatc
     assert not any(section["ok"] for section in late.values())
 
 
-def test_images_that_differ_fail_the_section() -> None:
+def test_images_that_differ_fail_the_section():
     image = np.zeros((10, 10, 3), np.uint8)
     same = gpu_check.compared(lambda: image, lambda: image)
     other = gpu_check.compared(lambda: image + 9, lambda: image)
@@ -35,5 +35,5 @@ def test_images_that_differ_fail_the_section() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
-def test_without_a_card_the_check_ends_with_an_error_of_the_machine() -> None:
+def test_without_a_card_the_check_ends_with_an_error_of_the_machine():
     assert run_command(["doctor", "--gpu"]) == 4

@@ -57,13 +57,13 @@ def plane(value: float) -> np.ndarray[Any, np.dtype[np.float32]]:
     ],
     ids=str,
 )
-def test_a_frame_against_the_contract_is_the_renderers_failure(members: dict[str, Any]) -> None:
+def test_a_frame_against_the_contract_is_the_renderers_failure(members):
     with pytest.raises(RendererError):
         checked_frames(Returns(replace(GOOD, **members)), [REQUEST])
 
 
 @pytest.mark.parametrize("frame", [None, GOOD.rgb, "frame"], ids=["nothing", "array", "text"])
-def test_what_is_no_frame_is_the_renderers_failure(frame: Any) -> None:
+def test_what_is_no_frame_is_the_renderers_failure(frame):
     with pytest.raises(RendererError):
         checked_frames(Returns(frame), [REQUEST])
 
@@ -74,7 +74,7 @@ class Far(ConstantVelocity):
         return replace(plan, xy=plan.xy * 1e30)
 
 
-def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure() -> None:
+def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure():
     with pytest.raises(PolicyError):
         run_rollout(SCENE, make_renderer("clean", SCENE), Far(SCENE))
     times_us = np.array([0, 1], np.int64)

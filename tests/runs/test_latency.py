@@ -12,7 +12,7 @@ def plan(t_us: int) -> Trajectory:
     return Trajectory(np.array([t_us]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
 
 
-def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due() -> None:
+def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due():
     queue = PlanQueue(Latency("fixed", 150_000))
     first, second = plan(0), plan(100_000)
     queue.submit(first, 0, 0)
@@ -22,7 +22,7 @@ def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due() -> None:
     assert queue.active(250_000) is second
 
 
-def test_a_slow_answer_never_replaces_a_newer_fast_one() -> None:
+def test_a_slow_answer_never_replaces_a_newer_fast_one():
     queue = PlanQueue(Latency("measured"))
     slow, fast = plan(0), plan(100_000)
     queue.submit(slow, 0, wall_us=500_000)
@@ -31,7 +31,7 @@ def test_a_slow_answer_never_replaces_a_newer_fast_one() -> None:
     assert queue.active(500_000) is fast
 
 
-def test_a_query_waits_until_the_fixer_is_done_with_its_frames() -> None:
+def test_a_query_waits_until_the_fixer_is_done_with_its_frames():
     queue = PlanQueue(Latency("measured", fixer=True))
     queue.frames(0, {"fix": 20.0, "map": 10.0})  # ms
     now = plan(0)
@@ -40,7 +40,7 @@ def test_a_query_waits_until_the_fixer_is_done_with_its_frames() -> None:
     assert queue.active(35_000) is now
 
 
-def test_a_fixer_slower_than_the_camera_falls_behind() -> None:
+def test_a_fixer_slower_than_the_camera_falls_behind():
     queue = PlanQueue(Latency("measured", fixer=True))
     for t_us in (0, 100_000, 200_000):
         queue.frames(t_us, {"fix": 150.0})

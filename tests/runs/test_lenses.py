@@ -38,10 +38,10 @@ def fisheye(straight_road: Scenario) -> CameraSpec:
     return CameraSpec("fish", 200, 150, K, straight_road.cameras[0].T_rig_camera, 30_000, lens)
 
 
-def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road: Scenario) -> None:
+def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
     camera = fisheye(straight_road)
     scenario = replace(straight_road, cameras=(camera, straight_road.cameras[0]))
-    made: list[Directions] = []
+    made = []
 
     def make(pinholes: Scenario) -> Renderer:
         made.append(Directions(pinholes))
@@ -71,5 +71,5 @@ def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road: Sc
     assert abs(float(np.nanmedian(ahead.share)) - 0.5) < 0.02
 
 
-def test_pinholes_alone_are_rendered_as_they_are(straight_road: Scenario) -> None:
+def test_pinholes_alone_are_rendered_as_they_are(straight_road):
     assert isinstance(through_lenses(straight_road, Directions), Directions)

@@ -40,7 +40,7 @@ RUNS = (
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("many") / "runs"
     for one in RUNS:
         make_one(root, one)
@@ -56,9 +56,7 @@ def listed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, dict[st
     }
 
 
-def test_runs_are_found_at_any_depth_and_the_newest_comes_first(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_are_found_at_any_depth_and_the_newest_comes_first(root, capsys):
     found = listed(capsys, str(root))
     assert list(found) == ["new", "middle", "old"]
     assert [one["rollouts"] for one in found.values()] == [24, 48, 2]
@@ -85,15 +83,11 @@ def test_runs_are_found_at_any_depth_and_the_newest_comes_first(
         (("--since", "2026-02-10T08:00:00"), ["new", "middle"]),
     ],
 )
-def test_a_filter_takes(
-    root: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], names: list[str]
-) -> None:
+def test_a_filter_takes(root, capsys, words, names):
     assert list(listed(capsys, str(root), *words)) == names
 
 
-def test_what_cannot_be_read_is_listed_as_such(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_read_is_listed_as_such(tmp_path, capsys):
     stopped = unfinish(make_one(tmp_path, Many("stopped")))
     (stopped / ".simrun.lock").touch()
     os.truncate(make_one(tmp_path, Many("cut")) / "run.json", 300)
@@ -129,9 +123,7 @@ def test_what_cannot_be_read_is_listed_as_such(
     ]
 
 
-def test_the_table_shows_metrics_beside_their_renderers(
-    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_table_shows_metrics_beside_their_renderers(root, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert (
         run_command(

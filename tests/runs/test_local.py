@@ -40,7 +40,7 @@ def work(item: str) -> str:
     return item.upper()
 
 
-def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_path: Path) -> None:
+def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_path):
     once = f"dies once {tmp_path / 'seen'}"
     found = dict(run_jobs(work, ["a", "dies", "b", "leaves", once, "c", "d"], 2))
     assert isinstance(found.pop("dies"), Lost)
@@ -48,15 +48,15 @@ def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_pat
     assert found == {item: item.upper() for item in ("a", "b", "c", "d", once)}
 
 
-def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not() -> None:
+def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not():
     found = dict(run_jobs(work, ["hangs", "a"], 1, limit_s=0.5))
     assert found["a"] == "A"
     assert "within 0.5 s" in found["hangs"].reason
 
 
 def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(local, "OVERTIME_S", 1.0)
     found = dict(run_jobs(work, ["stops", "a"], 2, limit_s=2.0))
     assert found["a"] == "A"
@@ -64,7 +64,7 @@ def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_worker_has_its_threads_and_passes_no_safe_path_on(threads: int) -> None:
+def test_a_worker_has_its_threads_and_passes_no_safe_path_on(threads):
     ((_, seen),) = run_jobs(environment, ["OMP_NUM_THREADS"], 1, threads, limit_s=60.0)
     assert seen == (str(threads), None)
     assert "PYTHONSAFEPATH" not in os.environ
@@ -75,7 +75,7 @@ def environment(name: str) -> tuple[str | None, str | None]:
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
+def test_results_do_not_depend_on_the_number_of_workers(workers):
     assert dict(map_jobs(work, ["a", "b", "c", "d"], workers)) == {
         "a": "A",
         "b": "B",
@@ -84,7 +84,7 @@ def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
     }
 
 
-def test_a_result_that_is_lost_ends_work_that_needs_all_of_them() -> None:
+def test_a_result_that_is_lost_ends_work_that_needs_all_of_them():
     with pytest.raises(InfrastructureError):
         list(map_jobs(work, ["a", "dies", "b"], 2))
 
@@ -92,13 +92,13 @@ def test_a_result_that_is_lost_ends_work_that_needs_all_of_them() -> None:
 @pytest.mark.parametrize(
     ("item", "error"), [("raises", ValueError), ("cannot be sent", AttributeError)]
 )
-def test_an_error_ends_the_work_and_reaches_the_parent(item: str, error: type[Exception]) -> None:
+def test_an_error_ends_the_work_and_reaches_the_parent(item, error):
     with pytest.raises(error):
         dict(run_jobs(work, [item, "a"], 2))
 
 
 @pytest.mark.parametrize("item", ["hangs", "stops"])
-def test_work_that_is_left_early_ends_its_workers(item: str) -> None:
+def test_work_that_is_left_early_ends_its_workers(item):
     outcomes = run_jobs(work, [item, "a"], 2)
     assert next(outcomes) == ("a", "A")
     began_s = time.monotonic()
@@ -109,7 +109,7 @@ def test_work_that_is_left_early_ends_its_workers(item: str) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("threads", [1, 2])
-def test_workers_end_when_their_parent_is_killed(tmp_path: Path, repo: Path, threads: int) -> None:
+def test_workers_end_when_their_parent_is_killed(tmp_path, repo, threads):
     (tmp_path / "driver.py").write_text(
         "import os, time\n"
         "from pathlib import Path\n"

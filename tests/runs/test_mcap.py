@@ -19,7 +19,6 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.log.asl import AslReader
 from tests.core.checksum_files import vouch_for
-from tests.runs.conftest import Watched
 
 mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed: pip install mcap")
 CELL = ("--scene", "urban-left_turn", "--policy", "lane-camera", "--seed", "0")
@@ -49,9 +48,7 @@ def read(path: Path) -> tuple[Messages, dict[str, str], dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def recorded(
-    watched: Watched, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Messages, dict[str, str], dict[str, str]]:
+def recorded(watched, tmp_path_factory):
     path = tmp_path_factory.mktemp("mcap") / "cell.mcap"
     assert run_command(["export", str(watched.folder), *CELL, "--mcap", str(path)]) == 0
     return read(path)
@@ -66,8 +63,8 @@ def nanoseconds(time: dict[str, int]) -> int:
 
 
 def test_channels_have_foxgloves_schemas(
-    recorded: tuple[Messages, dict[str, str], dict[str, str]],
-) -> None:
+    recorded,
+):
     _, schemas, metadata = recorded
     own = {
         "boxes": "SceneUpdate",
@@ -97,9 +94,7 @@ def test_channels_have_foxgloves_schemas(
 
 
 @pytest.mark.parametrize("renderer", ["clean", "3dgs"])
-def test_what_is_recorded_is_what_the_log_holds(
-    watched: Watched, recorded: tuple[Messages, dict[str, str], dict[str, str]], renderer: str
-) -> None:
+def test_what_is_recorded_is_what_the_log_holds(watched, recorded, renderer):
     found, log = recorded[0], watched.log(renderer)
     for camera in ("front", "side"):
         kept = [(1000 * image.end_us, image.data) for image in log.images if image.camera == camera]
@@ -141,10 +136,8 @@ def test_what_is_recorded_is_what_the_log_holds(
     )
 
 
-def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(
-    watched: Watched, recorded: tuple[Messages, dict[str, str], dict[str, str]]
-) -> None:
-    series: dict[str, list[tuple[int, float]]] = defaultdict(list)
+def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(watched, recorded):
+    series = defaultdict(list)
     for t, body in recorded[0]["/clean/metrics"]:
         for name, value in body.items():
             if name != "timestamp":
@@ -154,9 +147,7 @@ def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(
     assert "min_distance_to_obstacle_m" not in series  # never valid in this scene
 
 
-def test_a_failed_rollout_and_missing_frames_are_said(
-    watched: Watched, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failed_rollout_and_missing_frames_are_said(watched, tmp_path, capsys):
     folder = Path(shutil.copytree(watched.folder, tmp_path / "run"))
     log = folder / "rollouts" / "clean" / "lane-camera" / "urban-left_turn" / "1" / "rollout.asl"
     log.write_bytes(without_images(log))
@@ -190,10 +181,10 @@ def without_images(log: Path) -> bytes:
 
 
 def test_refusals(
-    watched: Watched,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    watched,
+    tmp_path,
+    monkeypatch,
+):
     run, out = str(watched.folder), tmp_path / "a.mcap"
     (tmp_path / "there.mcap").touch()
     rollout = f"{run}/rollouts/clean/lane-camera/urban-left_turn/0"

@@ -57,7 +57,7 @@ ONLY = ("--images", "none", "--no-report", "--workers", "1", "smoke/curve")
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def places(tmp_path_factory):
     """Drive a rollout with a metric of a plug-in, and make runs of it whose plug-in says something
     else about the metric.
     """
@@ -101,9 +101,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(
-    places: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(places, capsys):
     first, words = str(places / "first"), str(places / "words")
     assert run_command(["compare", first, words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["diff"] == 0.0
@@ -113,17 +111,13 @@ def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(
     assert read_run(words).table["height_m"].help == "height of the roof"
 
 
-def test_another_unit_under_the_same_name_is_refused(
-    places: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_unit_under_the_same_name_is_refused(places, capsys):
     first, unit = str(places / "first"), str(places / "unit")
     assert run_command(["compare", first, unit]) == 2
     assert "metric 'height_m'" in capsys.readouterr().err
 
 
-def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(
-    places: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(places, capsys):
     run = read_run(places / "first")
     assert run_command(["compare", str(run.folder), str(places / "words"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["margin"] == 0.3
@@ -136,7 +130,7 @@ def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(
 
 
 @pytest.mark.slow
-def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_path: Path) -> None:
+def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_path):
     root = tmp_path / "run"
     assert (
         run_command(
@@ -156,7 +150,7 @@ def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_pa
         )
         == 0
     )
-    series: dict[str, dict[int, float]] = {}
+    series = {}
     for row in pq.read_table(root / "steps.parquet").to_pylist():
         if row["valid"]:
             series.setdefault(row["metric"], {})[row["t_us"]] = row["value"]

@@ -56,7 +56,7 @@ def last_us(scenario: Scenario) -> int:
     return int(run_rollout(scenario, Grey(), Fast(), 0).log().ego.t_us[-1])
 
 
-def test_a_rollout_ends_where_a_moving_recording_ends(straight_road: Scenario) -> None:
+def test_a_rollout_ends_where_a_moving_recording_ends(straight_road):
     scenario = shortened(straight_road, 25.0, stands=False)
     rollout = run_rollout(scenario, Grey(), Fast(), 0)
     ego = rollout.log().ego
@@ -67,8 +67,8 @@ def test_a_rollout_ends_where_a_moving_recording_ends(straight_road: Scenario) -
 
 
 def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     log = run_rollout(shortened(straight_road, 25.0, stands=False), Grey(), Fast(), 0).log()
     check_complete(Path("rollout.asl"), log)
     ego = log.ego
@@ -84,8 +84,8 @@ def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later
 
 
 def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     assert last_us(shortened(straight_road, 20.0, stands=True)) == straight_road.end_us
     assert (
         last_us(replace(shortened(straight_road, 25.0, stands=False), stop_at_path_end=False))
@@ -94,8 +94,8 @@ def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(
 
 
 def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     angle = np.linspace(0.0, 2 * np.pi - 0.3, 301)
     xyz = np.stack([30 * np.sin(angle), 30 - 30 * np.cos(angle), 0 * angle], axis=1)
     log = Trajectory(np.linspace(0, 3_000_000, 301).astype(np.int64), xyz, quat_from_yaw(angle))
@@ -105,8 +105,8 @@ def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(
 
 
 def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     def plan(preset: str) -> RunPlan:
         refs = expand("smoke/straight", ("timing.duration_us=2000000", "degradation.kind=none"))
         return make_plan(refs, (GREY,), ("constant-velocity", FAST), (0,), RunOptions(preset))
@@ -123,7 +123,7 @@ def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
 
 @pytest.mark.parametrize("name", ["smoke/straight", "real/us101"])
 @pytest.mark.parametrize("stop", [True, False])
-def test_the_key_in_the_file_decides(stop: bool, name: str) -> None:
+def test_the_key_in_the_file_decides(stop, name):
     override = () if stop else ("timing.stop_at_path_end=false",)
     scenario = load_scenario(name, overrides=override)
     assert scenario.stop_at_path_end is stop

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from alpasim_plugin import run_rollout
-from alpasim_plugin.core.types import F64, Frame, Latency, Scenario
+from alpasim_plugin.core.types import F64, Frame, Latency
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.loop import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
@@ -29,7 +29,7 @@ def offline(frames: list[Frame]) -> list[Frame]:
     return [out for frame in frames for out in fixer.step([frame], ())]
 
 
-def test_a_drive_sees_every_frame_fixed_once_at_its_true_pose(straight_road: Scenario) -> None:
+def test_a_drive_sees_every_frame_fixed_once_at_its_true_pose(straight_road):
     scenario = replace(straight_road, end_us=1_200_000)
     run = drive(scenario, Zigzag, network)  # type: ignore[arg-type]
     session = run.session
@@ -48,7 +48,7 @@ def test_a_drive_sees_every_frame_fixed_once_at_its_true_pose(straight_road: Sce
     assert session.stage_ms["fix"] > 0
 
 
-def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road: Scenario) -> None:
+def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road):
     class Slow(Grey):
         stage_ms = MappingProxyType({"fix": 150.0})  # longer than the camera's period
 

@@ -19,12 +19,12 @@ def git(folder: Path, *words: str) -> str:
 
 
 @pytest.fixture(autouse=True)
-def nothing_stated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def nothing_stated(monkeypatch, tmp_path):
     monkeypatch.delenv("SIMRUN_COMMIT", raising=False)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
 
 
-def test_a_commit_a_changed_file_and_a_detached_head(tmp_path: Path) -> None:
+def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
     git(tmp_path, "init", "-q", "-b", "trunk")
     assert "trunk" in project(tmp_path)["reason"]  # no commit yet
     (tmp_path / "policy.py").write_text("a")
@@ -47,7 +47,7 @@ def test_a_commit_a_changed_file_and_a_detached_head(tmp_path: Path) -> None:
     assert (project(tmp_path)["dirty"], project(tmp_path)["branch"]) == (True, None)
 
 
-def test_a_program_that_the_repository_names_is_not_run(tmp_path: Path) -> None:
+def test_a_program_that_the_repository_names_is_not_run(tmp_path):
     spy, own = tmp_path / "spy", tmp_path / "own"
     spy.write_text(f"#!/bin/sh\necho $0 $@ >> {tmp_path}/was-run\ncat\n")
     spy.chmod(0o755)
@@ -103,9 +103,7 @@ def test_a_program_that_the_repository_names_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "was-run").exists(), (tmp_path / "was-run").read_text()
 
 
-def test_without_a_repository_or_without_git_it_is_said_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_repository_or_without_git_it_is_said_why(tmp_path, monkeypatch):
     assert "not a git repository" in project(tmp_path)["reason"]
     monkeypatch.setenv("SIMRUN_COMMIT", "3F2A9C1")
     assert project(tmp_path)["commit"] == "3f2a9c1"

@@ -23,7 +23,7 @@ KILLER = "tests.runs.broken_policies:KillsItsProcess"
 
 
 @pytest.fixture(scope="module")
-def cluster(repo: Path):
+def cluster(repo):
     pytest.importorskip("ray", reason="the extra [ray] is not installed")
     with pytest.MonkeyPatch.context() as patch:
         # nodes import nothing from the working directory
@@ -39,7 +39,7 @@ def drive(plan, root: Path, executor: Executor):
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_run_of_one_process(tmp_path: Path, cluster: None) -> None:
+def test_a_cluster_gives_the_run_of_one_process(tmp_path, cluster):
     plan = plan_of(scenes=("smoke/straight", "smoke/lead_car"))
     drive(plan, tmp_path / "local", Executor())
     result, announced = drive(plan, tmp_path / "ray", Executor("ray"))
@@ -49,7 +49,7 @@ def test_a_cluster_gives_the_run_of_one_process(tmp_path: Path, cluster: None) -
 
 
 @pytest.mark.slow
-def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path: Path, cluster: None) -> None:
+def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path, cluster):
     refs = expand("smoke/straight", SHORT)
     plan = make_plan(refs, (GREY,), ("constant-velocity", KILLER), (0,), RunOptions())
     result, announced = drive(plan, tmp_path, Executor("ray"))
@@ -58,12 +58,12 @@ def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path: Path, cluster: N
 
 
 @pytest.mark.slow
-def test_more_than_any_node_has_is_an_error(tmp_path: Path, cluster: None) -> None:
+def test_more_than_any_node_has_is_an_error(tmp_path, cluster):
     with pytest.raises(InfrastructureError):
         drive(plan_of(), tmp_path, Executor("ray", cores=4096))
 
 
-def test_a_node_that_differs_drives_nothing(tmp_path: Path) -> None:
+def test_a_node_that_differs_drives_nothing(tmp_path):
     plan = plan_of()
     cell = plan.cells[0]
     scenario = plan.scenarios[cell.scene]
@@ -80,6 +80,6 @@ def test_a_node_that_differs_drives_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["slurm", "local?cores=2", "ray://head:1", "ray?cores=0", "ray?disks=1", "ray?gpus=x"]
 )
-def test_an_executor_that_does_not_exist_is_refused(text: str) -> None:
+def test_an_executor_that_does_not_exist_is_refused(text):
     with pytest.raises(InputError):
         parse_executor(text)

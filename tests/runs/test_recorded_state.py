@@ -26,7 +26,7 @@ def circle(speed_mps: float, radius_m: float) -> Trajectory:
 
 
 @pytest.mark.parametrize("speed_mps", [8.0, -3.0, 0.0])
-def test_many_times_at_once_are_those_times_one_by_one(speed_mps: float) -> None:
+def test_many_times_at_once_are_those_times_one_by_one(speed_mps):
     log, vehicle = circle(speed_mps, 40.0), Vehicle()
     times = np.concatenate([T_US, T_US[:-1] + 13_000])
     for one, t in zip(ego_states_from_log(log, times, vehicle), times, strict=True):
@@ -37,7 +37,7 @@ def test_many_times_at_once_are_those_times_one_by_one(speed_mps: float) -> None
             assert getattr(one, name) == getattr(alone, name)
 
 
-def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends() -> None:
+def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends():
     vehicle = Vehicle()
     for one in ego_states_from_log(circle(8.0, 40.0), T_US, vehicle):
         assert one.speed_mps == pytest.approx(8.0, rel=1e-3)
@@ -46,7 +46,7 @@ def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends() -> None:
         assert one.accel_mps2 == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_log_of_one_pose_stands_still_and_times_outside_are_refused() -> None:
+def test_a_log_of_one_pose_stands_still_and_times_outside_are_refused():
     log = circle(8.0, 40.0)
     alone = Trajectory(log.t_us[:1], log.xyz[:1], log.quat[:1])
     (still,) = ego_states_from_log(alone, [int(T_US[0])], Vehicle())

@@ -82,13 +82,11 @@ def read(path: Path) -> tuple[list[Fraction], U8]:
 
 
 @pytest.mark.parametrize(("n", "sizes"), [(1, [1]), (5, [5]), (6, [5, 1]), (22, [5, 8, 8, 1])])
-def test_every_length_is_cut_into_the_fixers_blocks(
-    tmp_path: Path, n: int, sizes: list[int]
-) -> None:
+def test_every_length_is_cut_into_the_fixers_blocks(tmp_path, n, sizes):
     fixer = Inverting()
     given = pictures(n)
     files = RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4")
-    done: list[tuple[int, int | None]] = []
+    done = []
     summary = refine_video(
         files, lambda: fixer, lambda frames, claimed: done.append((frames, claimed))
     )
@@ -103,14 +101,14 @@ def test_every_length_is_cut_into_the_fixers_blocks(
     assert [f.t_us for f in fixer.seen] == [i * 100_000 for i in range(n)]
 
 
-def test_variable_frame_times_are_kept(tmp_path: Path) -> None:
+def test_variable_frame_times_are_kept(tmp_path):
     times = [100, 140, 147, 1600, 1601, 1700]
     source = video(tmp_path / "in.mp4", pictures(6), times=times, base=Fraction(1, 1000))
     refine_video(RefineFiles(source, tmp_path / "out.mp4"), Inverting)
     assert read(tmp_path / "out.mp4")[0] == [Fraction(t, 1000) for t in times]
 
 
-def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path: Path) -> None:
+def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path):
     given = pictures(7)
     hole = [np.full_like(given[0], 255) for _ in given]
     for i, image in enumerate(hole):
@@ -135,7 +133,7 @@ def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path: Path) -> None:
     assert np.abs(side[:, :, 64:].astype(int) - images).mean() < 2
 
 
-def test_odd_sizes_are_padded_in_the_file_only(tmp_path: Path) -> None:
+def test_odd_sizes_are_padded_in_the_file_only(tmp_path):
     fixer = Inverting()
     source = tmp_path / "in.mkv"
     write_odd(source, pictures(3, 61, 35))
@@ -241,9 +239,7 @@ SITUATIONS = (
 
 
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(
-    tmp_path: Path, situation: str
-) -> None:
+def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(tmp_path, situation):
     files, found = misfits(tmp_path)[situation]
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=found):
@@ -253,7 +249,7 @@ def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(
     } == before
 
 
-def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_path: Path) -> None:
+def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_path):
     files = RefineFiles(
         video(tmp_path / "in.mp4", pictures(20)),
         tmp_path / "out.mp4",

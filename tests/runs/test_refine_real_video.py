@@ -41,9 +41,7 @@ def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[s
     return document
 
 
-def test_a_street_with_its_map_video(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_street_with_its_map_video(shared_data, tmp_path, capsys):
     source = small(shared_data / STREET.format("videos"), tmp_path / "in.mp4", (128, 72), 13)
     maps = small(
         shared_data / STREET.format("control_input_hdmap_bbox"), tmp_path / "map.mp4", (128, 72), 13
@@ -56,9 +54,7 @@ def test_a_street_with_its_map_video(
 
 
 @pytest.mark.slow
-def test_the_whole_freeway_at_its_own_size(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_whole_freeway_at_its_own_size(shared_data, tmp_path, capsys):
     summary = refine(capsys, shared_data / FREEWAY, "-o", tmp_path / "out.mp4")
     assert (summary["frames"], summary["width"], summary["height"]) == (221, 960, 540)
     assert summary["events"] == {}

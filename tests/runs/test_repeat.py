@@ -35,14 +35,14 @@ def repeated(plan: RunPlan, root: Path) -> dict:
 
 
 @pytest.mark.parametrize("policy", ["constant-velocity", "lane-camera"])
-def test_the_shortest_rollout_is_repeatable(tmp_path: Path, policy: str) -> None:
+def test_the_shortest_rollout_is_repeatable(tmp_path, policy):
     found = repeated(plan_of(policy), tmp_path)
     assert found["repeatable"]
     assert found["cell"]["scene"] == "smoke-straight"
     assert len(set(found["digests"])) == 1
 
 
-def test_a_policy_that_remembers_is_not_repeatable(tmp_path: Path) -> None:
+def test_a_policy_that_remembers_is_not_repeatable(tmp_path):
     found = repeated(plan_of(f"constant-velocity,{FORGETFUL}"), tmp_path)
     assert found["cell"]["policy"] == FORGETFUL
     assert found["repeatable"] is False
@@ -50,6 +50,6 @@ def test_a_policy_that_remembers_is_not_repeatable(tmp_path: Path) -> None:
     assert "NOT" in repeat_line(found)
 
 
-def test_measured_latency_is_not_repeated(tmp_path: Path) -> None:
+def test_measured_latency_is_not_repeated(tmp_path):
     found = repeated(plan_of("constant-velocity", "latency.kind=measured"), tmp_path)
     assert found["repeatable"] is None

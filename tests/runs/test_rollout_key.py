@@ -5,7 +5,6 @@ same ones elsewhere are not.
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -22,9 +21,7 @@ def keys() -> list[str]:
     return [cell.rollout_key for cell in plan.cells]
 
 
-def test_other_weights_are_another_rollout_of_that_policy_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path, monkeypatch):
     blind, seeing = keys()
     assert keys() == [blind, seeing]
     monkeypatch.setattr(Learned, "files", (tmp_path / "other.safetensors",))
@@ -50,7 +47,7 @@ def fixed_key(*overrides: str) -> str:
     )
 
 
-def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path: Path) -> None:
+def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path):
     shipped = fixer_settings("onefixer-dit-tiny")
     assert shipped.weights.bundle is not None
     moved, other = tmp_path / "moved.safetensors", tmp_path / "other.safetensors"

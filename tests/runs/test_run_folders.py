@@ -47,7 +47,7 @@ def run(root: Path, plan: RunPlan | None = None) -> Announced:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """Give a finished run of two renderers and two seeds."""
     root = tmp_path_factory.mktemp("run") / "made"
     run(root)
@@ -55,7 +55,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def root(made: Path, tmp_path: Path) -> Path:
+def root(made, tmp_path):
     """Give a copy of the run to be damaged; as ``cp -r`` makes it, with other times."""
     return Path(shutil.copytree(made, tmp_path / "run", copy_function=shutil.copyfile))
 
@@ -101,13 +101,13 @@ QUICK = ("log changed", "manifest a list", "steps cut")  # the others with -m sl
     ],
 )
 def test_the_same_command_makes_only_the_damaged_rollout_again(
-    made: Path,
-    root: Path,
-    file: str,
-    damage: Callable[[Path], None],
-    remedy: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    made,
+    root,
+    file,
+    damage,
+    remedy,
+    capsys,
+):
     damage(root / CELL / file)
     assert run_command(["check", "run", str(root), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
@@ -133,9 +133,7 @@ SCENE = "scenes/smoke-straight.json"
 OF_THE_RUN = ("run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", SCENE)
 
 
-def test_every_file_of_the_run_is_verified_and_written_again(
-    made: Path, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_file_of_the_run_is_verified_and_written_again(made, root, capsys):
     for file in (*OF_THE_RUN, "junit.xml", "files.json"):
         (lengthen if file != "files.json" else remove)(root / file)
         capsys.readouterr()
@@ -147,7 +145,7 @@ def test_every_file_of_the_run_is_verified_and_written_again(
 
 
 @pytest.mark.parametrize("verb", ["gate", "report", "compare"])
-def test_no_verdict_comes_of_a_file_that_was_changed(root: Path, verb: str) -> None:
+def test_no_verdict_comes_of_a_file_that_was_changed(root, verb):
     for file in ("run.json", SCENE, f"{CELL}/manifest.json", f"{CELL}/rollout.asl"):
         before = (root / file).read_bytes()
         flip(root / file)
@@ -158,9 +156,7 @@ def test_no_verdict_comes_of_a_file_that_was_changed(root: Path, verb: str) -> N
 
 
 @pytest.mark.parametrize("damage", [becomes("[]"), becomes('{"scenes": 5}'), cut])
-def test_a_damaged_description_is_written_again(
-    made: Path, root: Path, damage: Callable[[Path], None]
-) -> None:
+def test_a_damaged_description_is_written_again(made, root, damage):
     damage(root / "run.json")
     assert run_command(["check", "run", str(root)]) == 2
     announced = run(root)
@@ -169,9 +165,7 @@ def test_a_damaged_description_is_written_again(
     assert comparable(root) == comparable(made)
 
 
-def test_readers_make_missing_tables_again(
-    made: Path, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_readers_make_missing_tables_again(made, root, capsys):
     """They make them for themselves: a run folder may be read-only."""
     assert run_command(["compare", str(made)]) == 0
     wanted = capsys.readouterr().out
@@ -195,7 +189,7 @@ def test_readers_make_missing_tables_again(
     assert run_command(["compare", str(root)]) == 2
 
 
-def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> None:
+def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root):
     (root / "summary.json").unlink()
     shutil.rmtree(root / CELL)
     assert run_command(["gate", str(root)]) == 2
@@ -204,7 +198,7 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> 
     assert not inspect_run(root).unfinished
 
 
-def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -> None:
+def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root):
     def named(pid: int, at: Path = root / CELL) -> Path:
         return at / temporary_path(Path("a.json")).name.replace(f".{os.getpid()}.", f".{pid}.")
 
@@ -229,9 +223,7 @@ def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -
     assert all(path.exists() for path in [*kept, younger])
 
 
-def test_a_run_folder_is_named_by_what_was_driven_and_a_short_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_folder_is_named_by_what_was_driven_and_a_short_key(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plan = replace(plan_of(), asked=("suites/first",))
     folder = default_folder(plan)

@@ -88,14 +88,14 @@ def comparable(root: Path) -> dict[str, object]:
     ],
 )
 @pytest.mark.slow
-def test_one_and_two_workers_give_the_same_run(tmp_path: Path, scenes: tuple[str, ...]) -> None:
+def test_one_and_two_workers_give_the_same_run(tmp_path, scenes):
     _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
     _, two = run(plan_of(scenes=scenes), tmp_path / "two", workers=2)
     assert one.results.count(("ok", False)) == two.results.count(("ok", False)) == 2 * len(scenes)
     assert comparable(tmp_path / "one") == comparable(tmp_path / "two")
 
 
-def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_path: Path) -> None:
+def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_path):
     plan = cheap_plan()
     run(plan, tmp_path)
     before = comparable(tmp_path)
@@ -106,7 +106,7 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     assert comparable(tmp_path) == before
 
 
-def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
+def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path):
     run(cheap_plan(), tmp_path)
     with pytest.raises(InputError):
         run(cheap_plan((0, 1)), tmp_path)
@@ -115,7 +115,7 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
     assert result.n_rollouts == 8
 
 
-def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path: Path) -> None:
+def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path):
     broken = "tests.runs.broken_policies:Raises"
     plan = make_plan(
         expand("smoke/straight", SHORT),
@@ -139,7 +139,7 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
     ]
 
 
-def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
+def test_a_policy_without_its_file_is_tried_again(tmp_path):
     plan = make_plan(
         expand("smoke/straight", SHORT),
         (GREY,),
@@ -154,9 +154,7 @@ def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)
-def test_a_worker_that_dies_takes_only_its_own_rollout(
-    tmp_path: Path, seeds: tuple[int, ...]
-) -> None:
+def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path, seeds):
     refs = expand("smoke/straight", SHORT)
     killer = "tests.runs.broken_policies:KillsItsProcess"
     plan = make_plan(
@@ -169,7 +167,7 @@ def test_a_worker_that_dies_takes_only_its_own_rollout(
 
 
 @pytest.mark.slow
-def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
+def test_a_killed_run_loses_no_finished_rollout(tmp_path):
     words = "--renderer clean --policy lane-camera --seeds 3 --workers 1 --no-report"
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", "smoke/straight", *words.split()]
     command += ["--set", SHORT[0], "--out"]
@@ -196,7 +194,7 @@ def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Path) -> None:
+def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path):
     """A file-size limit stands in for a full disk: the system refuses the same writes with an error
     of the same kind.
     """
@@ -237,7 +235,7 @@ def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Pat
     assert {p: p.read_bytes() for p in kept} == kept
 
 
-def test_workers_times_threads_never_exceed_the_cores() -> None:
+def test_workers_times_threads_never_exceed_the_cores():
     cores = len(os.sched_getaffinity(0))
     for wanted in (None, 1, 2, 3, 64):
         for cells in (0, 1, 2, 1000):
@@ -247,7 +245,7 @@ def test_workers_times_threads_never_exceed_the_cores() -> None:
             assert wanted is not None or budget.workers * budget.per_worker <= max(cores, 1)
 
 
-def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_refused() -> None:
+def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_refused():
     refs = [*expand("suites/smoke"), *expand("suites/hard")]  # both list hard/hard_brake
     plan = make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
     assert len(refs) == len(plan.cells) + 1
@@ -259,7 +257,7 @@ def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_r
         make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
 
 
-def test_names_become_safe_folders_that_never_collide() -> None:
+def test_names_become_safe_folders_that_never_collide():
     assert slug("onefixer@1") == "onefixer@1"
     assert slug("../../etc").startswith("etc-")
     assert len({slug(name) for name in ("a/b", "a-b", "a:b", "a b", "", "-")}) == 6

@@ -4,8 +4,6 @@ not.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command
@@ -27,21 +25,19 @@ def trial(margin: float, is_broken: bool, change: float, limit: float | None = N
     return Trial(name, is_broken, judge_against(again, spec, first, name))
 
 
-def test_a_sensitive_gate_is_right_about_both() -> None:
+def test_a_sensitive_gate_is_right_about_both():
     caught = trial(0.1, True, 0.5)
     assert (caught.is_right, caught.caught_by) == (True, ["lateral_distance_m"])
     assert trial(0.1, False, 0.0).is_right
 
 
-def test_a_blunt_gate_and_a_gate_that_fails_everything_are_both_found_out() -> None:
+def test_a_blunt_gate_and_a_gate_that_fails_everything_are_both_found_out():
     assert not trial(5.0, True, 0.5).is_right
     assert not trial(0.1, False, 0.0, limit=0.0).is_right
 
 
 @pytest.mark.slow
-def test_the_default_gate_catches_every_broken_renderer_in_closed_loop(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_default_gate_catches_every_broken_renderer_in_closed_loop(tmp_path, capsys):
     assert run_command(["gate", "--self-test", "--out", str(tmp_path / "self")]) == 0
     out = capsys.readouterr().out
     assert out.count("caught by") == 6

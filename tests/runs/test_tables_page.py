@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from alpasim_plugin.log.run_folder.rows import series_by_cell
-from evaluators.opening import Run, read_run
+from evaluators.opening import read_run
 from tests.report.make_run import Plan, make_run
 
 duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed: pip install duckdb")
@@ -21,10 +21,10 @@ FAILED = ("3dgs", "smoke-straight", 1)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Give a folder with ``runs/mine`` and ``runs/other``; one rollout of the first failed."""
     root = tmp_path_factory.mktemp("tables")
-    small: dict[str, Any] = {
+    small = {
         "scenes": SCENES,
         "seeds": (0, 1),
         "steps": 20,
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+def run(folder, monkeypatch):
     monkeypatch.chdir(folder)
     return read_run(folder / "runs" / "mine")
 
@@ -55,7 +55,7 @@ def rows(repo: Path, number: int) -> list[dict[str, Any]]:
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
 
-def test_means_of_many_runs_are_those_of_their_summaries(repo: Path, run: Run) -> None:
+def test_means_of_many_runs_are_those_of_their_summaries(repo, run):
     found = {(Path(row["filename"]).parent.name, row["renderer"]): row for row in rows(repo, 0)}
     assert set(found) == {("mine", "clean"), ("mine", "3dgs"), ("other", "clean")}
     for (name, renderer), row in found.items():
@@ -67,7 +67,7 @@ def test_means_of_many_runs_are_those_of_their_summaries(repo: Path, run: Run) -
         assert row["valid"] == held["lateral_distance_m"]["n_rollouts"]
 
 
-def test_paired_differences_are_those_of_the_summary(repo: Path, run: Run) -> None:
+def test_paired_differences_are_those_of_the_summary(repo, run):
     found = {row["scene"]: row for row in rows(repo, 1)}
     stated = run.summary["paired"]["3dgs"]["lateral_distance_m"]
     assert {scene: row["pairs"] for scene, row in found.items()} == {
@@ -81,7 +81,7 @@ def test_paired_differences_are_those_of_the_summary(repo: Path, run: Run) -> No
     )
 
 
-def test_the_farthest_instant_is_that_of_the_series(repo: Path, run: Run) -> None:
+def test_the_farthest_instant_is_that_of_the_series(repo, run):
     series = series_by_cell(run.steps(["lateral_bias_m"]))
     found = rows(repo, 2)
     assert len(found) == min(10, len(series))
@@ -93,9 +93,9 @@ def test_the_farthest_instant_is_that_of_the_series(repo: Path, run: Run) -> Non
         assert (row["most_m"], row["at_s"]) == pytest.approx((abs(value[at]), 1e-6 * t_us[at]))
 
 
-def test_the_page_in_pandas_gives_the_same(repo: Path, run: Run) -> None:
+def test_the_page_in_pandas_gives_the_same(repo, run):
     (block,) = blocks(repo, "python")
-    names: dict[str, Any] = {}
+    names = {}
     exec(block, names)
     means, worse = names["means"], names["worse_by_m"]
     assert isinstance(means, pd.DataFrame)

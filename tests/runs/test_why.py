@@ -108,7 +108,7 @@ class ByContrast(Right):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """Give a run of the three in a bend."""
     folder = tmp_path_factory.mktemp("why")
     (folder / "bend.yaml").write_text(BEND)
@@ -138,9 +138,7 @@ def queries_of(page: str) -> list[dict[str, Any]]:
     return list(json.loads(found[1])["queries"])
 
 
-def test_the_page_holds_the_route_and_the_debug_output_and_runs_nothing(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_holds_the_route_and_the_debug_output_and_runs_nothing(run, monkeypatch, capsys):
     monkeypatch.setattr(parts, "build", pytest.fail)
     monkeypatch.setattr(ByRoute, "act", pytest.fail)
     assert run_command(["why", str(rollout(run, "ByRoute")), "--json"]) == 0
@@ -157,8 +155,8 @@ def test_the_page_holds_the_route_and_the_debug_output_and_runs_nothing(
 
 
 def test_a_run_stands_for_its_worst_failure_and_no_name_for_the_newest_run(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    run, monkeypatch, capsys
+):
     (run.parent / "runs").mkdir(exist_ok=True)
     if not (run.parent / "runs" / "one").exists():
         (run.parent / "runs" / "one").symlink_to(run)
@@ -171,9 +169,7 @@ def test_a_run_stands_for_its_worst_failure_and_no_name_for_the_newest_run(
     assert "Right" not in shown[0]
 
 
-def test_a_rollout_that_broke_off_shows_its_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rollout_that_broke_off_shows_its_error(tmp_path, capsys):
     (tmp_path / "bend.yaml").write_text(BEND)
     both = tuple(f"{HERE}:{name}" for name in ("Raises", "RaisesLater"))
     plan = make_plan(expand(str(tmp_path / "bend.yaml")), (GREY,), both, (0,), RunOptions())
@@ -188,8 +184,8 @@ def test_a_rollout_that_broke_off_shows_its_error(
 
 
 def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, capsys
+):
     (tmp_path / "bend.yaml").write_text(BEND)
     plan = make_plan(
         expand(str(tmp_path / "bend.yaml")),
@@ -210,7 +206,7 @@ def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_
 
 
 @pytest.mark.parametrize("side", ["front", "lateral", "rear"])
-def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
+def test_a_contact_at_any_side_is_when_a_drive_failed(side):
     events = [
         {"metric": "offroad", "t_us": 7},
         {"metric": f"collision_{side}", "t_us": 5},
@@ -220,7 +216,7 @@ def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
     assert failed_at({"events": events[2:]}) is None
 
 
-def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
+def test_what_a_policy_says_is_sorted_by_what_it_is():
     debug = {
         "picture": np.zeros((8, 8, 3), np.uint8),
         "heat": np.eye(6),
@@ -247,8 +243,8 @@ def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_no_page_names_a_false_cause_and_most_show_the_right_evidence_first(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     bend = BEND.replace("length_m: 12", "length_m: 30").replace("3_000_000", "6_000_000")
     (tmp_path / "bend.yaml").write_text(bend)
     missed = []

@@ -144,9 +144,7 @@ def swap(old: str, new: str) -> str:
         ("just words\n", ":1:1", "'just words'", "object"),
     ],
 )
-def test_wrong_content_is_placed_and_explained(
-    tmp_path: Path, text: str, at: str, found: str, do: str
-) -> None:
+def test_wrong_content_is_placed_and_explained(tmp_path, text, at, found, do):
     e = fails(tmp_path, text)
     assert f"scene.yaml{at}" in e.message
     assert found in e.message
@@ -189,9 +187,7 @@ def test_wrong_content_is_placed_and_explained(
         (GOOD + "ego: {lane_changes: [{at_m: 900, to_lane: 0}]}\n", ":8:1", "the road ends"),
     ],
 )
-def test_scenes_that_cannot_be_built_are_placed_and_explained(
-    tmp_path: Path, text: str, at: str, found: str
-) -> None:
+def test_scenes_that_cannot_be_built_are_placed_and_explained(tmp_path, text, at, found):
     e = fails(
         tmp_path,
         text + "jitter: {length: 0, position_m: 0, speed: 0, lane_width: 0, curvature: 0}\n",
@@ -200,12 +196,12 @@ def test_scenes_that_cannot_be_built_are_placed_and_explained(
     assert found in e.message
 
 
-def test_ego_that_would_leave_its_lane_is_refused(tmp_path: Path) -> None:
+def test_ego_that_would_leave_its_lane_is_refused(tmp_path):
     e = fails(tmp_path, swap(STRAIGHT, SWERVE))
     assert "leave the lanes" in e.message
 
 
-def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> None:
+def test_actors_beside_a_recording_are_refused(tmp_path, repo):
     xml = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
     e = fails(
         tmp_path,
@@ -224,20 +220,20 @@ def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> No
         ("{commonrode: a.xml}", ":2:7", "unknown key 'commonrode'"),
     ],
 )
-def test_bad_log_sections(tmp_path: Path, log: str, at: str, found: str) -> None:
+def test_bad_log_sections(tmp_path, log, at, found):
     e = fails(tmp_path, f"version: 1\nlog: {log}\n")
     assert f"scene.yaml{at}" in e.message
     assert found in e.message
 
 
-def test_a_duration_beyond_the_recording_is_refused(repo: Path) -> None:
+def test_a_duration_beyond_the_recording_is_refused(repo):
     with pytest.raises(InputError) as e:
         load_scenario("real/us101", overrides=["timing.duration_us=9000000"])
     assert "--set timing.duration_us=9000000" in e.value.message
     assert "of a log 3.10 s long" in e.value.message
 
 
-def test_missing_file_gives_the_nearest_shipped_names() -> None:
+def test_missing_file_gives_the_nearest_shipped_names():
     with pytest.raises(InputError) as e:
         load_scenario("smoke/strait")
     assert "no such file or folder" in e.value.message
@@ -246,7 +242,7 @@ def test_missing_file_gives_the_nearest_shipped_names() -> None:
         load_scenario("qqqqqq.yaml")
 
 
-def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path: Path) -> None:
+def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path):
     (tmp_path / "a.usdz").write_bytes(b"PK")
     with pytest.raises(InputError, match="no readable ZIP"):
         load_scenario(tmp_path / "a.usdz")
@@ -259,7 +255,7 @@ def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path: Path
         load_scenario(tmp_path)
 
 
-def test_a_map_without_lanes_is_refused(tmp_path: Path) -> None:
+def test_a_map_without_lanes_is_refused(tmp_path):
     path = tmp_path / "empty.xml"
     path.write_text(
         '<commonRoad timeStepSize="0.1" commonRoadVersion="2018b" benchmarkID="X"></commonRoad>'

@@ -37,7 +37,7 @@ def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
     )
 
 
-def test_the_library_is_as_large_as_promised() -> None:
+def test_the_library_is_as_large_as_promised():
     def count(folder: str) -> int:
         return sum(name.startswith(f"{folder}/") for name in shipped_names())
 
@@ -48,7 +48,7 @@ def test_the_library_is_as_large_as_promised() -> None:
 
 
 @pytest.mark.parametrize("name", first_of(BUILT, 12))
-def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
+def test_expert_stays_on_the_road_and_clear_of_everybody(name):
     s = scenario(name)
     lanes = [
         shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2]).buffer(1e-3)  # type: ignore[index]
@@ -67,7 +67,7 @@ def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", first_of(BUILT, 12))
-def test_expert_drives_smoothly(name: str) -> None:
+def test_expert_drives_smoothly(name):
     log = scenario(name).ego_log
     assert (np.diff(log.t_us) == 10_000).all()
     v = np.hypot(*np.gradient(log.xyz[:, :2], 0.01, axis=0).T)
@@ -85,7 +85,7 @@ def test_expert_drives_smoothly(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*BUILT, "real/us101"])
-def test_scenario_is_complete(name: str) -> None:
+def test_scenario_is_complete(name):
     s = scenario(name)
     assert (
         s.ego_log.t_us[0] <= s.start_us < s.start_us + s.warmup_us < s.end_us <= s.ego_log.t_us[-1]
@@ -103,18 +103,18 @@ def test_scenario_is_complete(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in BUILT if n.startswith("smoke/")])
-def test_smoke_scenarios_are_short_and_small(name: str) -> None:
+def test_smoke_scenarios_are_short_and_small(name):
     s = scenario(name)
     assert (s.end_us - s.start_us) <= 8_000_000
     assert s.cameras[0].width * s.cameras[0].height <= 256 * 144
 
 
-def test_scenarios_are_different_from_each_other() -> None:
+def test_scenarios_are_different_from_each_other():
     shapes = {tuple(np.round(scenario(n).ego_log.xyz[::200, :2].ravel(), 1)) for n in BUILT}
     assert len(shapes) == len(BUILT)
 
 
-def test_suites_hold_what_their_folders_hold() -> None:
+def test_suites_hold_what_their_folders_hold():
     for name in ("urban", "highway", "hard"):
         assert [Path(r.path).stem for r in load_suite(name)] == [
             n.split("/")[1] for n in BUILT if n.startswith(name)

@@ -4,8 +4,6 @@ bounded.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.core.config import load_yaml
@@ -15,7 +13,7 @@ from scenarios.suite import load_suite
 DEPTH = 12
 
 
-def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path: Path) -> None:
+def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path):
     for i in range(DEPTH):
         (tmp_path / f"{i}.yaml").write_text(f"extends: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n")
     (tmp_path / f"{DEPTH}.yaml").write_text("a: 1\n")
@@ -23,7 +21,7 @@ def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path: Path) -
         load_yaml(tmp_path / "0.yaml")
 
 
-def test_suites_that_name_the_next_one_four_times_are_refused(tmp_path: Path) -> None:
+def test_suites_that_name_the_next_one_four_times_are_refused(tmp_path):
     for i in range(DEPTH):
         (tmp_path / f"{i}.yaml").write_text(
             f"version: 1\nscenarios: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n"
@@ -33,7 +31,7 @@ def test_suites_that_name_the_next_one_four_times_are_refused(tmp_path: Path) ->
         load_suite(tmp_path / "0.yaml")
 
 
-def test_a_base_named_by_several_files_is_no_cycle_and_is_taken(tmp_path: Path) -> None:
+def test_a_base_named_by_several_files_is_no_cycle_and_is_taken(tmp_path):
     (tmp_path / "base.yaml").write_text("a: 1\n")
     for name in ("x", "y"):
         (tmp_path / f"{name}.yaml").write_text(f"extends: base.yaml\n{name}: 2\n")

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 from scenarios.load import load_scenario
 from scenarios.schema import SCHEMA_FILE, json_schema
 
 
-def test_committed_schema_is_current() -> None:
+def test_committed_schema_is_current():
     assert SCHEMA_FILE.read_text(encoding="utf-8") == json_schema(), (
         "run python -m scenarios.schema"
     )
 
 
-def test_schema_is_closed_and_versioned() -> None:
+def test_schema_is_closed_and_versioned():
     schema = json.loads(json_schema())
     assert schema["properties"]["version"]["const"] == 1
     assert schema["additionalProperties"] is False
@@ -27,7 +26,7 @@ def test_schema_is_closed_and_versioned() -> None:
     )
 
 
-def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:
+def test_examples_in_the_docs_load(repo, tmp_path):
     text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
     examples = [
         block

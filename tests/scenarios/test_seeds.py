@@ -52,11 +52,11 @@ def bits(value: Any) -> Any:
 @pytest.mark.parametrize(
     "name", ["smoke/lead_car", "hard/occluded_pedestrian", "urban/junction_left", "real/us101"]
 )
-def test_same_file_and_seed_give_a_bit_identical_scenario(name: str) -> None:
+def test_same_file_and_seed_give_a_bit_identical_scenario(name):
     assert bits(load_scenario(name, seed=5)) == bits(load_scenario(name, seed=5))
 
 
-def test_other_seeds_change_road_actors_and_hash_and_name_the_scene(tmp_path: Path) -> None:
+def test_other_seeds_change_road_actors_and_hash_and_name_the_scene(tmp_path):
     path = write(tmp_path)
     scenes = [load_scenario(path, seed=seed) for seed in range(5)]
     assert len({s.content_hash for s in scenes}) == 5
@@ -76,7 +76,7 @@ def measures(s: Scenario) -> dict[str, float]:
     }
 
 
-def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
+def test_jitter_stays_inside_its_ranges(tmp_path):
     path = write(tmp_path)
     seen = [measures(load_scenario(path, seed=seed)) for seed in range(8)]
     for key, nominal, reach in (("length", 100, 5.0), ("width", 3.5, 0.07), ("place", 40, 1.5)):
@@ -85,7 +85,7 @@ def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
         assert np.ptp(values) > 0.3 * reach, key
 
 
-def test_seed_0_is_the_file_as_written_and_others_say_what_they_changed(tmp_path: Path) -> None:
+def test_seed_0_is_the_file_as_written_and_others_say_what_they_changed(tmp_path):
     scene = load_scenario(write(tmp_path))
     assert measures(scene) == pytest.approx(
         {"length": 100.0, "width": 3.5, "place": 40.0}, abs=1e-9
@@ -97,7 +97,7 @@ def test_seed_0_is_the_file_as_written_and_others_say_what_they_changed(tmp_path
     assert "actors.parked.clearance_m" not in other.varied
 
 
-def test_curvature_jitter_keeps_transitions_smooth(tmp_path: Path) -> None:
+def test_curvature_jitter_keeps_transitions_smooth(tmp_path):
     s = load_scenario(write(tmp_path), seed=4)
     centre = np.concatenate(
         [s.lane_map.lanes["s1_f0"].centre, s.lane_map.lanes["s2_f0"].centre[1:]]
@@ -107,7 +107,7 @@ def test_curvature_jitter_keeps_transitions_smooth(tmp_path: Path) -> None:
     assert np.abs(np.diff(turn)).max() < 1.5e-3
 
 
-def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path: Path) -> None:
+def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path):
     more = "variations:\n  actors.lead.s_m: {low: 50, high: 60}\n  environment.sky: {choice: [dusk, overcast]}\n"
     path = write(tmp_path, more)
     scenes = [load_scenario(path, seed=seed) for seed in range(10)]
@@ -117,7 +117,7 @@ def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path: Path) -> None:
     assert {s.environment.sky for s in scenes} == {"dusk", "overcast"}
 
 
-def test_explicit_samples_go_round(tmp_path: Path) -> None:
+def test_explicit_samples_go_round(tmp_path):
     path = write(
         tmp_path,
         "samples:\n  - {actors.lead.s_m: 50}\n  - {actors.lead.s_m: 60, environment.sky: dusk}\n",
@@ -127,7 +127,7 @@ def test_explicit_samples_go_round(tmp_path: Path) -> None:
     assert load_scenario(path, seed=1).environment.sky == "dusk"
 
 
-def test_an_override_wins_over_variation_and_jitter(tmp_path: Path) -> None:
+def test_an_override_wins_over_variation_and_jitter(tmp_path):
     path = write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n")
     s = load_scenario(
         path,
@@ -139,14 +139,14 @@ def test_an_override_wins_over_variation_and_jitter(tmp_path: Path) -> None:
     assert s.content_hash != load_scenario(path, seed=3).content_hash
 
 
-def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path: Path) -> None:
+def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path):
     with pytest.raises(InputError) as e:
         load_scenario(write(tmp_path, "variations: {ego.cruse_mps: {low: 9, high: 10}}\n"))
     assert "variation ego.cruse_mps" in e.value.message
     assert "did you mean 'cruise_mps'" in e.value.hint
 
 
-def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path: Path) -> None:
+def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path):
     plain = load_scenario(write(tmp_path))
     assert (
         load_scenario(write(tmp_path, "description: Something else.\ntags: [x]\n")).content_hash
@@ -165,7 +165,7 @@ def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path: P
     )
 
 
-def test_hash_depends_on_the_bytes_of_data_files(tmp_path: Path) -> None:
+def test_hash_depends_on_the_bytes_of_data_files(tmp_path):
     (tmp_path / "bg.ply").write_bytes(b"ply one")
     path = write(tmp_path, "background: {file: bg.ply}\n")
     first = load_scenario(path)

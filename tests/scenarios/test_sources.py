@@ -4,8 +4,6 @@ else.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -39,7 +37,7 @@ def drive_with_the_log(s: Scenario, step_us: int = 100_000) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("kind", FOLDERS)
-def test_a_recording_is_recognised_and_loaded_as_it_is(shared_data: Path, kind: str) -> None:
+def test_a_recording_is_recognised_and_loaded_as_it_is(shared_data, kind):
     path = shared_data / FOLDERS[kind]
     assert detect(path) == kind
     s = load_scenario(path)
@@ -51,9 +49,7 @@ def test_a_recording_is_recognised_and_loaded_as_it_is(shared_data: Path, kind: 
 
 
 @pytest.mark.parametrize("kind", [pytest.param("argoverse", marks=pytest.mark.slow), "commonroad"])
-def test_a_file_can_let_recorded_traffic_react_or_vanish(
-    shared_data: Path, tmp_path: Path, kind: str
-) -> None:
+def test_a_file_can_let_recorded_traffic_react_or_vanish(shared_data, tmp_path, kind):
     path = tmp_path / "scene.yaml"
     source = shared_data / FOLDERS[kind]
     path.write_text(
@@ -72,7 +68,7 @@ def test_a_file_can_let_recorded_traffic_react_or_vanish(
     assert load_scenario(path, overrides=["log.actors=none"]).actors == ()
 
 
-def test_other_recorded_car_as_ego(shared_data: Path, tmp_path: Path) -> None:
+def test_other_recorded_car_as_ego(shared_data, tmp_path):
     path = tmp_path / "scene.yaml"
     xml = shared_data / "commonroad" / "USA_US101-3_3_T-1.xml"
     path.write_text(f"version: 1\nlog: {{commonroad: {xml}, ego: 408}}\n")
@@ -82,7 +78,7 @@ def test_other_recorded_car_as_ego(shared_data: Path, tmp_path: Path) -> None:
     assert one.content_hash != two.content_hash
 
 
-def test_cameras_of_a_file_are_those_of_the_scene(shared_data: Path, tmp_path: Path) -> None:
+def test_cameras_of_a_file_are_those_of_the_scene(shared_data, tmp_path):
     path = tmp_path / "scene.yaml"
     log = shared_data / FOLDERS["commonroad"]
     path.write_text(

@@ -14,7 +14,7 @@ SCENE = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\ntiming
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     (tmp_path / "one.yaml").write_text(SCENE)
     (tmp_path / "two.yaml").write_text(SCENE)
     (tmp_path / "suite.yaml").write_text(
@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_suite_lists_scenarios_with_seeds_and_overrides(folder: Path) -> None:
+def test_a_suite_lists_scenarios_with_seeds_and_overrides(folder):
     refs = load_suite(folder / "suite.yaml")
     assert [(Path(r.path).name, r.seed, r.overrides) for r in refs] == [
         ("one.yaml", None, ()),
@@ -35,17 +35,17 @@ def test_a_suite_lists_scenarios_with_seeds_and_overrides(folder: Path) -> None:
     assert len({s.scene_id for s in scenes}) == 4
 
 
-def test_a_folder_gives_its_scenarios_and_not_its_suites(folder: Path) -> None:
+def test_a_folder_gives_its_scenarios_and_not_its_suites(folder):
     assert [Path(r.path).name for r in load_suite(folder)] == ["one.yaml", "two.yaml"]
 
 
-def test_one_scenario_or_recording_is_a_suite_of_one(folder: Path, repo: Path) -> None:
+def test_one_scenario_or_recording_is_a_suite_of_one(folder, repo):
     assert load_suite(folder / "one.yaml") == [ScenarioRef(str(folder / "one.yaml"))]
     xml = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
     assert load_suite(xml) == [ScenarioRef(str(xml))]
 
 
-def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:
+def test_an_unknown_entry_is_placed_in_the_suite(folder):
     (folder / "bad.yaml").write_text("version: 1\nscenarios:\n  - one.yaml\n  - smoke/strait\n")
     with pytest.raises(InputError) as e:
         load_suite(folder / "bad.yaml")
@@ -63,14 +63,14 @@ def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:
         ("version: 1\nscenarios: ['']\n", "scenarios[0] = ''"),
     ],
 )
-def test_bad_suites_are_refused(folder: Path, text: str, found: str) -> None:
+def test_bad_suites_are_refused(folder, text, found):
     (folder / "bad.yaml").write_text(text)
     with pytest.raises(InputError) as e:
         load_suite(folder / "bad.yaml")
     assert found in e.value.message
 
 
-def test_an_empty_folder_and_a_missing_name_are_refused(tmp_path: Path) -> None:
+def test_an_empty_folder_and_a_missing_name_are_refused(tmp_path):
     with pytest.raises(InputError, match="a folder without scenario files"):
         load_suite(tmp_path)
     with pytest.raises(InputError, match="did you mean suites/smoke"):

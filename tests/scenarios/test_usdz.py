@@ -8,7 +8,6 @@ import json
 import warnings
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +45,7 @@ def changed(**parts: bytes | None) -> dict[str, bytes]:
     return out
 
 
-def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path: Path) -> None:
+def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path):
     log = read_usdz(write(tmp_path / "a.usdz"))
     assert (log.scene_id, log.source, usdz_scene_id(tmp_path / "a.usdz")) == (
         "small",
@@ -77,13 +76,13 @@ def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path: Path) -> None:
     assert any("no reconstruction" in note for note in log.notes)
 
 
-def test_rails_as_a_struct_of_lists_give_the_same_map(tmp_path: Path) -> None:
+def test_rails_as_a_struct_of_lists_give_the_same_map(tmp_path):
     one = read_usdz_scene(write(tmp_path / "a.usdz"))
     two = read_usdz_scene(write(tmp_path / "b.usdz", members() | tables(as_struct=True)))
     np.testing.assert_array_equal(one.lane_map.lanes["L0"].left, two.lane_map.lanes["L0"].left)
 
 
-def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_path: Path) -> None:
+def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_path):
     path = write(
         tmp_path / "a.usdz", {k: v for k, v in members().items() if not k.startswith("clipgt")}
     )
@@ -92,7 +91,7 @@ def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_pat
     assert not read_usdz_scene(path).lane_map.lanes
 
 
-def test_an_unusable_folder_of_tables_passes_the_turn_to_the_next_source(tmp_path: Path) -> None:
+def test_an_unusable_folder_of_tables_passes_the_turn_to_the_next_source(tmp_path):
     content = changed(clipgt__association_dot_parquet=None)
     content |= {name.replace("clipgt", "fastmap"): data for name, data in tables().items()}
     log = read_usdz(write(tmp_path / "a.usdz", content))
@@ -100,7 +99,7 @@ def test_an_unusable_folder_of_tables_passes_the_turn_to_the_next_source(tmp_pat
     assert any("passed over: no association" in note for note in log.notes)
 
 
-def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
+def test_map_data_comes_before_clipgt(tmp_path):
     content = members() | {
         name.replace("clipgt", "map_data"): data for name, data in tables().items()
     }
@@ -183,9 +182,7 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_damaged_content_is_refused_with_its_place(
-    tmp_path: Path, content: dict[str, bytes], found: str
-) -> None:
+def test_damaged_content_is_refused_with_its_place(tmp_path, content, found):
     with pytest.raises(InputError) as error:
         read_usdz(write(tmp_path / "a.usdz", content))
     assert found in error.value.message
@@ -193,13 +190,13 @@ def test_damaged_content_is_refused_with_its_place(
 
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/x", "a/../../b", "C:\\x"])
-def test_names_that_leave_the_archive_are_refused(tmp_path: Path, name: str) -> None:
+def test_names_that_leave_the_archive_are_refused(tmp_path, name):
     with pytest.raises(InputError, match="outside the archive"):
         read_usdz(write(tmp_path / "a.usdz", members() | {name: b"x"}))
     assert [p.name for p in tmp_path.rglob("*")] == ["a.usdz"]
 
 
-def test_a_member_that_stands_twice_is_refused(tmp_path: Path) -> None:
+def test_a_member_that_stands_twice_is_refused(tmp_path):
     path = write(tmp_path / "a.usdz")
     with zipfile.ZipFile(path, "a") as z, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -208,9 +205,7 @@ def test_a_member_that_stands_twice_is_refused(tmp_path: Path) -> None:
         read_usdz(path)
 
 
-def test_a_member_that_swells_beyond_the_limit_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_member_that_swells_beyond_the_limit_is_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.usdz", changed(rig_trajectories_dot_json=b" " * 300_000))
     assert path.stat().st_size < 20_000
     monkeypatch.setattr(
@@ -228,14 +223,14 @@ def test_a_member_that_swells_beyond_the_limit_is_refused(
         read_usdz(path)
 
 
-def test_checkpoints_are_named_and_never_opened(tmp_path: Path) -> None:
+def test_checkpoints_are_named_and_never_opened(tmp_path):
     log = read_usdz(
         write(tmp_path / "a.usdz", members() | {"checkpoint.ckpt": b"\x80\x04cos\nsystem\n"})
     )
     assert any("checkpoint.ckpt (13 bytes)" in note and "not read" in note for note in log.notes)
 
 
-def test_the_front_wide_camera_of_a_calibration_table(tmp_path: Path) -> None:
+def test_the_front_wide_camera_of_a_calibration_table(tmp_path):
     properties = {"Model": "ftheta", "width": "3848", "height": "2168", "cx": "1924", "cy": "1084"}
     properties |= {"polynomial": "0.0 0.00053 0 0 0", "polynomial-type": "pixeldistance-to-angle"}
     nominal = {"roll-pitch-yaw": [0.0, 0.0, 0.0], "t": [1.7, 0.1, 1.4]}
@@ -255,7 +250,7 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path: Path) -> None:
     )  # turned left by the correction: looks along y
 
 
-def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path: Path) -> None:
+def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path):
     scenario = load_scenario(write(tmp_path / "a.usdz"))
     assert scenario.scene_id == "small"
     assert scenario.source == "usdz"
@@ -264,7 +259,7 @@ def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path: Path) -> None
     assert len(scenario.actors) == 2
 
 
-def test_golden_scenes_are_read(shared_data: Path) -> None:
+def test_golden_scenes_are_read(shared_data):
     folder = shared_data / "alpasim-golden"
     paths = sorted(folder.glob("scenes/*.usdz"))
     assert len(paths) >= 23

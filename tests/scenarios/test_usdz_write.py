@@ -18,7 +18,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
+from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Trajectory
 from scenarios.ftheta import pixel_to_angle
 from scenarios.load import load_scenario
 from scenarios.map_lines import alpasim_view, rails, with_vertices
@@ -30,14 +30,12 @@ TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_
 
 
 @pytest.fixture(scope="module")
-def straight() -> Scenario:
+def straight():
     return load_scenario("smoke/straight")
 
 
 @pytest.fixture(scope="module", params=["smoke/lead_car", "real/us101"])
-def written(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Scenario, Path]:
+def written(request, tmp_path_factory):
     scenario = load_scenario(request.param)
     path = tmp_path_factory.mktemp("scenes") / "scene.usdz"
     write_usdz(path, scenario)
@@ -50,8 +48,8 @@ def table(path: Path, name: str) -> list[dict]:
 
 
 def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
-    written: tuple[Scenario, Path],
-) -> None:
+    written,
+):
     scenario, path = written
     read, view = read_usdz(path), scenario.alpasim_map
     ids = table_ids(list(view.lanes))
@@ -69,7 +67,7 @@ def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
     assert len(read.lane_map.stop_lines) == len(scenario.lane_map.stop_lines)
 
 
-def test_drive_traffic_and_vehicle_come_back(written: tuple[Scenario, Path]) -> None:
+def test_drive_traffic_and_vehicle_come_back(written):
     scenario, path = written
     read = read_usdz(path)
     assert (read.scene_id, read.vehicle.box) == (scenario.scene_id, scenario.vehicle.box)
@@ -89,7 +87,7 @@ def test_drive_traffic_and_vehicle_come_back(written: tuple[Scenario, Path]) -> 
         )
 
 
-def test_no_table_is_empty_and_links_go_both_ways(written: tuple[Scenario, Path]) -> None:
+def test_no_table_is_empty_and_links_go_both_ways(written):
     _, path = written
     rows = {name: table(path, name) for name in TABLES}
     assert all(rows.values())
@@ -111,7 +109,7 @@ def test_no_table_is_empty_and_links_go_both_ways(written: tuple[Scenario, Path]
     assert all(len(r["lane"]["left_rail"]) == len(r["lane"]["right_rail"]) for r in rows["lane"])
 
 
-def test_a_lane_with_unequal_edges_keeps_its_area() -> None:
+def test_a_lane_with_unequal_edges_keeps_its_area():
     t = np.linspace(0, np.pi / 2, 40)
     left = np.column_stack([20 * np.cos(t), 20 * np.sin(t), 0.01 * t])
     right = np.column_stack([24 * np.cos(t), 24 * np.sin(t), 0.01 * t])[[0, 3, 9, 10, 25, 39]]
@@ -127,7 +125,7 @@ def test_a_lane_with_unequal_edges_keeps_its_area() -> None:
     assert float(np.linalg.norm(np.diff(view.lanes["a-1"].centre, axis=0), axis=1).max()) <= 2.0
 
 
-def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight: Scenario, tmp_path: Path) -> None:
+def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight, tmp_path):
     first = next(iter(straight.lane_map.lanes.values()))
     shoulder = replace(
         first,
@@ -157,8 +155,8 @@ def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight: Scenario, tmp_pa
 
 
 def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhole(
-    straight: Scenario, tmp_path: Path
-) -> None:
+    straight, tmp_path
+):
     (camera,) = straight.cameras
     assert list(alpasim_cameras((replace(camera, name="left"), camera))) == [
         "left",
@@ -183,7 +181,7 @@ def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhol
     )  # level ground: two triangles
 
 
-def test_a_scene_that_alpasim_cannot_drive_is_refused(straight: Scenario, tmp_path: Path) -> None:
+def test_a_scene_that_alpasim_cannot_drive_is_refused(straight, tmp_path):
     with pytest.raises(InputError, match="no lane"):
         write_usdz(tmp_path / "s.usdz", replace(straight, lane_map=LaneMap({})))
     assert not (tmp_path / "s.usdz").exists()
@@ -202,9 +200,7 @@ def test_vertices_are_put_in_and_rounded_as_alpasims_loader_does():
     )  # to the bit: it decides whether a union of lanes has cracks
 
 
-def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(
-    straight: Scenario, tmp_path: Path
-):
+def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(straight, tmp_path):
     path = tmp_path / "scene.usdz"
     write_usdz(path, straight)
     alpasim = ["timing.timeline=alpasim"]

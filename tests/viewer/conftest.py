@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from tests.viewer.make_watched import make_watched
 
 
 @pytest.fixture(scope="session")
-def watched_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def watched_run(tmp_path_factory):
     """Make three renderers x two scenes x two seeds with logs, of which some end differently."""
     return make_watched(tmp_path_factory.mktemp("watched"))

@@ -5,7 +5,6 @@ Chromium.
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from urllib.parse import quote
 
 import pytest
@@ -32,7 +31,7 @@ SEEN = f"""(() => {{
 
 
 @pytest.fixture(scope="module")
-def page(watched_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(watched_run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
     return write_page(read_run(watched_run), path, Wanted()).path
 
@@ -49,9 +48,7 @@ def seek(browser: Browser, ms: float) -> None:
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True), (820, False)])
-def test_no_complaint_no_request_and_nothing_wider_than_the_screen(
-    browser: Browser, page: Path, width: int, dark: bool
-) -> None:
+def test_no_complaint_no_request_and_nothing_wider_than_the_screen(browser, page, width, dark):
     browser.requests.clear()
     browser.complaints.clear()
     browser.open(page, width=width, dark=dark)
@@ -70,7 +67,7 @@ def test_no_complaint_no_request_and_nothing_wider_than_the_screen(
     assert browser.evaluate("document.getElementById('birdseye').clientHeight") >= 150
 
 
-def test_all_cameras_show_the_frame_of_the_scrubbers_time(browser: Browser, page: Path) -> None:
+def test_all_cameras_show_the_frame_of_the_scrubbers_time(browser, page):
     browser.open(page)
     settled(browser)
     for ms, frame in ((0, 0), (1000, 10), (1049, 10), (1090, 10), (1100, 11), (300, 3), (2200, 22)):
@@ -87,7 +84,7 @@ def test_all_cameras_show_the_frame_of_the_scrubbers_time(browser: Browser, page
         ).endswith("seconds")
 
 
-def test_the_keyboard_does_everything(browser: Browser, page: Path) -> None:
+def test_the_keyboard_does_everything(browser, page):
     browser.open(page)
     settled(browser)
     seek(browser, 500)
@@ -132,7 +129,7 @@ def test_the_keyboard_does_everything(browser: Browser, page: Path) -> None:
     assert not browser.evaluate("document.getElementById('keys').open")
 
 
-def test_keys_jump_from_event_to_event(browser: Browser, page: Path) -> None:
+def test_keys_jump_from_event_to_event(browser, page):
     browser.open(page)
     settled(browser)
     seek(browser, 0)
@@ -151,7 +148,7 @@ def test_keys_jump_from_event_to_event(browser: Browser, page: Path) -> None:
     assert "seconds" in browser.evaluate("document.getElementById('said').textContent")
 
 
-def test_changed_outcomes_lead_to_their_rollouts(browser: Browser, page: Path) -> None:
+def test_changed_outcomes_lead_to_their_rollouts(browser, page):
     browser.open(page)
     settled(browser)
     count = browser.evaluate("document.querySelectorAll('#flips button').length")
@@ -171,7 +168,7 @@ def test_changed_outcomes_lead_to_their_rollouts(browser: Browser, page: Path) -
         )
 
 
-def test_an_address_opens_a_rollout_at_a_time(browser: Browser, page: Path) -> None:
+def test_an_address_opens_a_rollout_at_a_time(browser, page):
     where = f"#scene={quote('smoke-straight')}&policy=lane-camera&seed=1&renderer=onefixer&t=1.2"
     browser.visit(page.resolve().as_uri() + where)
     settled(browser)
@@ -191,9 +188,7 @@ def test_an_address_opens_a_rollout_at_a_time(browser: Browser, page: Path) -> N
     assert not browser.evaluate("document.getElementById('missing').hidden")
 
 
-def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(
-    browser: Browser, page: Path
-) -> None:
+def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(browser, page):
     browser.open(page)
     settled(browser)
     browser.evaluate("player.open(player.index.cells.find(c => c.scene === 'urban-left_turn').id)")
@@ -209,7 +204,7 @@ def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(
     assert browser.evaluate("document.querySelectorAll('#curves .curve').length") == chosen - 1
 
 
-def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_without_frames_says_so(browser, tmp_path):
     root = make_watched(
         tmp_path / "run",
         Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8),
@@ -228,9 +223,7 @@ def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("width", "dark"), [(1400, False), (1400, True), (390, False), (390, True)]
 )
-def test_axe_finds_nothing_serious(
-    browser: Browser, page: Path, usual_report: Path, width: int, dark: bool
-) -> None:
+def test_axe_finds_nothing_serious(browser, page, usual_report, width, dark):
     script = find_axe()
     if script is None:
         pytest.skip(MISSING)
@@ -242,5 +235,5 @@ def test_axe_finds_nothing_serious(
 
 
 @pytest.fixture(scope="module")
-def usual_report(watched_run: Path) -> Path:
+def usual_report(watched_run):
     return write_report(watched_run)

@@ -59,7 +59,7 @@ def number_of(jpeg: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_run(tmp_path_factory):
     return make_watched(tmp_path_factory.mktemp("small"), SMALL)
 
 
@@ -69,7 +69,7 @@ def only_cell(root: Path, fine: Fineness | None = Fineness()) -> dict[str, Any]:
     return cell_data(run, cell, read_logs(run, cell), fine)
 
 
-def test_poses_are_those_of_the_log(watched_run: Path) -> None:
+def test_poses_are_those_of_the_log(watched_run):
     run = read_run(watched_run)
     cell = cells_of(run)[0]
     data = cell_data(run, cell, read_logs(run, cell), None)
@@ -88,7 +88,7 @@ def test_poses_are_those_of_the_log(watched_run: Path) -> None:
         assert len(drive["plans"][3]["lines"]) == 3  # the plan and two samples
 
 
-def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
+def test_every_frame_comes_with_its_own_time(small_run):
     for drive in only_cell(small_run)["drives"]:
         (camera,) = drive["cameras"]
         assert (
@@ -101,7 +101,7 @@ def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
     assert thinned["t"] == [0, 300, 600, 900]
 
 
-def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known() -> None:
+def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known():
     assert clock_zero_us({"start_us": 500_000}, 0) == 500_000
     assert (
         clock_zero_us({"start_us": 0}, 1_689_697_803_493_732) == 1_689_697_803_493_732
@@ -109,7 +109,7 @@ def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_n
     assert clock_zero_us({}, 70) == 70
 
 
-def test_two_logs_of_one_cell_are_two_cells(small_run: Path) -> None:
+def test_two_logs_of_one_cell_are_two_cells(small_run):
     run = read_run(small_run)
     twice = replace(
         run, rollouts=(*run.rollouts, *(replace(one, path=f"{one.path}-2") for one in run.rollouts))
@@ -121,7 +121,7 @@ def test_two_logs_of_one_cell_are_two_cells(small_run: Path) -> None:
     assert second.name.endswith(", log 2")
 
 
-def test_a_road_user_that_goes_the_same_way_everywhere_is_kept_once(small_run: Path) -> None:
+def test_a_road_user_that_goes_the_same_way_everywhere_is_kept_once(small_run):
     data = only_cell(small_run, None)
     base, other = (set(drive["users"]) for drive in data["drives"])
     assert len(base) == len(other) == 6
@@ -132,7 +132,7 @@ def test_a_road_user_that_goes_the_same_way_everywhere_is_kept_once(small_run: P
     assert len(standing["t"]) == 2
 
 
-def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> None:
+def test_events_are_at_the_times_that_the_report_states(watched_run):
     run = read_run(watched_run)
     seen = 0
     for cell in cells_of(run):
@@ -153,9 +153,7 @@ def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> No
     assert seen >= 3
 
 
-def test_where_pictures_come_from_is_shown_and_said_before_an_event(
-    watched_run: Path, tmp_path: Path
-) -> None:
+def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run, tmp_path):
     root = Path(shutil.copytree(watched_run, tmp_path / "run"))
     run = read_run(root)
     cell = next(one for one in cells_of(run) if one.flips)
@@ -183,7 +181,7 @@ def test_where_pictures_come_from_is_shown_and_said_before_an_event(
     )
 
 
-def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:
+def test_what_is_not_valid_has_no_value_and_a_reason(small_run):
     curves = only_cell(small_run, None)["drives"][0]["curves"]
     assert curves["min_distance_to_obstacle_m"]["v"] == [None]
     assert curves["min_distance_to_obstacle_m"]["why"] == "no other road user within 50 m"
@@ -192,7 +190,7 @@ def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:
     assert "ego_x_m" not in curves
 
 
-def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_path: Path) -> None:
+def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_path):
     root = make_watched(tmp_path, SMALL, cameras=())
     for drive in only_cell(root)["drives"]:
         assert drive["cameras"] == []
@@ -207,7 +205,7 @@ def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_pat
         assert drive["cameras"][0]["t"] == [100 * k for k in range(SMALL.steps)]
 
 
-def test_a_missing_log_is_told_in_its_place(small_run: Path, tmp_path: Path) -> None:
+def test_a_missing_log_is_told_in_its_place(small_run, tmp_path):
     root = Path(shutil.copytree(small_run, tmp_path / "run"))
     (root / read_run(root).rollouts[0].path / "rollout.asl").unlink()
     bare, whole = only_cell(root, None)["drives"]
@@ -215,9 +213,7 @@ def test_a_missing_log_is_told_in_its_place(small_run: Path, tmp_path: Path) -> 
     assert "ego" in whole
 
 
-def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(
-    small_run: Path, tmp_path: Path
-) -> None:
+def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(small_run, tmp_path):
     root = Path(shutil.copytree(small_run, tmp_path / "run"))
     (root / read_run(root).rollouts[0].path / "rollout.asl").write_bytes(b"no log")
     damaged, whole = only_cell(root)["drives"]
@@ -225,7 +221,7 @@ def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(
     assert len(whole["cameras"][0]["t"]) == SMALL.steps
 
 
-def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) -> None:
+def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run):
     run = read_run(watched_run)
     cells = cells_of(run)
     assert [cell.interest for cell in cells] == ["flip", "flip", "flip", "quiet"]
@@ -250,7 +246,7 @@ def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) 
     assert caught.value.exit_code == 2
 
 
-def test_a_page_is_one_file_that_asks_for_nothing(watched_run: Path, tmp_path: Path) -> None:
+def test_a_page_is_one_file_that_asks_for_nothing(watched_run, tmp_path):
     made = write_page(read_run(watched_run), tmp_path / "view.html", Wanted())
     html = made.path.read_text()
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', html)
@@ -264,7 +260,7 @@ def test_a_page_is_one_file_that_asks_for_nothing(watched_run: Path, tmp_path: P
     assert index["notes"] == []
 
 
-def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run: Path) -> None:
+def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run):
     run = read_run(watched_run)
     cells = cells_of(run)[2:]  # a changed outcome and a quiet one
     size = len(make_page(run, cells, cells).html)
@@ -281,7 +277,7 @@ def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run: Path) ->
     assert {f"cell-{cell.id}" for cell in least.cells} == set(documents(least.html)) - {"index"}
 
 
-def test_names_cannot_leave_their_place(tmp_path: Path) -> None:
+def test_names_cannot_leave_their_place(tmp_path):
     hostile = "</script><script>alert(1)</script><!--"
     root = make_watched(
         tmp_path, Plan(renderers=("clean", hostile), scenes=(hostile,), seeds=(0,), steps=6)
@@ -293,9 +289,7 @@ def test_names_cannot_leave_their_place(tmp_path: Path) -> None:
     assert documents(html)["index"]["cells"][0]["scene"] == hostile
 
 
-def test_a_run_links_its_changed_outcomes_to_a_small_page(
-    watched_run: Path, tmp_path: Path
-) -> None:
+def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run, tmp_path):
     root = Path(shutil.copytree(watched_run, tmp_path / "run"))
     links = write_flips_page(root)
     assert len(links) == 3
@@ -313,7 +307,7 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(
     assert not (root / FLIPS_PAGE).exists()
 
 
-def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path: Path) -> None:
+def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path):
     plan = Plan(
         renderers=("clean",),
         policies=("one", "two"),
@@ -330,7 +324,7 @@ def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path: Path)
     assert len(cells_of(run)) == 2  # a recording for other tools holds one policy
 
 
-def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run: Path) -> None:
+def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run):
     run = read_run(small_run)
     cell = cells_of(run)[0]
     drive = cell_data(run, cell, read_logs(run, cell), Fineness(width_px=32))["drives"][0]

@@ -70,7 +70,7 @@ def winding_track(seed: int, t0: int) -> Trajectory:
     return Trajectory(t, rng.normal(0, 30, (60, 3)) + 5e5, quat_from_yaw(yaw))
 
 
-def test_batched_replay_agrees_with_interpolating_track_by_track() -> None:
+def test_batched_replay_agrees_with_interpolating_track_by_track():
     actors = [Actor(f"a{i}", "car", BOX, winding_track(i, T0 + 37_000 * i)) for i in range(12)]
     batch = Actors(actors, Vehicle(), T0)
     for t in range(T0 - 50_000, T0 + 7_000_000, 33_333):
@@ -84,13 +84,13 @@ def test_batched_replay_agrees_with_interpolating_track_by_track() -> None:
                 )
 
 
-def test_replay_is_present_exactly_from_its_first_to_its_last_pose() -> None:
+def test_replay_is_present_exactly_from_its_first_to_its_last_pose():
     actors = Actors([Actor("a", "car", BOX, line_track(0, 5, 1.0, t0=100_000))], Vehicle(), 0)
     present = [t for t in (99_999, 100_000, 1_100_000, 1_100_001) if actors.step(t, FAR_AWAY)]
     assert present == [100_000, 1_100_000]
 
 
-def test_time_must_go_forwards_until_a_reset() -> None:
+def test_time_must_go_forwards_until_a_reset():
     actors = Actors([Actor("a", "car", BOX, line_track(0, 5))], Vehicle(), 0)
     actors.step(500_000, FAR_AWAY)
     with pytest.raises(InputError):
@@ -99,7 +99,7 @@ def test_time_must_go_forwards_until_a_reset() -> None:
     assert actors.step(0, FAR_AWAY)["a"][0, 3] == 0.0
 
 
-def test_reactive_driver_follows_its_track_while_the_log_is_forced() -> None:
+def test_reactive_driver_follows_its_track_while_the_log_is_forced():
     actors = Actors([idm("a", 0, 8)], Vehicle(), 2_000_000, ground=flat())
     x = run(actors, ego_at(40.0), 2_000_000)[
         "a"
@@ -107,7 +107,7 @@ def test_reactive_driver_follows_its_track_while_the_log_is_forced() -> None:
     np.testing.assert_allclose(x, 8.0 * np.arange(21) * 0.1, atol=1e-9)
 
 
-def test_reactive_driver_stops_behind_a_standing_ego_without_contact() -> None:
+def test_reactive_driver_stops_behind_a_standing_ego_without_contact():
     ego = ego_at(60.0)
     actors = Actors([idm("a", 0, 10)], Vehicle(), 500_000, ground=flat())
     x = run(actors, ego, 10_000_000)["a"]
@@ -117,7 +117,7 @@ def test_reactive_driver_stops_behind_a_standing_ego_without_contact() -> None:
     assert abs(x[-1] - x[-11]) < 1.0, "slower than 1 m/s by then"
 
 
-def test_reactive_driver_follows_a_replayed_leader_that_stops() -> None:
+def test_reactive_driver_follows_a_replayed_leader_that_stops():
     t = np.array([0, 3_000_000, 10_000_000])
     stop = Trajectory(
         t, np.array([[30.0, 0, 0.75], [45, 0, 0.75], [45, 0, 0.75]]), quat_from_yaw(np.zeros(3))
@@ -129,7 +129,7 @@ def test_reactive_driver_follows_a_replayed_leader_that_stops() -> None:
     assert x[-1] + BOX.length_m / 2 < 45 - BOX.length_m / 2 - 0.5
 
 
-def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there() -> None:
+def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there():
     def parked(last_us: int) -> Actor:
         t = np.array([0, last_us])
         track = Trajectory(t, np.array([[50.0, 0.5, 0.75]] * 2), quat_from_yaw(np.zeros(2)))
@@ -149,7 +149,7 @@ def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there() -> N
     assert leaves[-1] > 60
 
 
-def test_a_column_of_reactive_drivers_stays_in_order() -> None:
+def test_a_column_of_reactive_drivers_stays_in_order():
     column = [idm(f"c{i}", -12.0 * i, 9, desired_speed_mps=6.0 + 2 * i) for i in range(4)]
     x = run(Actors(column, Vehicle(), 0, ground=flat()), FAR_AWAY, 9_000_000)
     for i in range(3):
@@ -157,7 +157,7 @@ def test_a_column_of_reactive_drivers_stays_in_order() -> None:
         assert gap.min() > 1.0
 
 
-def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends() -> None:
+def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends():
     bend = np.column_stack(
         [
             15 + 20 * np.sin(np.linspace(0, 1.5, 40)),
@@ -186,13 +186,13 @@ def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends() -> None:
     assert "a" not in poses[-1], "it leaves the scene at the end of the map"
 
 
-def test_reactive_driver_with_a_track_that_goes_nowhere_stays_on_it() -> None:
+def test_reactive_driver_with_a_track_that_goes_nowhere_stays_on_it():
     parked = Actor("a", "car", BOX, line_track(5, 0.0), behaviour=Behaviour("idm"))
     actors = Actors([parked], Vehicle(), 0, ground=flat())
     assert run(actors, FAR_AWAY, 5_000_000)["a"] == pytest.approx([5.0] * 51)
 
 
-def test_a_track_that_begins_late_reacts_from_then_on() -> None:
+def test_a_track_that_begins_late_reacts_from_then_on():
     late = Actor(
         "a",
         "car",
@@ -207,7 +207,7 @@ def test_a_track_that_begins_late_reacts_from_then_on() -> None:
     assert float(seen[10_000_000]["a"][0, 3]) + 2.3 < 30 + 1.4 - 4.855 / 2
 
 
-def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
+def test_an_outlook_stays_as_it_is_while_the_actors_move_on():
     replayed = Actor("replayed", "car", BOX, line_track(40.0, 7.0, y=3.5))
     actors = Actors([replayed, idm("driver", 0.0, 10.0)], Vehicle(), 0, None, flat())
     for t in (0, 100_000):
@@ -228,7 +228,7 @@ def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
     )
 
 
-def test_an_outlook_ends_with_the_track_and_with_the_drivers_way() -> None:
+def test_an_outlook_ends_with_the_track_and_with_the_drivers_way():
     replayed = Actor("replayed", "car", BOX, line_track(40.0, 7.0, seconds=1.0, y=3.5))
     short = Actor(
         "driver",

@@ -27,14 +27,14 @@ def straight(y: float) -> object:
     )
 
 
-def test_hard_brake_stops_after_the_physical_distance() -> None:
+def test_hard_brake_stops_after_the_physical_distance():
     t = grid(0, 8_000_000)
     s = integrate(t, speed_profile(t, [(2.0, 12.0), (4.0, 0.0)]), 10.0)
     assert s[-1] == pytest.approx(10 + 12 * 2 + 12**2 / (2 * 6), abs=1e-9)
     assert s[-1] == s[-20]
 
 
-def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt() -> None:
+def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt():
     t = grid(0, 6_000_000, 10_000)
     s = integrate(t, np.full(len(t), 12.0), 5.0)
     track = cut_in_track(straight(-3.5), straight(0.0), t, s, BOX, 1_000_000, 2_500_000)
@@ -50,7 +50,7 @@ def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt() -> N
     np.testing.assert_allclose(heading[5:-5], np.arctan2(v[5:-5, 1], v[5:-5, 0]), atol=2e-3)
 
 
-def test_track_is_cut_where_the_path_ends() -> None:
+def test_track_is_cut_where_the_path_ends():
     t = grid(0, 10_000_000)
     track = track_on_path(straight(0.0), t, integrate(t, np.full(len(t), 20.0), 100.0), BOX)
     assert track.xyz[-1, 0] <= 150.0
@@ -58,7 +58,7 @@ def test_track_is_cut_where_the_path_ends() -> None:
     assert (track.xyz[:, 2] == 0.75).all()
 
 
-def test_walker_stands_walks_at_its_speed_and_stands_again() -> None:
+def test_walker_stands_walks_at_its_speed_and_stands_again():
     t = grid(0, 12_000_000, 10_000)
     track = walk_track(np.array([0.0, -5, 0]), np.array([0.0, 5, 0]), t, 2_000_000, 1.4, BOX)
     assert (track.xyz[t <= 2_000_000, 1] == -5.0).all()
@@ -70,7 +70,7 @@ def test_walker_stands_walks_at_its_speed_and_stands_again() -> None:
     assert track.xyz[:, 1].max() <= 5.0 + 1e-9
 
 
-def test_standing_track_covers_the_whole_time() -> None:
+def test_standing_track_covers_the_whole_time():
     track = standing_track(1.0, 2.0, 0.5, 0.3, grid(0, 5_000_000), BOX)
     assert track.t_us.tolist() == [0, 5_000_000]
     assert track.xyz[0].tolist() == [1.0, 2.0, 1.25]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import LaneMap
 from alpasim_plugin.world.road_strip import Curve, Intersection, LaneTaper, Profile
-from alpasim_plugin.world.roads import Road, build_road, polyline
+from alpasim_plugin.world.roads import build_road, polyline
 from tests.examples import examples
 
 TOWN = [
@@ -69,7 +69,7 @@ def assert_sound(lane_map: LaneMap) -> None:
 
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("turn", ["left", "straight", "right"])
-def test_lanes_are_valid_and_meet_exactly_for_every_profile_and_turn(name: str, turn: str) -> None:
+def test_lanes_are_valid_and_meet_exactly_for_every_profile_and_turn(name, turn):
     elements = [
         Curve(40),
         Curve(20, 0, 0.015),
@@ -83,7 +83,7 @@ def test_lanes_are_valid_and_meet_exactly_for_every_profile_and_turn(name: str, 
     assert len(chain) == len(elements)
 
 
-def test_a_town_with_merge_split_and_two_junctions_is_sound() -> None:
+def test_a_town_with_merge_split_and_two_junctions_is_sound():
     road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
     assert_sound(road.lane_map)
     assert len(road.forward_chain(0)) == 10, (
@@ -93,7 +93,7 @@ def test_a_town_with_merge_split_and_two_junctions_is_sound() -> None:
     assert len(road.backward_chain(0)) == len(TOWN)
 
 
-def test_no_seam_between_consecutive_stretches() -> None:
+def test_no_seam_between_consecutive_stretches():
     road = build_road(
         [Curve(30), Curve(25, 0, 0.03), Curve(25, 0.03, -0.03), Curve(30, -0.03, 0)], Profile(2, 2)
     )
@@ -106,7 +106,7 @@ def test_no_seam_between_consecutive_stretches() -> None:
     assert steps.min() > 0.5
 
 
-def test_road_edges_never_cross_the_main_roads_lanes() -> None:
+def test_road_edges_never_cross_the_main_roads_lanes():
     road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
     middle = shapely.LineString(
         polyline(road.lane_map, [i for i, _ in road.forward_chain(1)])[:, :2]
@@ -115,7 +115,7 @@ def test_road_edges_never_cross_the_main_roads_lanes() -> None:
         assert not middle.crosses(shapely.LineString(edge[:, :2]))
 
 
-def test_left_turn_leads_from_inner_to_inner_lane_and_right_turn_from_outer_to_outer() -> None:
+def test_left_turn_leads_from_inner_to_inner_lane_and_right_turn_from_outer_to_outer():
     road = build_road(
         [Curve(40), Intersection("straight", cross_lanes=2), Curve(40)], Profile(2, 2)
     )
@@ -133,7 +133,7 @@ def test_left_turn_leads_from_inner_to_inner_lane_and_right_turn_from_outer_to_o
     }
 
 
-def test_stop_lines_and_crosswalks_lie_across_their_arms() -> None:
+def test_stop_lines_and_crosswalks_lie_across_their_arms():
     lane_map = build_road(
         [Curve(60), Intersection("straight"), Curve(60)], Profile(1, 1, shoulder_m=0.5)
     ).lane_map
@@ -149,7 +149,7 @@ def test_stop_lines_and_crosswalks_lie_across_their_arms() -> None:
     assert shapely.Polygon(ring[:, :2]).area == pytest.approx(3.0 * 8.0)
 
 
-def test_t_junction_closes_the_missing_side() -> None:
+def test_t_junction_closes_the_missing_side():
     road = build_road(
         [Curve(40), Intersection("left", ("left", "right")), Curve(40)], Profile(1, 1)
     )
@@ -160,7 +160,7 @@ def test_t_junction_closes_the_missing_side() -> None:
     assert borders.intersects(beyond)
 
 
-def test_merging_lane_ends_exactly_on_its_neighbour() -> None:
+def test_merging_lane_ends_exactly_on_its_neighbour():
     road = build_road([Curve(30), LaneTaper("merge", 60), Curve(30)], Profile(3, 0))
     slant, after = road.lane_map.lanes["s1_merge"], road.lane_map.lanes["s2_f1"]
     assert slant.successors == ("s2_f1",)
@@ -184,7 +184,7 @@ def test_merging_lane_ends_exactly_on_its_neighbour() -> None:
         ),
     ],
 )
-def test_impossible_roads_are_refused(elements: list, profile: Profile, text: str) -> None:  # type: ignore[type-arg]
+def test_impossible_roads_are_refused(elements, profile, text):  # type: ignore[type-arg]
     with pytest.raises(InputError) as e:
         build_road(elements, profile)
     assert text in str(e.value)
@@ -198,9 +198,7 @@ def test_impossible_roads_are_refused(elements: list, profile: Profile, text: st
     st.floats(0, 3),
     st.floats(-3.0, 3.0),
 )
-def test_any_winding_road_is_sound(
-    bends: list[tuple[float, float]], forward: int, backward: int, shoulder: float, heading: float
-) -> None:
+def test_any_winding_road_is_sound(bends, forward, backward, shoulder, heading):
     elements, before = [], 0.0
     for length, curvature in bends:
         elements.append(Curve(length, before, curvature))
@@ -208,7 +206,7 @@ def test_any_winding_road_is_sound(
     profile = Profile(forward, backward, shoulder_m=shoulder)
     if 0.04 * max(profile.left_extent_m(), profile.right_extent_m()) > 0.85:
         profile = Profile(1, 1, shoulder_m=shoulder)
-    road: Road = build_road(elements, profile, (100.0, -50.0, heading))
+    road = build_road(elements, profile, (100.0, -50.0, heading))
     for lane in road.lane_map.lanes.values():
         for successor in lane.successors:
             assert (lane.centre[-1] == road.lane_map.lanes[successor].centre[0]).all()

@@ -77,16 +77,14 @@ READERS: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], Any]]] = {
 
 
 @pytest.fixture(scope="module")
-def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def valid(tmp_path_factory):
     return {name: make(tmp_path_factory.mktemp("valid")) for name, (make, _) in READERS.items()}
 
 
 @pytest.mark.parametrize("name", READERS)
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 @given(data=st.data())
-def test_damaged_files_are_refused_or_read(
-    name: str, valid: dict[str, bytes], tmp_path: Path, data: st.DataObject
-) -> None:
+def test_damaged_files_are_refused_or_read(name, valid, tmp_path, data):
     content = bytearray(valid[name])
     for _ in range(data.draw(st.integers(1, 4), label="damages")):
         at = data.draw(st.integers(0, len(content)), label="at")
@@ -100,7 +98,7 @@ def test_damaged_files_are_refused_or_read(
         READERS[name][1](path)
 
 
-def test_a_bit_that_turned_in_a_table_is_never_read_as_another_value(tmp_path: Path) -> None:
+def test_a_bit_that_turned_in_a_table_is_never_read_as_another_value(tmp_path):
     path = tmp_path / "rollouts.parquet"
     table = pa.table({"collision_any": [1.0, 0.0, 1.0, 0.0] * 8, "scene": ["a", "b"] * 16})
     write_parquet(path, table)

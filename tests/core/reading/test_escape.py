@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART, markdown, terminal, xml
@@ -13,7 +12,7 @@ from tests.report.make_run import Plan, make_run
 HOSTILE = "a|b`c <img src=x>&amp; [l](javascript:1) \x1b[31m\x07 \u202e\u0000 *b* _i_\n# head"
 
 
-def test_a_terminal_sees_no_control_character() -> None:
+def test_a_terminal_sees_no_control_character():
     shown = terminal(HOSTILE)
     assert shown.isprintable()
     assert "\\x1b[31m" in shown
@@ -21,7 +20,7 @@ def test_a_terminal_sees_no_control_character() -> None:
     assert terminal("Grüße, 東京 ± 1.5 m") == "Grüße, 東京 ± 1.5 m"
 
 
-def test_markdown_shows_text_as_it_is() -> None:
+def test_markdown_shows_text_as_it_is():
     shown = markdown(HOSTILE)
     assert "\n" not in shown
     assert not set("<>") & set(shown)
@@ -31,12 +30,12 @@ def test_markdown_shows_text_as_it_is() -> None:
     assert markdown("collision_at_fault") == "collision_at_fault"
 
 
-def test_xml_holds_any_text() -> None:
+def test_xml_holds_any_text():
     element = ET.Element("a", {"b": xml("".join(map(chr, range(0x300))) + "\ud800\uffff")})
     assert ET.fromstring(ET.tostring(element)).get("b") is not None
 
 
-def test_parts_of_errors_are_short_and_cannot_act() -> None:
+def test_parts_of_errors_are_short_and_cannot_act():
     error = InputError(f"{'a' * 10000}: {f'found {HOSTILE}' + 'b' * 7500000}", "do")
     assert all(len(part) <= MAX_PART and part.isprintable() for part in (error.message, error.hint))
     assert "10000" not in error.message
@@ -45,7 +44,7 @@ def test_parts_of_errors_are_short_and_cannot_act() -> None:
     assert str(error).count("\n") == 1
 
 
-def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path: Path) -> None:
+def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path):
     run = make_run(
         tmp_path / "run",
         Plan(

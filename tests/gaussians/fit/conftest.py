@@ -62,7 +62,7 @@ def actor_pose(i: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def posed() -> Posed:
+def posed():
     """Give eight views of the scene."""
     rng = stream("fit-tests", 0, "scene")
     wall = patch(at(12, 0, 2), [0.3, 6, 2.2], 250, rng, 0.5)

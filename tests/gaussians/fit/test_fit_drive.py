@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.gaussians.fit import SplatRecipe, drive
-from alpasim_plugin.gaussians.fit.drive import FittedDrive, fit_drive
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.loop import SplatFit
 from alpasim_plugin.gaussians.fit.model import Exposure
 from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
-from alpasim_plugin.gaussians.fit.views import PosedView
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth
 
 pytestmark = pytest.mark.slow
@@ -26,13 +25,13 @@ GAINS = [(1 + 0.1 * np.sin(i),) * 3 for i in range(8)]
 
 
 @pytest.fixture(scope="module")
-def views() -> list[PosedView]:
+def views():
     return [brightened(view, gain) for view, gain in zip(street_views(8), GAINS, strict=True)]
 
 
 @pytest.fixture(scope="module")
-def fitted(views: list[PosedView]) -> tuple[FittedDrive, list[tuple[str, dict[str, float]]]]:
-    told: list[tuple[str, dict[str, float]]] = []
+def fitted(views):
+    told = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive, "LEAST_WAY_M", 2.0)  # these views cover 4 m
         done = fit_drive(
@@ -47,9 +46,7 @@ def fitted(views: list[PosedView]) -> tuple[FittedDrive, list[tuple[str, dict[st
     return done, told
 
 
-def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(
-    fitted: tuple[FittedDrive, object], views: list[PosedView]
-) -> None:
+def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(fitted, views):
     out = fitted[0].model.graph().render(views[4].camera, {}, 1)
     truth = true_depth(views[4])
     near = np.isfinite(truth) & (truth < 20) & (out.alpha > 0.5)
@@ -57,17 +54,15 @@ def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(
     assert np.median(np.abs(out.depth[near] / truth[near] - 1)) < 0.2
 
 
-def test_the_sky_stays_free_of_gaussians(
-    fitted: tuple[FittedDrive, object], views: list[PosedView]
-) -> None:
+def test_the_sky_stays_free_of_gaussians(fitted, views):
     sky = ~np.isfinite(true_depth(views[4]))
     out = fitted[0].model.graph().render(views[4].camera, {}, 1)
     assert out.alpha[sky].mean() < 0.25
 
 
 def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(
-    fitted: tuple[FittedDrive, object],
-) -> None:
+    fitted,
+):
     found = fitted[0].exposures
     assert len(found) == 8
     fitted_ones = [i for i in range(8) if i != 4]
@@ -77,9 +72,7 @@ def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(
     assert found["front-000004"][1] == pytest.approx(between, abs=0.01)
 
 
-def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(
-    views: list[PosedView], tmp_path
-) -> None:
+def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views, tmp_path):
     recipe = replace(QUICK, steps=8, save_every=4, points=500, cap=600)
 
     class CutOffError(Exception):
@@ -97,7 +90,7 @@ def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(
     assert again.model.background.means.tobytes() == whole.model.background.means.tobytes()
 
 
-def test_photographs_that_share_nothing_start_from_given_points(views: list[PosedView]) -> None:
+def test_photographs_that_share_nothing_start_from_given_points(views):
     rng = np.random.default_rng(0)
     noise = [
         replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8))
@@ -109,7 +102,7 @@ def test_photographs_that_share_nothing_start_from_given_points(views: list[Pose
     )
 
 
-def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[PosedView]) -> None:
+def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views):
     """Of a flat grey picture colours say nothing: the weight pulls the points, 12 m away, towards
     the depth of 8 m.
     """
@@ -134,7 +127,7 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[Pos
     assert abs(fitted_to(0.5) - 8.0) < 0.5 < abs(fitted_to(0.0) - 8.0)
 
 
-def test_an_exposure_learns_its_gain_and_keeps_the_mean() -> None:
+def test_an_exposure_learns_its_gain_and_keeps_the_mean():
     exposure = Exposure(np.ones((2, 3)))
     for _ in range(200):
         ((exposure.gain(0) - 1.2) ** 2).sum().backward()

@@ -29,7 +29,7 @@ from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.reconstruction import sky_of
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from tests.gaussians.fit.conftest import BOX, FAR, Posed
+from tests.gaussians.fit.conftest import BOX, FAR
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import cloud_of
 
@@ -64,7 +64,7 @@ def plain_ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return (top / ((mx * mx + my * my + C1) * (mxx - mx * mx + myy - my * my + C2))).mean()
 
 
-def test_similarity_and_its_gradient_equal_the_plain_ones() -> None:
+def test_similarity_and_its_gradient_equal_the_plain_ones():
     a, b = images()
     a[3:9, 4:12] = b[3:9, 4:12] = 0.5  # flat in both: only the constants keep the quotient
     wanted, found = a.clone().requires_grad_(), a.clone().requires_grad_()
@@ -77,7 +77,7 @@ def test_similarity_and_its_gradient_equal_the_plain_ones() -> None:
 
 
 @pytest.mark.gpu
-def test_similarity_on_a_gpu_equals_that_on_the_cpu() -> None:
+def test_similarity_on_a_gpu_equals_that_on_the_cpu():
     a, b = images()
     on_cpu, on_gpu = a.clone().requires_grad_(), a.cuda().requires_grad_()
     values = [SsimTarget(b).ssim(on_cpu), SsimTarget(b.cuda()).ssim(on_gpu)]
@@ -89,7 +89,7 @@ def test_similarity_on_a_gpu_equals_that_on_the_cpu() -> None:
     )
 
 
-def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_error() -> None:
+def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_error():
     a = images()[0].numpy()
     assert ssim(a, a, peak=1.0) == pytest.approx(1.0, abs=1e-6)
     assert psnr_db(a, a + 0.1, peak=1.0) == pytest.approx(20.0, abs=1e-4)
@@ -98,7 +98,7 @@ def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_e
 # --- optimiser
 
 
-def test_updates_follow_the_published_algorithm() -> None:
+def test_updates_follow_the_published_algorithm():
     start = stream("fit-tests", 0, "adam").standard_normal((5, 3)).astype(np.float32)
     p = torch.as_tensor(start.copy()).requires_grad_()
     adam = RowAdam({"p": p})
@@ -114,7 +114,7 @@ def test_updates_follow_the_published_algorithm() -> None:
     assert np.allclose(p.detach().numpy(), wanted, atol=1e-5)
 
 
-def test_rows_keep_their_moments_when_others_come_and_go() -> None:
+def test_rows_keep_their_moments_when_others_come_and_go():
     p = torch.arange(6.0).reshape(3, 2).requires_grad_()
     adam = RowAdam({"p": p})
     p.sum().backward()
@@ -127,7 +127,7 @@ def test_rows_keep_their_moments_when_others_come_and_go() -> None:
 # --- model
 
 
-def test_an_actor_is_placed_as_a_moved_cloud_is() -> None:
+def test_an_actor_is_placed_as_a_moved_cloud_is():
     ground, car = random_cloud(20, 1), random_cloud(15, 2)
     model, T = model_of(ground, {"car": car, "gone": random_cloud(5, 3)}, degree=3), random_rigid(4)
     splats, rows = model.placed(model.motion({"car": T, "stranger": T}), 16)
@@ -140,7 +140,7 @@ def test_an_actor_is_placed_as_a_moved_cloud_is() -> None:
     assert np.allclose(found.opacities, wanted.opacities, atol=1e-6)
 
 
-def test_a_placed_actor_passes_gradients_to_its_own_frame() -> None:
+def test_a_placed_actor_passes_gradients_to_its_own_frame():
     model, T = model_of(random_cloud(3, 1), {"car": random_cloud(4, 2)}), random_rigid(5)
     splats, _ = model.placed(model.motion({"car": T}), 4)
     splats.means[3:, 0].sum().backward()
@@ -151,7 +151,7 @@ def test_a_placed_actor_passes_gradients_to_its_own_frame() -> None:
     assert not gradient[:3].any()
 
 
-def test_clouds_come_back_as_they_went_in_far_from_the_origin() -> None:
+def test_clouds_come_back_as_they_went_in_far_from_the_origin():
     cloud = random_cloud(30, 6, degree=1)
     far = replace(cloud, means=cloud.means + FAR, opacities=cloud.opacities.clip(0.01, 0.99))
     model = SplatModel.from_start(Start(far, {"car": cloud}), FAR, 1)
@@ -189,7 +189,7 @@ def density_case(cap: int = 100) -> tuple[SplatModel, RowAdam, ScreenGradients, 
     )
 
 
-def test_small_ones_are_cloned_large_ones_split_calm_ones_kept() -> None:
+def test_small_ones_are_cloned_large_ones_split_calm_ones_kept():
     model, adam, gradients, recipe = density_case()
     densify(model, adam, gradients, recipe, 50.0, stream("t", 0, "split"))
     size = model.params["log_scales"].exp().max(dim=1).values.tolist()
@@ -203,7 +203,7 @@ def test_small_ones_are_cloned_large_ones_split_calm_ones_kept() -> None:
     )
 
 
-def test_faint_and_oversized_ones_are_removed() -> None:
+def test_faint_and_oversized_ones_are_removed():
     model, adam, gradients, recipe = density_case()
     with torch.no_grad():
         model.params["logit_opacities"][2] = -6.0
@@ -221,7 +221,7 @@ def test_faint_and_oversized_ones_are_removed() -> None:
 # --- start and sky
 
 
-def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed: Posed) -> None:
+def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed):
     start = start_from_depth(posed.views, {"car": BOX}, 400, "s", 0, 50)
     assert len(start.actors["car"]) == 50
     assert np.abs(start.actors["car"].means).max() < 2.2
@@ -233,7 +233,7 @@ def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed: Posed) ->
     assert np.array_equal(start.background.means, again.background.means)
 
 
-def test_points_become_gaussians_as_large_as_their_distance() -> None:
+def test_points_become_gaussians_as_large_as_their_distance():
     line = np.column_stack([np.arange(5) * 0.5, np.zeros(5), np.zeros(5)])
     cloud = cloud_from_points(line, np.full((5, 3), 0.25))
     assert cloud.scales[2, 0] > 0.2
@@ -241,14 +241,14 @@ def test_points_become_gaussians_as_large_as_their_distance() -> None:
     assert len(cloud_from_points(line[:1], np.zeros((1, 3)))) == 1
 
 
-def test_where_no_depth_is_known_an_actor_starts_all_over_its_box() -> None:
+def test_where_no_depth_is_known_an_actor_starts_all_over_its_box():
     cloud = start_in_boxes({"car": BOX}, 500, "s", 0)["car"]
     half = np.array([BOX.length_m, BOX.width_m, BOX.height_m]) / 2
     assert np.all(np.abs(cloud.means) <= half)
     assert np.all(np.abs(cloud.means).max(axis=0) > 0.9 * half)
 
 
-def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
+def test_the_panorama_shows_the_sky_that_the_views_saw(posed):
     sky = sky_of(posed.views)
     for view in posed.views[::3]:
         assert view.sky is not None
@@ -261,7 +261,7 @@ def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
 # --- recipe
 
 
-def test_the_schedule_stretches_with_the_steps() -> None:
+def test_the_schedule_stretches_with_the_steps():
     short, long = (
         SplatRecipe(steps=100, densify_every=10),
         SplatRecipe(steps=1000, densify_every=100),
@@ -274,6 +274,6 @@ def test_the_schedule_stretches_with_the_steps() -> None:
 
 
 @pytest.mark.parametrize("change", [{"steps": 0}, {"sh_degree": 4}, {"ssim_weight": 1.5}])
-def test_a_recipe_outside_its_range_is_refused(change: dict[str, float]) -> None:
+def test_a_recipe_outside_its_range_is_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):
         replace(SplatRecipe(), **change)

@@ -20,7 +20,7 @@ from alpasim_plugin.gaussians.fit import (
     loop,
 )
 from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
-from tests.gaussians.fit.conftest import BOX, Posed, actor_pose, at, camera_at
+from tests.gaussians.fit.conftest import BOX, actor_pose, at, camera_at
 
 QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
 
@@ -43,12 +43,12 @@ def bits(model: Reconstruction) -> list[bytes]:
     ]
 
 
-def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed: Posed) -> None:
+def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed):
     train = [view for i, view in enumerate(posed.views) if i % 4 != 2]
     kept = posed.views[2::4]
     recipe = replace(QUICK, steps=80)
     before = mean_psnr(fit(train, posed.start, replace(recipe, steps=1)), kept)
-    numbers: list[dict[str, float]] = []
+    numbers = []
     after = fit(
         train, posed.start, recipe, report=lambda step, row: numbers.append({"step": step, **row})
     )
@@ -58,7 +58,7 @@ def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed: 
     assert len(posed.start.background) < len(after) <= recipe.cap
 
 
-def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed: Posed, tmp_path) -> None:
+def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed, tmp_path):
     whole = fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "whole")
 
     class CutOffError(Exception):
@@ -70,7 +70,7 @@ def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed: Posed, tmp_p
 
     with pytest.raises(CutOffError):
         fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "cut", report=cut)
-    steps: list[int] = []
+    steps = []
     again = fit(
         posed.views,
         posed.start,
@@ -83,14 +83,14 @@ def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed: Posed, tmp_p
     assert bits(again) == bits(whole)
 
 
-def test_threads_do_not_change_the_result(posed: Posed) -> None:
+def test_threads_do_not_change_the_result(posed):
     recipe = replace(QUICK, steps=12)
     assert bits(fit(posed.views, posed.start, recipe, threads=1)) == bits(
         fit(posed.views, posed.start, recipe, threads=2)
     )
 
 
-def test_a_folder_begun_with_another_recipe_is_refused(posed: Posed, tmp_path) -> None:
+def test_a_folder_begun_with_another_recipe_is_refused(posed, tmp_path):
     recipe = replace(QUICK, steps=2)
     fit(posed.views, posed.start, recipe, folder=tmp_path)
     with pytest.raises(InputError):
@@ -99,7 +99,7 @@ def test_a_folder_begun_with_another_recipe_is_refused(posed: Posed, tmp_path) -
         fit(posed.views[1:], posed.start, recipe, folder=tmp_path)
 
 
-def test_the_actor_is_learned_in_its_own_frame(posed: Posed) -> None:
+def test_the_actor_is_learned_in_its_own_frame(posed):
     model = fit(posed.views, posed.start, replace(QUICK, steps=80))
     car = model.actors["car"]
     solid = car.opacities > 0.3
@@ -121,7 +121,7 @@ def test_the_actor_is_learned_in_its_own_frame(posed: Posed) -> None:
     assert columns.max() < 0.6 * camera.width, "to the left, as it was put"
 
 
-def test_a_mask_keeps_what_it_hides_out_of_the_model(posed: Posed) -> None:
+def test_a_mask_keeps_what_it_hides_out_of_the_model(posed):
     spoiled = []
     for view in posed.views:
         rgb, mask = view.rgb.copy(), np.ones(view.rgb.shape[:2], dtype=bool)
@@ -134,8 +134,8 @@ def test_a_mask_keeps_what_it_hides_out_of_the_model(posed: Posed) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
-    posed: Posed, tmp_path, monkeypatch
-) -> None:
+    posed, tmp_path, monkeypatch
+):
     real, calls = loop.rasterize_gradient, []
 
     def breaks(*args, **kwargs):
@@ -149,14 +149,14 @@ def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
     assert "update 3" in str(error.value)
     assert "view-" in str(error.value)
     monkeypatch.setattr(loop, "rasterize_gradient", real)
-    steps: list[int] = []
+    steps = []
     fit(posed.views, posed.start, QUICK, folder=tmp_path, report=lambda step, _: steps.append(step))
     assert (tmp_path / STATE_FILE).exists()
     assert steps[0] == 4
 
 
 @pytest.mark.parametrize("missing", ["views", "start"])
-def test_nothing_to_learn_from_is_one_clear_error(posed: Posed, missing: str) -> None:
+def test_nothing_to_learn_from_is_one_clear_error(posed, missing):
     with pytest.raises(InputError):
         fit([], posed.start, QUICK) if missing == "views" else fit(
             posed.views, Start(GaussianCloud.empty(), {}), QUICK

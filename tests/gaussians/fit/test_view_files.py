@@ -12,7 +12,6 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.gaussians.fit.photographs import FILE, read_points, read_views
-from tests.gaussians.fit.conftest import Posed
 from tests.gaussians.fit.view_files import write_views
 
 
@@ -36,7 +35,7 @@ def write_points(path: Path, names: str, rows: np.ndarray) -> None:
     path.write_bytes(header.encode() + b"end_header\n" + data.tobytes())
 
 
-def test_views_come_back_as_they_were_written(posed: Posed, tmp_path: Path) -> None:
+def test_views_come_back_as_they_were_written(posed, tmp_path):
     masked = replace(posed.views[1], mask=np.arange(32 * 48).reshape(32, 48) % 3 > 0)
     write_views(tmp_path, [posed.views[0], masked])
     views, start = read_views(tmp_path)
@@ -55,7 +54,7 @@ def test_views_come_back_as_they_were_written(posed: Posed, tmp_path: Path) -> N
     assert np.array_equal(views[1].mask, masked.mask)
 
 
-def test_axes_of_opengl_are_turned_to_ours(posed: Posed, tmp_path: Path) -> None:
+def test_axes_of_opengl_are_turned_to_ours(posed, tmp_path):
     write_views(tmp_path, posed.views[:1])
     pose = inverse(posed.views[0].camera.T_camera_world)
     change(
@@ -67,7 +66,7 @@ def test_axes_of_opengl_are_turned_to_ours(posed: Posed, tmp_path: Path) -> None
     assert np.abs(inverse(views[0].camera.T_camera_world) - pose).max() < 1e-9
 
 
-def test_sizes_and_intrinsics_may_stand_for_all_frames(posed: Posed, tmp_path: Path) -> None:
+def test_sizes_and_intrinsics_may_stand_for_all_frames(posed, tmp_path):
     write_views(tmp_path, posed.views[:2])
     document = json.loads((tmp_path / FILE).read_text())
     shared = {key: document["frames"][0][key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
@@ -76,7 +75,7 @@ def test_sizes_and_intrinsics_may_stand_for_all_frames(posed: Posed, tmp_path: P
     assert len(read_views(tmp_path)[0]) == 2
 
 
-def test_actors_are_placed_at_a_frames_time(posed: Posed, tmp_path: Path) -> None:
+def test_actors_are_placed_at_a_frames_time(posed, tmp_path):
     write_views(tmp_path, posed.views[:2])
     change(tmp_path, frame={"t_us": 300_000})
     views, _ = read_views(tmp_path, lambda t_us: {"car": np.eye(4) * t_us})
@@ -84,7 +83,7 @@ def test_actors_are_placed_at_a_frames_time(posed: Posed, tmp_path: Path) -> Non
     assert not views[1].actors
 
 
-def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path) -> None:
+def test_points_to_start_from_keep_place_and_colour(posed, tmp_path):
     write_views(tmp_path, posed.views[:1])
     write_points(
         tmp_path / "points.ply",
@@ -113,9 +112,7 @@ def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path
         ({"ply_file_path": "gone.ply"}, "gone.ply"),
     ],
 )
-def test_what_cannot_be_is_one_clear_error(
-    posed: Posed, tmp_path: Path, keys: dict[str, object], says: str
-) -> None:
+def test_what_cannot_be_is_one_clear_error(posed, tmp_path, keys, says):
     write_views(tmp_path, posed.views[:1])
     change(tmp_path, **keys)
     with pytest.raises(InputError):

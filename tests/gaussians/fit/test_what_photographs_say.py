@@ -11,29 +11,27 @@ import pytest
 
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_between
-from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
-from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from alpasim_plugin.gaussians.fit.tracks import Tracks, corrected, follow, place
+from alpasim_plugin.gaussians.fit.views import halved
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
 
 
 @pytest.fixture(scope="module")
-def views() -> list[PosedView]:
+def views():
     return street_views()
 
 
 @pytest.fixture(scope="module")
-def tracks(views: list[PosedView]) -> Tracks:
+def tracks(views):
     return follow(views)
 
 
 @pytest.fixture(scope="module")
-def placed(views: list[PosedView], tracks: Tracks) -> Placed:
+def placed(views, tracks):
     return place(tracks, [view.camera for view in views])
 
 
-def test_points_followed_through_the_street_lie_on_its_surfaces(
-    tracks: Tracks, placed: Placed
-) -> None:
+def test_points_followed_through_the_street_lie_on_its_surfaces(tracks, placed):
     good = np.ones(tracks.count, bool)
     np.logical_and.at(good, tracks.point, placed.error_px < 0.5)
     good &= placed.angle_rad > 0.05
@@ -45,7 +43,7 @@ def test_points_followed_through_the_street_lie_on_its_surfaces(
     assert (on_wall | on_road | on_box).mean() > 0.95
 
 
-def test_masked_pixels_start_no_track(views: list[PosedView]) -> None:
+def test_masked_pixels_start_no_track(views):
     mask = np.ones(views[0].rgb.shape[:2], bool)
     mask[64:] = False
     found = follow([replace(view, mask=mask) for view in views[:3]])
@@ -53,7 +51,7 @@ def test_masked_pixels_start_no_track(views: list[PosedView]) -> None:
     assert found.at[found.view == 0][:, 1].max() < 65
 
 
-def test_poses_that_are_off_come_back_to_the_truth(views: list[PosedView]) -> None:
+def test_poses_that_are_off_come_back_to_the_truth(views):
     rng = np.random.default_rng(3)
     wrong = [turned(view, rng.normal(0, 0.003, 3), rng.normal(0, 0.02, 3)) for view in views]
     found = corrected(wrong)
@@ -82,9 +80,7 @@ def test_poses_that_are_off_come_back_to_the_truth(views: list[PosedView]) -> No
     )
 
 
-def test_depth_by_flow_is_the_street_s(
-    views: list[PosedView], tracks: Tracks, placed: Placed
-) -> None:
+def test_depth_by_flow_is_the_street_s(views, tracks, placed):
     maps = depth_maps(views, tracks, placed)
     middle = 4
     depth, truth = maps[middle].depth, true_depth(views[middle])
@@ -99,21 +95,21 @@ def test_depth_by_flow_is_the_street_s(
     )
 
 
-def test_nothing_is_measured_where_tracks_place_too_few_points(views: list[PosedView]) -> None:
+def test_nothing_is_measured_where_tracks_place_too_few_points(views):
     none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
     empty = place(none, [view.camera for view in views])
     assert between_points(views[0].camera, none, empty, 0) is None
     assert not any(one.depth.any() for one in depth_maps(views[:3], none, empty))
 
 
-def test_sky_is_found_where_the_street_has_none_of_its_own(views: list[PosedView]) -> None:
+def test_sky_is_found_where_the_street_has_none_of_its_own(views):
     for view, mask in zip(views, sky_masks(views), strict=True):
         truth = ~np.isfinite(true_depth(view))
         assert mask[truth].mean() > 0.7
         assert not mask[~truth].mean() > 0.005
 
 
-def test_a_smooth_wall_with_depth_is_no_sky(views: list[PosedView]) -> None:
+def test_a_smooth_wall_with_depth_is_no_sky(views):
     walled = [
         replace(view, depth=np.where(np.isfinite(true_depth(view)), 0, 8).astype(np.float32))
         for view in views
@@ -126,9 +122,7 @@ def test_a_smooth_wall_with_depth_is_no_sky(views: list[PosedView]) -> None:
     assert not any(mask.any() for mask in sky_masks(thinned))
 
 
-def test_exposure_and_white_balance_are_found_to_a_percent(
-    views: list[PosedView], tracks: Tracks
-) -> None:
+def test_exposure_and_white_balance_are_found_to_a_percent(views, tracks):
     rng = np.random.default_rng(5)
     true = rng.uniform(0.85, 1.15, (len(views), 3))
     true /= np.exp(np.log(true).mean(axis=0))
@@ -139,7 +133,7 @@ def test_exposure_and_white_balance_are_found_to_a_percent(
     assert np.abs(np.log(found).mean(axis=0)).max() < 1e-9
 
 
-def test_a_gain_between_photographs_is_that_of_the_nearest_two() -> None:
+def test_a_gain_between_photographs_is_that_of_the_nearest_two():
     centres, gains = (
         np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]),
         np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3]),
@@ -149,7 +143,7 @@ def test_a_gain_between_photographs_is_that_of_the_nearest_two() -> None:
     assert np.allclose(gain_between(centres[:0], gains[:0], np.zeros(3)), 1.0)
 
 
-def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views: list[PosedView]) -> None:
+def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views):
     depth = np.arange(views[0].rgb[..., 0].size, dtype=np.float32).reshape(views[0].rgb.shape[:2])
     small = halved(replace(views[0], depth=depth, sky=depth > 100, gain=(1.1, 1.0, 0.9)))
     point = views[0].camera.centre_world + np.array([8.0, 1.0, 0.5])

@@ -8,7 +8,7 @@ import pytest
 
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, paint_of, road_of
+from alpasim_plugin.lab.bench.lane_paint import PaintCounts, compare_paint, paint_of, road_of
 from alpasim_plugin.world.ground import flat
 
 WIDTH = 320
@@ -21,7 +21,7 @@ YELLOW = (220, 190, 60)
 
 
 @pytest.fixture(scope="module")
-def camera() -> PinholeCamera:
+def camera():
     T = np.eye(4)
     T[:3, :3] = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
     T[2, 3] = EYE_M
@@ -50,13 +50,13 @@ def drawn(camera: PinholeCamera, lines: list[tuple[float, float, tuple[int, int,
 
 
 @pytest.fixture(scope="module")
-def road(camera: PinholeCamera) -> Road:
+def road(camera):
     return road_of(camera, flat(), PATH)
 
 
 def test_the_road_is_seen_between_four_and_thirty_metres_and_four_beside_the_path(
-    road: Road,
-) -> None:
+    road,
+):
     rows, columns = np.nonzero(road.seen)
     assert rows.min() == pytest.approx(60 + 180 * EYE_M / 30, abs=1.5)
     assert rows.max() == pytest.approx(60 + 180 * EYE_M / 4, abs=1.5)
@@ -67,9 +67,7 @@ def test_the_road_is_seen_between_four_and_thirty_metres_and_four_beside_the_pat
 
 
 @pytest.mark.parametrize("colour", [WHITE, YELLOW])
-def test_a_line_is_paint_and_found_where_it_is(
-    camera: PinholeCamera, road: Road, colour: tuple[int, int, int]
-) -> None:
+def test_a_line_is_paint_and_found_where_it_is(camera, road, colour):
     picture = drawn(camera, [(1.8, 0.12, colour)])
     paint = paint_of(picture, road)
     truth = (np.abs(picture.astype(int) - ROAD_LEVEL).max(axis=2) > 60) & road.seen
@@ -78,16 +76,14 @@ def test_a_line_is_paint_and_found_where_it_is(
 
 
 @pytest.mark.parametrize("picture", ["plain", "bright half", "wide slab"])
-def test_what_is_no_line_is_no_paint(camera: PinholeCamera, road: Road, picture: str) -> None:
+def test_what_is_no_line_is_no_paint(camera, road, picture):
     lines = {"plain": [], "bright half": [(5.0, 8.0, WHITE)], "wide slab": [(0.0, 2.5, WHITE)]}[
         picture
     ]
     assert not paint_of(drawn(camera, lines), road).any()
 
 
-def test_an_invented_double_line_costs_precision_and_not_recall(
-    camera: PinholeCamera, road: Road
-) -> None:
+def test_an_invented_double_line_costs_precision_and_not_recall(camera, road):
     truth = drawn(camera, [(1.8, 0.12, WHITE)])
     made = drawn(camera, [(1.8, 0.12, WHITE), (-0.5, 0.12, YELLOW), (-0.9, 0.12, YELLOW)])
     found = compare_paint(made, truth, road)
@@ -95,9 +91,7 @@ def test_an_invented_double_line_costs_precision_and_not_recall(
     assert found.recall == pytest.approx(1.0)
 
 
-def test_a_lost_line_costs_recall_and_nothing_made_has_no_precision(
-    camera: PinholeCamera, road: Road
-) -> None:
+def test_a_lost_line_costs_recall_and_nothing_made_has_no_precision(camera, road):
     found = compare_paint(drawn(camera, []), drawn(camera, [(1.8, 0.12, WHITE)]), road)
     assert found.precision is None
     assert found.recall == 0
@@ -106,16 +100,14 @@ def test_a_lost_line_costs_recall_and_nothing_made_has_no_precision(
     )
 
 
-def test_a_line_off_by_less_than_two_pixels_counts_as_the_same(
-    camera: PinholeCamera, road: Road
-) -> None:
+def test_a_line_off_by_less_than_two_pixels_counts_as_the_same(camera, road):
     truth = drawn(camera, [(1.8, 0.12, WHITE)])
     assert compare_paint(np.roll(truth, 1, axis=1), truth, road).precision == pytest.approx(1.0)
     away = compare_paint(np.roll(truth, 8, axis=1), truth, road).precision
     assert away < 0.3
 
 
-def test_counts_of_pictures_are_added() -> None:
+def test_counts_of_pictures_are_added():
     both = PaintCounts(10, 5, 8, 8) + PaintCounts(10, 10, 2, 0)
     assert (both.precision, both.recall) == (0.75, 0.8)
     assert PaintCounts().precision is None

@@ -11,8 +11,8 @@ from alpasim_plugin.lab.bench.loop import STAGES, bench_loop, markdown
 
 
 def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(module, "COMMANDS", {"start": ("--version",)})
     monkeypatch.setattr(module, "SIZES", ((128, 72), (64, 36)))
     record = bench_loop(["clean"], repeats=1, seconds=0.5)

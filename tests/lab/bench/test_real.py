@@ -14,7 +14,7 @@ from torch import Tensor
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest
 from alpasim_plugin.lab.bench import colour_video_vdp
 from alpasim_plugin.lab.bench.real import METRICS, Judges, intervals, measure_drive, shots_of
 from alpasim_plugin.lab.cli import bench_real
@@ -50,11 +50,11 @@ class Blocks(Truth):
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+def drive(tmp_path_factory):
     return recorded_drive(tmp_path_factory.mktemp("drive"))
 
 
-def test_photographs_that_no_fit_saw_make_rows_by_camera_and_distance(drive: Scenario) -> None:
+def test_photographs_that_no_fit_saw_make_rows_by_camera_and_distance(drive):
     truth = Truth()
     rows = measure_drive("d", drive, {"truth": lambda: truth}, Judges(Difference(), None))
     assert [list(row) for row in rows] == [KEYS] * 2
@@ -77,8 +77,8 @@ def test_photographs_that_no_fit_saw_make_rows_by_camera_and_distance(drive: Sce
 
 
 def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(
-    drive: Scenario,
-) -> None:
+    drive,
+):
     judges = Judges(Difference(), None)
     rows = measure_drive(
         "d", drive, {"3dgs": lambda: make_renderer("3dgs", drive, threads=1)}, judges
@@ -99,7 +99,7 @@ def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(
     )
 
 
-def test_what_cannot_be_measured_is_refused(drive: Scenario) -> None:
+def test_what_cannot_be_measured_is_refused(drive):
     with pytest.raises(InputError):
         shots_of(straight())
     with pytest.raises(InputError):
@@ -110,9 +110,7 @@ def test_what_cannot_be_measured_is_refused(drive: Scenario) -> None:
         measure_drive("d", drive, {"blocks": Blocks}, Judges(Difference(), None))
 
 
-def test_the_command_prints_one_document(
-    drive: Scenario, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_one_document(drive, monkeypatch, capsys):
     monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
     monkeypatch.setattr(
         bench_real,
@@ -156,7 +154,7 @@ def test_the_command_prints_one_document(
     assert run_command(["bench", "real", "d", "--renderer", "3dgs,onefixr"]) == 2
 
 
-def test_without_the_package_the_reason_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_the_reason_is_said(monkeypatch):
     def gone(name: str) -> object:
         raise ModuleNotFoundError("no", name=name)
 

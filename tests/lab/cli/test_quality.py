@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
@@ -30,9 +28,9 @@ FRAMES = 14
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(tmp_path_factory):
     path = tmp_path_factory.mktemp("bundle") / "small.safetensors"
-    settings: OneFixerSettings = small_settings("holes=noise", "window=3")
+    settings = small_settings("holes=noise", "window=3")
     parts = {
         "dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3),
         "vae": TinyVAE.random(seed=3).state_dict(),
@@ -43,16 +41,14 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     root = tmp_path_factory.mktemp("pairs")
     for name in ("a", "b"):
         make(root, "test-known", name, frames=FRAMES)
     return root
 
 
-def test_a_table_a_document_charts_and_pictures(
-    data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_a_document_charts_and_pictures(data, bundle, tmp_path, capsys):
     out = tmp_path / "out"
     command = [
         "bench",
@@ -99,7 +95,7 @@ def test_a_table_a_document_charts_and_pictures(
     assert table.count("| identity |") == 2
 
 
-def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
+def test_finished_clips_are_kept_until_something_differs(data, tmp_path):
     variant = parse_variants("identity", [])[0]
     work = Work(
         data / "test-known" / "b",
@@ -133,7 +129,7 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
         assert json.loads(work.row_file.read_text())["key"] != key
 
 
-def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
+def test_labels_overrides_and_bundles_are_told_apart(bundle):
     variants = parse_variants(
         f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"]
     )
@@ -158,14 +154,12 @@ def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
         ("identity", ["window=3"], "not a key of the fixer"),
     ],
 )
-def test_variants_that_cannot_be_are_refused(text: str, overrides: list[str], words: str) -> None:
+def test_variants_that_cannot_be_are_refused(text, overrides, words):
     with pytest.raises(InputError, match=words):
         parse_variants(text, overrides)
 
 
-def test_unknown_baseline_is_refused(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_baseline_is_refused(data, tmp_path, capsys):
     assert (
         run_command(["bench", "quality", str(data), "--fixer", "identity", "--out", str(tmp_path)])
         == 2
@@ -188,7 +182,7 @@ def row(variant: str, clip: str, psnr: float, frames: int = 200) -> dict[str, ob
     }
 
 
-def test_intervals_are_over_clips_and_pairs_are_sharper() -> None:
+def test_intervals_are_over_clips_and_pairs_are_sharper():
     rows = [row("3dgs", c, p) for c, p in zip("abcd", (20, 22, 24, 30), strict=True)]
     rows += [row("f", c, p) for c, p in zip("abcd", (21.0, 23.1, 25.0, 31.1), strict=True)]
     found = summarise(rows, "3dgs")
@@ -202,7 +196,7 @@ def test_intervals_are_over_clips_and_pairs_are_sharper() -> None:
         summarise(rows, "x")
 
 
-def test_drift_holds_the_end_against_frames_50_to_100() -> None:
+def test_drift_holds_the_end_against_frames_50_to_100():
     black = np.zeros((150, 16, 16, 3), dtype=np.uint8)
     made = black + np.uint8(1)
     made[100:] = 2

@@ -32,7 +32,7 @@ environment: {buildings: 0, trees_per_100m: 0, poles_spacing_m: 0}
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     root = tmp_path_factory.mktemp("pairs")
     for split in ("train", "val"):
         make(root, split, "a", frames=13, height=96, width=160)
@@ -40,7 +40,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(tmp_path_factory):
     path = tmp_path_factory.mktemp("bundle") / "small.safetensors"
     settings = small_settings()
     parts = {
@@ -60,7 +60,7 @@ def run_train(
     return json.loads(out), err
 
 
-def test_scenes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_are_listed(tmp_path, capsys):
     document, err = run_train(
         capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2
     )
@@ -72,9 +72,7 @@ def test_scenes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert document["paths"][0] in err
 
 
-def test_pairs_made_and_kept_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pairs_made_and_kept_are_counted(tmp_path, capsys):
     (tmp_path / "scenes" / "val").mkdir(parents=True)
     (tmp_path / "scenes" / "val" / "mine.yaml").write_text(BARE)
     command = (
@@ -92,9 +90,7 @@ def test_pairs_made_and_kept_are_counted(
     assert Path(first["rows"][0]["folder"], "sequence.json").is_file()
 
 
-def test_weights_come_with_digest_updates_and_time(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_come_with_digest_updates_and_time(data, tmp_path, capsys):
     document, err = run_train(
         capsys, "fixer", data, "--recipe", "vae", "--out", tmp_path, "--steps", 1
     )
@@ -112,7 +108,7 @@ def test_weights_come_with_digest_updates_and_time(
     assert f"wrote {weights}" in err.replace("\n", "")
 
 
-def test_a_file_without_an_autoencoder_is_refused(bundle: Path, tmp_path: Path) -> None:
+def test_a_file_without_an_autoencoder_is_refused(bundle, tmp_path):
     assert load_tiny_vae(bundle).sizes == TinyVAE.random().sizes
     path = tmp_path / "other.safetensors"
     settings = small_settings()
@@ -126,9 +122,7 @@ def test_a_file_without_an_autoencoder_is_refused(bundle: Path, tmp_path: Path) 
         load_tiny_vae(path)
 
 
-def test_errors_are_documents_and_tracebacks_are_shown_on_request(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path, capsys):
     assert (
         run_command(
             [
@@ -153,9 +147,7 @@ def test_errors_are_documents_and_tracebacks_are_shown_on_request(
         assert run_command(command) == 2
 
 
-def test_scenes_of_any_name_are_in_order_of_their_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scenes_of_any_name_are_in_order_of_their_numbers(tmp_path, capsys):
     (tmp_path / "train").mkdir()
     for name in ("street_001", "bend_000", "foo", "bend_001"):
         (tmp_path / "train" / f"{name}.yaml").write_text("version: 1\nroda: {}\n")
@@ -169,9 +161,7 @@ def test_scenes_of_any_name_are_in_order_of_their_numbers(
     assert "roda" in capsys.readouterr().err
 
 
-def test_a_policys_card_says_what_made_it_and_how_well_it_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_policys_card_says_what_made_it_and_how_well_it_does(tmp_path, capsys):
     for split in ("train", "val"):
         folder = tmp_path / "scenes" / split
         folder.mkdir(parents=True)

@@ -38,14 +38,12 @@ FEW = [
 
 
 @pytest.fixture
-def pairs(tmp_path: Path) -> Path:
+def pairs(tmp_path):
     make(tmp_path / "pairs", name="street_000", frames=6)
     return tmp_path / "pairs"
 
 
-def test_pairs_become_a_bundle_with_its_card(
-    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pairs_become_a_bundle_with_its_card(pairs, tmp_path, capsys):
     out = tmp_path / "run"
     command = [
         "train",
@@ -90,12 +88,12 @@ def test_pairs_become_a_bundle_with_its_card(
     ],
 )
 def test_what_cannot_be_trained_is_refused(
-    pairs: Path,
-    tmp_path: Path,
-    options: list[str],
-    mention: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    pairs,
+    tmp_path,
+    options,
+    mention,
+    capsys,
+):
     sizes = [] if "--fixer" in options else SIZES
     assert (
         run_command(

@@ -5,7 +5,6 @@ all of them.
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,16 +15,16 @@ from tests.docs.test_commands import needing_the_checkout, not_understood
 
 
 @pytest.fixture
-def everywhere(repo: Path) -> list[Path]:
+def everywhere(repo):
     return [repo / "CHANGELOG.md", *pages(repo), *lab_pages(repo)]
 
 
-def test_links_to_and_from_the_pages_resolve(repo: Path, everywhere: list[Path]) -> None:
+def test_links_to_and_from_the_pages_resolve(repo, everywhere):
     assert core.broken_links(repo, everywhere, to_lab=True) == []
     assert core.broken_links(repo, lab_pages(repo), to_lab=False) == []
 
 
-def test_pages_that_code_and_pages_name_exist(repo: Path, everywhere: list[Path]) -> None:
+def test_pages_that_code_and_pages_name_exist(repo, everywhere):
     folders = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "tests", "docs")
     code = [
         path
@@ -45,19 +44,19 @@ def test_pages_that_code_and_pages_name_exist(repo: Path, everywhere: list[Path]
     ] == []
 
 
-def test_pages_are_reachable_and_their_pictures_shown(repo: Path) -> None:
+def test_pages_are_reachable_and_their_pictures_shown(repo):
     assert [
         page.name for page in lab_pages(repo) if page not in core.reachable(repo / "docs")
     ] == []
     assert core.unshown(repo / LAB, lab_pages(repo)) == []
 
 
-def test_files_and_modules_that_pages_name_exist(repo: Path, everywhere: list[Path]) -> None:
+def test_files_and_modules_that_pages_name_exist(repo, everywhere):
     assert core.files_not_there(repo, everywhere) == []
     assert core.imports_of_nothing(repo, everywhere) == []
 
 
-def test_every_command_is_understood_and_needs_no_checkout(repo: Path) -> None:
+def test_every_command_is_understood_and_needs_no_checkout(repo):
     every = commands(repo, [*pages(repo), *lab_pages(repo)])
     every = [one for one in every if "docs/experiments" not in one.page]  # of an older commit
     assert not_understood([one for one in every if one.is_of_lab or one.page.startswith(LAB)]) == []
@@ -65,7 +64,7 @@ def test_every_command_is_understood_and_needs_no_checkout(repo: Path) -> None:
     assert needing_the_checkout(lab_pages(repo)) == []
 
 
-def test_every_verb_of_the_laboratory_is_there_and_on_a_page(repo: Path) -> None:
+def test_every_verb_of_the_laboratory_is_there_and_on_a_page(repo):
     text = "\n".join(page.read_text(encoding="utf-8") for page in lab_pages(repo))
     assert {verb for verb, where in verbs().items() if ".lab." in where} == set(LAB_VERBS)
     assert [verb for verb in LAB_VERBS if not re.search(rf"simrun {verb}\b", text)] == []

@@ -35,7 +35,7 @@ def shipped() -> Path:
     return Path(str(fixer_settings("onefixer", []).weights.bundle))  # type: ignore[attr-defined]
 
 
-def test_a_gain_is_accepted_where_chance_does_not_explain_it() -> None:
+def test_a_gain_is_accepted_where_chance_does_not_explain_it():
     before = np.linspace(20, 25, 8)
     assert compared(before, before + np.linspace(0.1, 0.3, 8)).accepted
     assert not compared(before, before + np.array([0.5, -0.5] * 4)).accepted
@@ -44,16 +44,14 @@ def test_a_gain_is_accepted_where_chance_does_not_explain_it() -> None:
 
 
 def test_a_drive_without_enough_photographs_is_refused_and_nothing_is_written(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     with pytest.raises(InputError):
         adapt(drive(tmp_path, 7), shipped(), tmp_path / "new.safetensors", updates=1, distance=None)
     assert not (tmp_path / "new.safetensors").exists()
 
 
-def test_the_command_trains_judges_and_keeps_what_there_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_trains_judges_and_keeps_what_there_was(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "load_scenario", lambda _: drive(tmp_path, 20))
     out = tmp_path / "new.safetensors"
     assert (

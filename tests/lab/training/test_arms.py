@@ -67,7 +67,7 @@ def deployed(path: Path, steps: int = 1) -> OneFixer:
 
 
 @pytest.fixture(scope="module")
-def student(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def student(data, tmp_path_factory):
     return train_fixer(
         run_of(data, recipe_of("omnidreams")), tmp_path_factory.mktemp("arms") / "student"
     )
@@ -85,7 +85,7 @@ QUICK = (
         for r in CAUSAL_ARMS
     ],
 )
-def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+def test_an_arm_trains_resumes_and_drives(data, tmp_path, recipe):
     run = run_of(data, recipe)
     whole = train_fixer(run, tmp_path / "whole")
     last = recipe.stages[-1].updates(STEPS)
@@ -110,7 +110,7 @@ def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Re
     assert deployed(whole, steps=4).label.startswith(f"{recipe.fixer}@4")
 
 
-def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) -> None:
+def test_the_bundle_carries_what_the_network_sees(data, tmp_path):
     recipe = replace(
         recipe_of("artifixer-pre"),
         stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),),
@@ -128,8 +128,8 @@ def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(
-    data: Path, student: Path, tmp_path: Path
-) -> None:
+    data, student, tmp_path
+):
     recipe = recipe_of("self-forcing")
     run = run_of(data, recipe, student=student, teacher=student)
     assert [stage.name for stage in run.stages()] == ["dmd"]
@@ -160,9 +160,7 @@ def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_
         train_fixer(run_of(data, recipe, student=student, teacher=less), tmp_path / "run")
 
 
-def test_a_head_that_no_longer_teaches_stops_its_run(
-    data: Path, student: Path, tmp_path: Path
-) -> None:
+def test_a_head_that_no_longer_teaches_stops_its_run(data, student, tmp_path):
     recipe = recipe_of("one-forcing")
     strict = replace(
         recipe.stages[-1], objective=Distillation(adversarial=AdversarialTerm(most=0.0))
@@ -178,12 +176,12 @@ def test_a_head_that_no_longer_teaches_stops_its_run(
 
 
 @pytest.mark.parametrize("name", [recipe.name for recipe in CAUSAL_ARMS])
-def test_without_weights_an_arm_says_what_trains_it(name: str) -> None:
+def test_without_weights_an_arm_says_what_trains_it(name):
     with pytest.raises(InputError, match=f"simrun train fixer .* --recipe {name}"):
         load_networks(arm_settings(name))
 
 
-def test_objectives_can_be_changed_by_field() -> None:
+def test_objectives_can_be_changed_by_field():
     four = with_objective(
         recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"]
     )
@@ -201,7 +199,7 @@ def test_objectives_can_be_changed_by_field() -> None:
         with_objective(recipe_of("self-forcing"), ["steps=many"])
 
 
-def test_recipes_that_do_not_fit_together_are_refused() -> None:
+def test_recipes_that_do_not_fit_together_are_refused():
     stage = recipe_of("omnidreams").stages[0]
     with pytest.raises(InputError):
         Recipe("odd", "", (replace(stage, start={"dit": "nowhere.dit"}),))

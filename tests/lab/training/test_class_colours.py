@@ -30,7 +30,7 @@ def drawn(label: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_augmented_cars_have_the_colours_of_the_other_class(kind: str) -> None:
+def test_augmented_cars_have_the_colours_of_the_other_class(kind):
     car, wanted = drawn("car"), drawn(LABELS[kind])
     made = swap_class_colours(car, kind)
     differs = (car != wanted).any(axis=-1)
@@ -42,7 +42,7 @@ def test_augmented_cars_have_the_colours_of_the_other_class(kind: str) -> None:
     np.testing.assert_array_equal(made[~differs], car[~differs])
 
 
-def test_a_map_without_cars_stays_as_it_is() -> None:
+def test_a_map_without_cars_stays_as_it_is():
     people = drawn("person")
     np.testing.assert_array_equal(swap_class_colours(people, "truck"), people)
     black = np.zeros((2, 4, 4, 3), np.uint8)
@@ -51,12 +51,12 @@ def test_a_map_without_cars_stays_as_it_is() -> None:
 
 @pytest.mark.parametrize("paint", COLOURS)
 @pytest.mark.parametrize("kind", OTHERS)
-def test_paint_of_every_colour_and_darkness_stays(paint: str, kind: str) -> None:
+def test_paint_of_every_colour_and_darkness_stays(paint, kind):
     shares = np.linspace(0.1, 1.0, 64)[None, :, None]
     faded = np.rint(shares * np.array(COLOURS[paint])).astype(np.uint8)
     np.testing.assert_array_equal(swap_class_colours(faded, kind), faded)
 
 
-def test_an_unknown_class_is_refused() -> None:
+def test_an_unknown_class_is_refused():
     with pytest.raises(InputError):
         swap_class_colours(drawn("car"), "tram")

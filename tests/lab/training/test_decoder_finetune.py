@@ -28,7 +28,7 @@ RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
 
 
 @pytest.fixture(scope="module")
-def bundle(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(data, tmp_path_factory):
     return train_fixer(
         run_of(data, "V9"), tmp_path_factory.mktemp("run") / "v9", ("brightness", brightness)
     )
@@ -45,9 +45,7 @@ def net_of(bundle: Path) -> CosmosCausalDiT:
     )
 
 
-def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(
-    data: Path, bundle: Path, tmp_path: Path
-) -> None:
+def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data, bundle, tmp_path):
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
     rollouts = Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
     assert len(rollouts) == len(clips)
@@ -66,9 +64,7 @@ def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(
     )
 
 
-def test_only_the_decoder_learns_and_pictures_get_nearer(
-    data: Path, bundle: Path, tmp_path: Path
-) -> None:
+def test_only_the_decoder_learns_and_pictures_get_nearer(data, bundle, tmp_path):
     schedule = Schedule(30, peak_lr=5e-3, warmup=3, ema=0.5, save_every=10)
     path = finetune_decoder(
         bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness)
@@ -93,9 +89,7 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(
     assert pixels(run_blocks(session, frames, maps_of(frames))).shape[0] == 13
 
 
-def test_batches_are_functions_of_their_number_and_crops_fit(
-    data: Path, bundle: Path, tmp_path: Path
-) -> None:
+def test_batches_are_functions_of_their_number_and_crops_fit(data, bundle, tmp_path):
     rollouts = Rollouts(
         clips_of(data, tmp_path / "z"),
         vae_of(bundle),
@@ -122,7 +116,7 @@ def test_batches_are_functions_of_their_number_and_crops_fit(
         )
 
 
-def test_a_fixer_without_history_is_refused(data: Path, tmp_path: Path) -> None:
+def test_a_fixer_without_history_is_refused(data, tmp_path):
     image = train_fixer(run_of(data, "image"), tmp_path / "image", ("brightness", brightness))
     with pytest.raises(InputError):
         finetune_decoder(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))

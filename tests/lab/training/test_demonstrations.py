@@ -4,8 +4,6 @@ learn from.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -41,13 +39,13 @@ def scenario():
 
 
 @pytest.fixture(scope="module")
-def root(scenario, tmp_path_factory) -> Path:
+def root(scenario, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demonstrations")
     assert write_demonstrations(scenario, folder / "train" / "lead_000", QUICK, 0)
     return folder
 
 
-def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root: Path) -> None:
+def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
     folder = root / "train" / "lead_000"
     before = (folder / "frames.npy").stat().st_mtime_ns
     assert not write_demonstrations(scenario, folder, QUICK, 0)
@@ -60,7 +58,7 @@ def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root: P
     assert not np.array_equal(Demonstrations(other).arrays["yaw"], first.arrays["yaw"])
 
 
-def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
+def test_sample_has_a_frame_a_state_and_a_target(root):
     (demonstrations,) = read_demonstrations(root, "train")
     a = demonstrations.arrays
     assert len(demonstrations) == len(a["frame"]) == 3 * len(a["frames"]) == 12
@@ -77,7 +75,7 @@ def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
     assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
 
 
-def test_missing_and_damaged_demonstrations_are_named(root: Path, tmp_path: Path) -> None:
+def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):
     with pytest.raises(InputError):
         read_demonstrations(root, "val")
     broken = tmp_path / "train" / "a"
@@ -90,7 +88,7 @@ def test_missing_and_damaged_demonstrations_are_named(root: Path, tmp_path: Path
         _ = read_demonstrations(tmp_path, "train")[0].arrays
 
 
-def test_turning_leaves_the_camera_where_it_is(scenario) -> None:
+def test_turning_leaves_the_camera_where_it_is(scenario):
     camera = wide_camera(scenario.cameras[0])
     T = np.array([[0.6, -0.8, 0, 5], [0.8, 0.6, 0, 7], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     after = rotated_about_camera(T, camera, 0.1)
@@ -100,7 +98,7 @@ def test_turning_leaves_the_camera_where_it_is(scenario) -> None:
     assert yaw_of(after) - yaw_of(T) == pytest.approx(0.1)
 
 
-def test_every_turn_of_a_junction_has_a_rollout() -> None:
+def test_every_turn_of_a_junction_has_a_rollout():
     scenario = load_scenario("urban/junction_straight", overrides=BARE)
     lines = turning_lines(scenario)
     bends = sorted(round(float(np.degrees(path.yaw[-1] - path.yaw[0]))) for path, _ in lines)
@@ -113,7 +111,7 @@ def test_every_turn_of_a_junction_has_a_rollout() -> None:
     assert sorted(np.round(turned_by)) == [-90, 0, 90]
 
 
-def test_drives_leave_the_path_and_meet_others(scenario) -> None:
+def test_drives_leave_the_path_and_meet_others(scenario):
     drives = list(perturbed_rollouts(scenario, 12, 3.0, 0))
     lateral = np.array(
         [d.line.path.project(m.T_world_rig[None, :2, 3])[1][0] for d in drives for m in d.states]
@@ -126,9 +124,7 @@ def test_drives_leave_the_path_and_meet_others(scenario) -> None:
 
 
 @pytest.mark.slow
-def test_batches_depend_on_their_number_alone_and_can_be_learned(
-    root: Path, tmp_path: Path
-) -> None:
+def test_batches_depend_on_their_number_alone_and_can_be_learned(root, tmp_path):
     torch.set_num_threads(1)
     task = PolicyTask(
         LearnedNet(0),
@@ -149,7 +145,7 @@ def test_batches_depend_on_their_number_alone_and_can_be_learned(
     assert after["speed_mps"] < 0.8 * before["speed_mps"]
 
 
-def test_sigma_sends_no_gradient_into_the_plan(root: Path) -> None:
+def test_sigma_sends_no_gradient_into_the_plan(root):
     """The likelihood term must train sigma alone."""
 
     def gradients(sigma: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -39,7 +39,7 @@ def noise(name: str, *shape: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def net() -> CosmosCausalDiT:
+def net():
     sizes = DiTSizes(
         width=24, blocks=2, head_width=12, mlp_width=32, adaln_rank=4, text_width=8, context_width=8
     )
@@ -73,8 +73,8 @@ def divergence(a: Gaussian, b: Gaussian, sigma: float) -> float:
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 0.9])
 def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the_teacher(
-    sigma: float,
-) -> None:
+    sigma,
+):
     """With z = mean + std a, the gradient of KL to the mean is E[(score_F - score_R)(1 - sigma)],
     score = ((1-sigma) x0 - x) / sigma^2.
     """
@@ -98,7 +98,7 @@ def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the
     assert float(mean.grad) == pytest.approx(float(g.mean()), rel=1e-9)
 
 
-def test_scaling_latents_and_predictions_leaves_the_direction() -> None:
+def test_scaling_latents_and_predictions_leaves_the_direction():
     z = noise("z", 3, 2, 4, 2, 2).double()
     n = noise("n", 3, 2, 4, 2, 2).double()
     sigma = score_levels(torch.tensor([0.1, 0.5, 0.9])).double()
@@ -119,10 +119,8 @@ def test_scaling_latents_and_predictions_leaves_the_direction() -> None:
     )
 
 
-def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student() -> (
-    None
-):
-    seen: list[Tensor] = []
+def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student():
+    seen = []
 
     def score(x: Tensor, sigma: Tensor) -> Tensor:
         seen.append(x)
@@ -142,7 +140,7 @@ def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradien
     assert weight.grad is not None
 
 
-def test_levels_of_the_scores_are_the_tables_and_bounded() -> None:
+def test_levels_of_the_scores_are_the_tables_and_bounded():
     levels = score_levels(torch.tensor([0.0, 0.0015, 0.5004, 0.9999]))
     torch.testing.assert_close(
         levels, torch.tensor([0.02, 0.02, 5 * 0.5 / 3, 0.98]), atol=1e-6, rtol=0
@@ -150,9 +148,7 @@ def test_levels_of_the_scores_are_the_tables_and_bounded() -> None:
 
 
 @pytest.mark.parametrize(("history", "crosses"), [("finalise", False), ("last-forward", True)])
-def test_gradients_cross_blocks_where_the_history_is_the_last_forward(
-    net: CosmosCausalDiT, history: str, crosses: bool
-) -> None:
+def test_gradients_cross_blocks_where_the_history_is_the_last_forward(net, history, crosses):
     z_1 = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True)
     second = noise("second", 1, 16, N, 4, 4)
     made = causal_rollout(
@@ -181,8 +177,8 @@ def test_gradients_cross_blocks_where_the_history_is_the_last_forward(
 
 
 def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deployed_ones(
-    net: CosmosCausalDiT,
-) -> None:
+    net,
+):
     z_1, context = (
         noise("z_1", 1, 16, N, 4, 4).requires_grad_(True),
         noise("context", 1, 16, N, 4, 4),
@@ -196,8 +192,8 @@ def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deploy
 
 
 def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(
-    net: CosmosCausalDiT,
-) -> None:
+    net,
+):
     term = AdversarialTerm(heads=2, inner=8)
     head, score = AdversarialHead(24, 1, 2, 8, seed=0), ScoreNet(net, TEXT, term.taps)
     x = noise("x", 2, 16, N, 4, 4).requires_grad_(True)
@@ -230,7 +226,7 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     assert head(score.features).shape == (2,)
 
 
-def test_the_tail_drop_shows_forty_five_percent_on_average() -> None:
+def test_the_tail_drop_shows_forty_five_percent_on_average():
     assert visible_share(TailDrop(), 93, 20_000) == pytest.approx(0.45, abs=0.01)
     ones = torch.ones(64, 16, 6, 2, 2)
     sample = Sample(
@@ -252,7 +248,7 @@ def test_the_tail_drop_shows_forty_five_percent_on_average() -> None:
     assert (hidden.condition[:, :16] == 1).all(), "the map stays"
 
 
-def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one() -> None:
+def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one():
     t = torch.from_numpy(stream("dmd", 0, "t").random((3, 8))).float()
     z = torch.zeros(3, 16, 8, 2, 2)
     sample = Sample(z, z, z, z[:, :1], z, z, t, t, 0)

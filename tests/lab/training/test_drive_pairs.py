@@ -4,8 +4,6 @@ is kept.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,7 @@ from alpasim_plugin.lab.training.reference_store import open_references
 from tests.renderers.recorded_drive import recorded_drive
 
 
-def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_path: Path) -> None:
+def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_path):
     drive = recorded_drive(tmp_path)
     xyz = np.random.default_rng(0).uniform((2, -5, 0), (40, 5, 0.1), (400, 3))
     write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
@@ -30,7 +28,7 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
         "street_front_2",
     ]
     taken = {one.t_us for one in drive.recording if one.camera == "front"}
-    shown: list[int] = []
+    shown = []
     for one in made:
         sequence = PairSequence(one.folder)
         references = open_references(sequence)
@@ -46,7 +44,7 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
     )
 
 
-def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
+def test_too_few_photographs_are_refused(tmp_path):
     write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
     with pytest.raises(InputError):
         list(

@@ -37,7 +37,7 @@ K = [[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> PairSequence:
+def sequence(tmp_path_factory):
     """Give a sequence with three recorded frames; a wall stands 10 m ahead."""
     folder = tmp_path_factory.mktemp("references") / "train" / "a"
     wall = np.full((HEIGHT, WIDTH), 10, np.float16)
@@ -84,14 +84,14 @@ def shown(
     return pair_references(sequence, draw, INDEX, rows, columns)
 
 
-def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence: PairSequence) -> None:
+def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence):
     rows, columns = slice(8, 24), slice(16, 48)
     whole, part = shown(sequence, EXACT), shown(sequence, EXACT, rows, columns)
     assert part.shape == (3, SLOTS, 16, 32, 4)
     assert np.abs(whole[:, :, rows, columns].astype(int) - part).max() <= 1
 
 
-def test_road_users_are_where_their_boxes_are(tmp_path: Path) -> None:
+def test_road_users_are_where_their_boxes_are(tmp_path):
     """A car of 4 x 2 x 1.5 m stands 10 m ahead of the camera in the first frame alone."""
     wall, T_world_box = np.full((HEIGHT, WIDTH), 10, np.float16), np.eye(4)
     T_world_box[2, 3] = 10.0
@@ -133,9 +133,7 @@ def test_road_users_are_where_their_boxes_are(tmp_path: Path) -> None:
     assert not without.any()
 
 
-def test_as_many_references_as_drawn_and_none_without_a_recording(
-    sequence: PairSequence, tmp_path: Path
-) -> None:
+def test_as_many_references_as_drawn_and_none_without_a_recording(sequence, tmp_path):
     for count in range(SLOTS + 1):
         there = shown(sequence, replace(EXACT, count=count)).any(axis=(0, 2, 3, 4))
         assert there.tolist() == [True] * count + [False] * (SLOTS - count)
@@ -143,8 +141,8 @@ def test_as_many_references_as_drawn_and_none_without_a_recording(
 
 
 def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_else(
-    sequence: PairSequence,
-) -> None:
+    sequence,
+):
     exact = shown(sequence, EXACT)[:, 0]
     errors = np.zeros((SLOTS, 6))
     errors[0, 0] = 0.5
@@ -156,7 +154,7 @@ def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_
         assert not np.array_equal(shown(sequence, other)[:, 0], exact)
 
 
-def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path: Path) -> None:
+def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path):
     x, y = np.meshgrid(np.arange(96), np.arange(64))
     smooth = (127 + 100 * np.sin(x / 7) * np.cos(y / 5)).astype(np.uint8)
     still = pair(3, 64, 96)._replace(rgb_gt=np.stack([smooth] * 3, axis=-1))
@@ -173,7 +171,7 @@ def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path: Path)
     assert not all(same)  # most flows are bent
 
 
-def test_errors_of_the_map_do_what_their_names_say() -> None:
+def test_errors_of_the_map_do_what_their_names_say():
     sdmap = np.zeros((1, 20, 30, 3), np.uint8)
     sdmap[:, 10, :] = COLOURS["line_white"]
     sdmap[:, 12, :] = (np.array(COLOURS["line_yellow"]) * 0.3).astype(np.uint8)  # far away

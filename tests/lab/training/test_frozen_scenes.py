@@ -23,7 +23,7 @@ def freeze(scenes: Path, record: Path) -> None:
 
 
 @pytest.fixture
-def scenes(tmp_path: Path) -> Path:
+def scenes(tmp_path):
     for split in TEST_SPLITS:
         (tmp_path / "scenes" / split).mkdir(parents=True)
         for name in ("a", "b"):
@@ -31,16 +31,14 @@ def scenes(tmp_path: Path) -> Path:
     return tmp_path / "scenes"
 
 
-def test_frozen_scenes_pass_their_check(scenes: Path, tmp_path: Path) -> None:
+def test_frozen_scenes_pass_their_check(scenes, tmp_path):
     record = tmp_path / "record.json"
     freeze(scenes, record)
     checked = check_scenes(scenes, record)
     assert len({split.sha256 for split in checked.values()}) == len(TEST_SPLITS)
 
 
-def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(
-    scenes: Path, tmp_path: Path
-) -> None:
+def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(scenes, tmp_path):
     record, one = tmp_path / "record.json", scenes / TEST_SPLITS[1] / "b.yaml"
     freeze(scenes, record)
     before = one.read_text()
@@ -56,14 +54,14 @@ def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(
         check_scenes(scenes, record)
 
 
-def test_a_record_that_cannot_be_read_is_said(scenes: Path, tmp_path: Path) -> None:
+def test_a_record_that_cannot_be_read_is_said(scenes, tmp_path):
     for text in ("{", '{"test-known": {"sha256": "x"}}', "[1]"):
         (tmp_path / "record.json").write_text(text)
         with pytest.raises(InputError):
             check_scenes(scenes, tmp_path / "record.json")
 
 
-def test_first_scene_of_each_split_is_drawn_as_it_was_frozen(tmp_path: Path) -> None:
+def test_first_scene_of_each_split_is_drawn_as_it_was_frozen(tmp_path):
     known = json.loads(RECORD.read_text())
     for split in TEST_SPLITS:
         assert len(known[split]["scenes"]) == SPLITS[split].count
@@ -71,12 +69,12 @@ def test_first_scene_of_each_split_is_drawn_as_it_was_frozen(tmp_path: Path) -> 
         assert hash_scenes(path.parent).scenes[path.stem] == known[split]["scenes"][path.stem]
 
 
-def test_other_scenes_than_the_shipped_ones_are_refused(scenes: Path) -> None:
+def test_other_scenes_than_the_shipped_ones_are_refused(scenes):
     assert run_command(["train", "scenes", "--out", str(scenes), "--check"]) != 0
 
 
 @pytest.mark.slow
-def test_all_test_scenes_are_drawn_as_they_were_frozen(tmp_path: Path) -> None:
+def test_all_test_scenes_are_drawn_as_they_were_frozen(tmp_path):
     for split in TEST_SPLITS:
         list(write_scenes(tmp_path, split, SPLITS[split].count, SPLITS[split].duration_s))
     check_scenes(tmp_path)

@@ -50,7 +50,7 @@ def brightness(a: Tensor, b: Tensor) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     root = tmp_path_factory.mktemp("pairs")
     make(root, name="a", frames=21)
     make(root, name="b", frames=14)
@@ -91,9 +91,7 @@ def clips_of(data: Path, folder: Path) -> LatentClips:
     )
 
 
-def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(
-    data: Path, tmp_path: Path
-) -> None:
+def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(data, tmp_path):
     clips = clips_of(data, tmp_path)
     assert len(clips) == 2 * (2 + 1)  # starts 0 and 7 of 21 frames, 0 of 14; each mirrored as well
     clip = clips[3]
@@ -116,7 +114,7 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")} == times
 
 
-def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: Path) -> None:
+def test_other_pairs_under_the_same_name_are_encoded_anew(data, tmp_path):
     (tmp_path / "vae.safetensors").write_bytes((data / "vae.safetensors").read_bytes())
     old = make(tmp_path, name="a", frames=21)
     before = clips_of(tmp_path, tmp_path / "z")
@@ -128,7 +126,7 @@ def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: 
     assert not torch.equal(after[0].z_r, before[0].z_r)
 
 
-def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_path: Path) -> None:
+def test_sequences_that_make_no_clips_or_no_batch_are_refused(data, tmp_path):
     make(tmp_path, name="short", frames=9)
     with pytest.raises(InputError):
         LatentClips(
@@ -151,8 +149,8 @@ def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_pa
 
 
 def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(
-    data: Path, tmp_path: Path
-) -> None:
+    data, tmp_path
+):
     run = run_of(data, "base")
     alone = train_fixer(run, tmp_path / "alone", ("brightness", brightness))
     make(tmp_path / "mixed", name="a", frames=21)
@@ -181,7 +179,7 @@ QUICK = ("base", "V5", "V8")  # the branches that V9, which is trained below, do
     "name",
     [r.name if r.name in QUICK else pytest.param(r.name, marks=pytest.mark.slow) for r in ABLATION],
 )
-def test_every_row_trains_by_one_function(data: Path, tmp_path: Path, name: str) -> None:
+def test_every_row_trains_by_one_function(data, tmp_path, name):
     steps = 3 if name == "V7" else 2  # the last of three is its perceptual term's
     run = run_of(data, name, steps=steps)
     path = train_fixer(run, tmp_path / "run", ("brightness", brightness))
@@ -201,7 +199,7 @@ def test_every_row_trains_by_one_function(data: Path, tmp_path: Path, name: str)
     )
 
 
-def test_v7_gives_five_eighths_of_its_updates_to_flow_matching() -> None:
+def test_v7_gives_five_eighths_of_its_updates_to_flow_matching():
     objective = recipe_of("V7").stages[0].objective
     kinds = [objective.at(update, 400) for update in range(400)]
     assert [sum(k.flow == "own" for k in kinds), sum(k.flow is None for k in kinds)] == [250, 150]
@@ -214,9 +212,7 @@ def test_v7_gives_five_eighths_of_its_updates_to_flow_matching() -> None:
     ("variant", "extra"),
     [("V9", "history=finalise"), pytest.param("image", "history=none", marks=pytest.mark.slow)],
 )
-def test_trained_weights_serve_the_streaming_fixer(
-    data: Path, tmp_path: Path, variant: str, extra: str
-) -> None:
+def test_trained_weights_serve_the_streaming_fixer(data, tmp_path, variant, extra):
     path = train_fixer(run_of(data, variant), tmp_path / "run", ("brightness", brightness))
     blocks = "block_latents=1" if variant == "image" else "block_latents=2"
     settings = small_settings("window=4", "holes=noise", extra, blocks, f"weights.bundle={path}")
@@ -228,9 +224,7 @@ def test_trained_weights_serve_the_streaming_fixer(
     assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
 
 
-def test_a_generator_from_noise_drives_with_the_render_as_its_condition(
-    data: Path, tmp_path: Path
-) -> None:
+def test_a_generator_from_noise_drives_with_the_render_as_its_condition(data, tmp_path):
     path = train_fixer(run_of(data, "V6"), tmp_path / "run", ("brightness", brightness))
     with pytest.raises(InputError):
         load_networks(
@@ -247,7 +241,7 @@ def test_a_generator_from_noise_drives_with_the_render_as_its_condition(
     assert (one != other).any()
 
 
-def test_a_black_map_is_encoded_in_training_and_on_the_road(data: Path, tmp_path: Path) -> None:
+def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     path = train_fixer(run_of(data, "V5"), tmp_path / "run", ("brightness", brightness))
     settings = fixer_settings(*bundle_fixer(path))
     assert (settings.uses_map, settings.no_map) == (False, "black")
@@ -275,9 +269,7 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data: Path, tmp_path
     assert (fixed != nothing).any()
 
 
-def test_without_history_a_frame_does_not_depend_on_those_before(
-    data: Path, tmp_path: Path
-) -> None:
+def test_without_history_a_frame_does_not_depend_on_those_before(data, tmp_path):
     path = train_fixer(run_of(data, "image"), tmp_path / "run", ("brightness", brightness))
     settings = small_settings(
         "window=4", "holes=noise", "history=none", "block_latents=1", f"weights.bundle={path}"
@@ -293,7 +285,7 @@ def test_without_history_a_frame_does_not_depend_on_those_before(
         small_settings("history=none")
 
 
-def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None:
+def test_draws_are_functions_of_their_number(data, tmp_path):
     run, clips = run_of(data, "V9"), clips_of(data, tmp_path)
     one, two = task_of(run, clips), task_of(run, clips)
     two.batch(0)
@@ -311,7 +303,7 @@ def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None
         task_of(run, clips, None)
 
 
-def test_a_widened_map_input_changes_nothing_at_first() -> None:
+def test_a_widened_map_input_changes_nothing_at_first():
     weights = initial_weights(DiTSizes(**small_settings().dit.model_dump()), 0, zero_velocity=True)
     wide = widen_map(weights, 32)
     narrow_net, wide_net = (CosmosCausalDiT.from_state_dict(w) for w in (weights, wide))

@@ -29,12 +29,12 @@ def pattern(period: int, size: float) -> Tensor:
     return (line[:, None] + line[None, :])[None, None, :, :, None]
 
 
-def test_the_truth_has_none() -> None:
+def test_the_truth_has_none():
     assert float(grid_term(picture(), picture())) == 0
 
 
 @pytest.mark.parametrize("period", [4, 16])
-def test_it_grows_with_a_pattern_of_a_cell(period: int) -> None:
+def test_it_grows_with_a_pattern_of_a_cell(period):
     truth = picture()
     found = [
         float(grid_term(truth + pattern(period, size), truth)) for size in (0.0, 0.005, 0.01, 0.02)
@@ -43,7 +43,7 @@ def test_it_grows_with_a_pattern_of_a_cell(period: int) -> None:
     assert found[-1] > 0.02
 
 
-def test_blur_noise_and_contrast_count_little() -> None:
+def test_blur_noise_and_contrast_count_little():
     truth = picture()
     marked = float(grid_term(truth + pattern(4, 0.02), truth))
     flat = truth.flatten(0, 1).permute(0, 3, 1, 2)
@@ -57,7 +57,7 @@ def test_blur_noise_and_contrast_count_little() -> None:
         assert float(grid_term(other, truth)) < 0.35 * marked
 
 
-def test_streams_count_one_by_one_and_a_flat_picture_is_finite() -> None:
+def test_streams_count_one_by_one_and_a_flat_picture_is_finite():
     truth = picture()
     made = truth + pattern(4, 0.02)
     alone = torch.stack([grid_term(made[b : b + 1], truth[b : b + 1]) for b in range(2)]).mean()

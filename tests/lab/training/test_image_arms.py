@@ -40,7 +40,7 @@ Train = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     root = tmp_path_factory.mktemp("pairs")
     make(root, name="a", frames=31)
     make(root, name="b", frames=26)
@@ -52,12 +52,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory):
     return tmp_path_factory.mktemp("runs")
 
 
 @pytest.fixture
-def train(data: Path, runs: Path) -> Train:
+def train(data, runs):
     """Return a function that trains a recipe for some updates by the command and returns its
     folder.
     """
@@ -89,7 +89,7 @@ def train(data: Path, runs: Path) -> Train:
 
 
 @pytest.fixture
-def trained(train: Train, runs: Path) -> Callable[[str], Path]:
+def trained(train, runs):
     """Return a function that gives a recipe's bundle, trained once."""
 
     def bundle(recipe: str) -> Path:
@@ -115,9 +115,7 @@ QUICK = (
     "recipe",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
 )
-def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(
-    data: Path, trained: Callable[[str], Path], recipe: str
-) -> None:
+def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(data, trained, recipe):
     path = trained(recipe)
     card = json.loads(path.with_suffix(".card.json").read_text())
     assert (card["training"]["recipe"], set(card["training"]["trained"])) in [
@@ -149,9 +147,7 @@ def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(
 @pytest.mark.parametrize(
     "recipe", ["harmonizer-temporal", pytest.param("gsfix3d", marks=pytest.mark.slow)]
 )
-def test_an_arm_resumes_bit_for_bit(
-    train: Train, trained: Callable[[str], Path], recipe: str
-) -> None:
+def test_an_arm_resumes_bit_for_bit(train, trained, recipe):
     more = ("--weights", f"harmonizer={trained('harmonizer')}") if "temporal" in recipe else ()
     train(recipe, 1, f"{recipe}-cut", *more)
     again = load_weights(train(recipe, 2, f"{recipe}-cut", *more) / "fixer.safetensors")
@@ -161,8 +157,8 @@ def test_an_arm_resumes_bit_for_bit(
 
 
 def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(
-    trained: Callable[[str], Path],
-) -> None:
+    trained,
+):
     path = trained("harmonizer")
     card = json.loads(path.with_suffix(".card.json").read_text())
     rows = [json.loads(line) for line in (path.parent / "log.jsonl").read_text().splitlines()]
@@ -174,7 +170,7 @@ def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both
     assert RenderStepLoss(weight=0.3, clamp=0.9, references="own").single == 0.5
 
 
-def test_what_an_arm_cannot_train_on_is_refused(train: Train) -> None:
+def test_what_an_arm_cannot_train_on_is_refused(train):
     with pytest.raises(InputError):
         train("difix", 1, "refused", "--block", "4")
     with pytest.raises(InputError):

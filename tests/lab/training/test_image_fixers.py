@@ -4,9 +4,8 @@ windows cover a clip.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,19 +30,19 @@ STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
+def one_thread():
     torch.set_num_threads(
         1
     )  # matrices this small are slower on several; tests/conftest.py sets the number back
 
 
 @pytest.fixture
-def settings_of(weights: Path) -> Callable[..., Settings]:
+def settings_of(weights):
     return lambda name, *overrides: busy_settings(weights, name, *overrides)
 
 
 @pytest.fixture
-def session(settings_of: Callable[..., Settings]) -> Callable[..., Fixer]:
+def session(settings_of):
     def make(name: str, *overrides: str, seed: int = 0) -> Fixer:
         return make_fixer(name, settings_of(name, *overrides), scene_id="scene", seed=seed)
 
@@ -65,11 +64,11 @@ def levels(a: np.ndarray, b: np.ndarray) -> int:
 @pytest.mark.parametrize("overrides", [(), ("decoder.kind=latent",)], ids=["render", "latent"])
 @pytest.mark.parametrize("name", STREAMED)
 def test_streaming_equals_the_whole_clip(
-    session: Callable[..., Fixer],
-    settings_of: Callable[..., Settings],
-    name: str,
-    overrides: tuple[str, ...],
-) -> None:
+    session,
+    settings_of,
+    name,
+    overrides,
+):
     frames = moving_picture(7, (16, 40))
     streamed = pixels(run(session(name, *overrides), frames))
     assert (
@@ -81,9 +80,7 @@ def test_streaming_equals_the_whole_clip(
 @pytest.mark.parametrize(
     ("count", "stitch"), [(7, "fade"), (25, "fade"), (45, "fade"), (45, "cut")]
 )
-def test_windows_equal_the_weighted_sum_over_the_whole_clip(
-    session: Callable[..., Fixer], settings_of: Callable[..., Settings], count: int, stitch: str
-) -> None:
+def test_windows_equal_the_weighted_sum_over_the_whole_clip(session, settings_of, count, stitch):
     frames = moving_picture(count, (16, 24))
     streamed = run(session("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames)
     assert [frame.t_us for frame in streamed] == [frame.t_us for frame in frames]
@@ -98,7 +95,7 @@ def test_windows_equal_the_weighted_sum_over_the_whole_clip(
 
 
 @pytest.mark.parametrize("frames", [1, 8, 25, 26, 42, 59, 60, 198, 900])
-def test_windows_cover_every_frame_and_their_weights_sum_to_one(frames: int) -> None:
+def test_windows_cover_every_frame_and_their_weights_sum_to_one(frames):
     parts = windows(frames, 25, 17)
     times = np.bincount([t for window in parts for t in window], minlength=frames)
     assert times.min() >= 1
@@ -112,9 +109,7 @@ def test_windows_cover_every_frame_and_their_weights_sum_to_one(frames: int) -> 
 
 
 @pytest.mark.parametrize("name", ["harmonizer-temporal", "gsfix3d"])
-def test_cameras_are_alike_alone_together_and_at_different_rates(
-    session: Callable[..., Fixer], name: str
-) -> None:
+def test_cameras_are_alike_alone_together_and_at_different_rates(session, name):
     left, right = (moving_picture(6, (16, 32), key=key, camera=key) for key in ("left", "right"))
     small = moving_picture(6, (16, 16), key="small", camera="small")
     alone = {clip[0].camera: pixels(run(session(name), clip)) for clip in (left, small)} | {
@@ -129,7 +124,7 @@ def test_cameras_are_alike_alone_together_and_at_different_rates(
     } == pytest.approx(dict.fromkeys(out, 0), abs=1)
 
 
-def test_noise_follows_seed_and_frame_unless_it_is_fixed(session: Callable[..., Fixer]) -> None:
+def test_noise_follows_seed_and_frame_unless_it_is_fixed(session):
     still = [replace(moving_picture(1, (16, 24))[0], t_us=i) for i in range(3)]
     fresh = pixels(run(session("gsfix3d"), still))
     assert levels(fresh[0], fresh[1]) > 1, "frames that are equal get noise of their own"
@@ -144,8 +139,8 @@ def test_noise_follows_seed_and_frame_unless_it_is_fixed(session: Callable[..., 
 
 
 def test_the_temporal_model_looks_at_four_outputs_and_no_further(
-    session: Callable[..., Fixer],
-) -> None:
+    session,
+):
     frames = moving_picture(7, (16, 24), holes=False)
     temporal, single = (
         pixels(run(session("harmonizer-temporal", f"references={n}"), frames)) for n in (4, 0)
@@ -169,8 +164,8 @@ class Spoilt(ImageFixer):
 
 
 def test_a_broken_frame_is_replaced_and_enters_the_references_as_it_was_shown(
-    settings_of: Callable[..., Settings],
-) -> None:
+    settings_of,
+):
     frames = moving_picture(8, (16, 24))
     fixer = Spoilt(settings_of("harmonizer-temporal"), "scene")
     out = run(fixer, frames)
@@ -182,7 +177,7 @@ def test_a_broken_frame_is_replaced_and_enters_the_references_as_it_was_shown(
     )
 
 
-def test_what_does_not_continue_a_rollout_is_refused(session: Callable[..., Fixer]) -> None:
+def test_what_does_not_continue_a_rollout_is_refused(session):
     frames = moving_picture(3, (16, 24))
     fixer = session("difix")
     fixer.step(frames[1:2], ())
@@ -198,7 +193,7 @@ def test_what_does_not_continue_a_rollout_is_refused(session: Callable[..., Fixe
     assert len(clip.step(frames, ())) == 3
 
 
-def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded() -> None:
+def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded():
     with pytest.raises(InputError):
         resolve_renderer("3dgs-enhancer")
     with pytest.raises(InputError):
@@ -207,7 +202,7 @@ def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded() -> Non
 
 
 @pytest.mark.parametrize("name", ["difix", "omnidreams@4", "onefixer-2b"])
-def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name: str) -> None:
+def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name):
     with pytest.raises(
         InputError,
     ):
@@ -216,7 +211,7 @@ def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name: st
         resolve_renderer(name, [f"weights.dit={__file__}"])
 
 
-def test_labels_blocks_and_refused_settings(session: Callable[..., Fixer]) -> None:
+def test_labels_blocks_and_refused_settings(session):
     assert session("gsfix3d").label == "gsfix3d@8, 3 updates"
     assert (session("difix").label, session("difix").blocks) == (
         "difix, 3 updates",
@@ -237,9 +232,7 @@ def test_labels_blocks_and_refused_settings(session: Callable[..., Fixer]) -> No
         make_fixer("difix", scene_id="scene")
 
 
-def test_a_bundle_loads_only_at_the_level_it_was_trained_for(
-    weights: Path, settings_of: Callable[..., Settings]
-) -> None:
+def test_a_bundle_loads_only_at_the_level_it_was_trained_for(weights, settings_of):
     settings_of("harmonizer")
     path = weights / "harmonizer_render.safetensors"
     name, overrides = bundle_fixer(path)

@@ -4,8 +4,6 @@ write.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -43,17 +41,17 @@ SIZES = DiTSizes(24, 2, 12, 40, 5, 7, 9)
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(tmp_path_factory):
     return tmp_path_factory.mktemp("weights")
 
 
 @pytest.fixture(scope="module")
-def net() -> CosmosCausalDiT:
+def net():
     return CosmosCausalDiT.from_state_dict(initial_weights(SIZES, 3)).requires_grad_(False)
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
+def one_thread():
     torch.set_num_threads(
         1
     )  # matrices this small are slower on several; tests/conftest.py sets the number back
@@ -71,7 +69,7 @@ def ddpm(steps: int = 1000) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(kept), np.sqrt(1 - kept)
 
 
-def test_difixs_step_is_the_ddpm_formula_at_199(net: CosmosCausalDiT) -> None:
+def test_difixs_step_is_the_ddpm_formula_at_199(net):
     settings = fixer_settings("difix")
     level, (alphas, sigmas) = settings.level, ddpm()
     alpha, sigma = float(alphas[199]), float(sigmas[199])
@@ -96,7 +94,7 @@ def test_difixs_step_is_the_ddpm_formula_at_199(net: CosmosCausalDiT) -> None:
     torch.testing.assert_close(exact, (z_r - sigma * eps) / alpha, atol=1e-6, rtol=0)
 
 
-def test_the_harmonizers_step_at_a_fifth(net: CosmosCausalDiT) -> None:
+def test_the_harmonizers_step_at_a_fifth(net):
     settings = fixer_settings("harmonizer")
     z_r = normal(1, 16, 2, 4, 6)
     v = net(0.8 * z_r, 200.0, TEXT, torch.zeros_like(z_r), block_latents=None)
@@ -108,7 +106,7 @@ def test_the_harmonizers_step_at_a_fifth(net: CosmosCausalDiT) -> None:
 
 
 @pytest.mark.parametrize("name", ["harmonizer", "harmonizer-temporal"])
-def test_the_training_sees_the_outputs_that_the_session_shows(weights: Path, name: str) -> None:
+def test_the_training_sees_the_outputs_that_the_session_shows(weights, name):
     frames = moving_picture(7, (16, 32))
     settings = busy_settings(weights, name)
     assert isinstance(settings, RenderStepSettings)
@@ -133,8 +131,8 @@ def step_of(settings: RenderStepSettings) -> RenderStep:
 
 
 def test_a_distance_beyond_the_clamp_has_no_gradient_and_gradients_reach_encoder_decoder_and_network(
-    weights: Path,
-) -> None:
+    weights,
+):
     settings = busy_settings(weights, "harmonizer")
     assert isinstance(settings, RenderStepSettings)
     step = step_of(settings)
@@ -168,7 +166,7 @@ def test_a_distance_beyond_the_clamp_has_no_gradient_and_gradients_reach_encoder
         assert weight.grad.abs().sum() > 0
 
 
-def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_frames() -> None:
+def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_frames():
     clip = (
         torch.from_numpy(pixels(moving_picture(6, (48, 64), holes=False)))
         .permute(3, 0, 1, 2)[None]
@@ -200,7 +198,7 @@ def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_fra
     ), "the last four, newest first"
 
 
-def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -> None:
+def test_the_enhancers_loss_is_edms_on_the_clean_latents(net):
     z_0, z_r, eps = (normal(3, 16, 2, 4, 4, key=key) for key in ("clean", "render", "noise"))
     s = torch.tensor([0.1, 2.0, 30.0])
     t = s / (1 + s)
@@ -220,9 +218,9 @@ def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -
     )
 
 
-def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path() -> None:
+def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path():
     z_0, eps = normal(1, 16, 2, 4, 4, key="clean"), normal(1, 16, 2, 4, 4, key="noise")
-    asked: list[float] = []
+    asked = []
 
     def velocity(z: Tensor, t: float, *rest: object, **options: object) -> Tensor:
         asked.append(t)
@@ -234,7 +232,7 @@ def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path() -> None:
     assert asked == [1000, 875, 750, 625, 500, 375, 250, 125]
 
 
-def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs() -> None:
+def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs():
     weights = initial_weights(SIZES, 1)
     shared = share_embedding(weights)
     before, after = (
@@ -250,7 +248,7 @@ def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs() -> None:
     assert shared[CONDITION_KEY].shape == weights[CONDITION_KEY].shape
 
 
-def test_multi_resolution_noise_has_unit_variance_and_larger_scales_at_later_times() -> None:
+def test_multi_resolution_noise_has_unit_variance_and_larger_scales_at_later_times():
     t = torch.tensor([0.0, 0.5, 1.0]).repeat_interleave(8)
     noise = multi_resolution_noise(stream("tests", 0, "noise"), (24, 16, 2, 18, 32), t)
     assert noise.shape == (24, 16, 2, 18, 32)
@@ -262,7 +260,7 @@ def test_multi_resolution_noise_has_unit_variance_and_larger_scales_at_later_tim
     assert torch.equal(noise, again)
 
 
-def test_cut_outs_are_black_soft_and_cover_a_tenth_at_most() -> None:
+def test_cut_outs_are_black_soft_and_cover_a_tenth_at_most():
     rng = stream("tests", 0, "masks")
     shares = [float(soft_mask(rng, 144, 256).mean()) for _ in range(40)]
     assert max(shares) <= 0.101

@@ -8,7 +8,7 @@ import pytest
 from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
 
 
-def test_a_draw_is_a_pure_function_of_its_stream_and_within_range() -> None:
+def test_a_draw_is_a_pure_function_of_its_stream_and_within_range():
     for seed in range(20):
         a, b = (draw_lost_resolution(np.random.default_rng(seed), 96, 128) for _ in range(2))
         np.testing.assert_array_equal(a.opacity, b.opacity)
@@ -19,7 +19,7 @@ def test_a_draw_is_a_pure_function_of_its_stream_and_within_range() -> None:
         assert 0 <= a.blurred.min() <= a.blurred.max() <= 1
 
 
-def test_flat_opaque_frames_stay_and_detail_is_lost() -> None:
+def test_flat_opaque_frames_stay_and_detail_is_lost():
     lost = LostResolution(1.5, 3, np.full((48, 64), 0.5, np.float32), np.ones((48, 64), np.float32))
     flat = np.full((2, 3, 48, 64), 0.25, np.float32)
     np.testing.assert_allclose(lost.apply(flat), flat, atol=1e-6)
@@ -27,7 +27,7 @@ def test_flat_opaque_frames_stay_and_detail_is_lost() -> None:
     assert lost.apply(noise).std() < 0.5 * noise.std()
 
 
-def test_black_shows_through_holes_by_their_transparency() -> None:
+def test_black_shows_through_holes_by_their_transparency():
     opacity = np.ones((48, 64), np.float32)
     opacity[10:20, 10:20] = 0.25
     white = np.ones((1, 3, 48, 64), np.float32)
@@ -36,7 +36,7 @@ def test_black_shows_through_holes_by_their_transparency() -> None:
 
 
 @pytest.mark.parametrize("size", [(16, 16), (1, 40)])
-def test_crops_smaller_than_a_patch_have_a_damage(size: tuple[int, int]) -> None:
+def test_crops_smaller_than_a_patch_have_a_damage(size):
     made = draw_lost_resolution(np.random.default_rng(1), *size).apply(
         np.zeros((1, 3, *size), np.float32)
     )

@@ -19,7 +19,7 @@ from alpasim_plugin.lab.training.pair_store import (
 from tests.lab.training.pair_files import make, pair
 
 
-def test_sequence_comes_back_as_memory_maps_with_every_value(tmp_path: Path) -> None:
+def test_sequence_comes_back_as_memory_maps_with_every_value(tmp_path):
     clip = make(tmp_path).clip
     assert len(clip) == 12
     for i in (0, 7, 11):
@@ -30,7 +30,7 @@ def test_sequence_comes_back_as_memory_maps_with_every_value(tmp_path: Path) -> 
         clip.rgb_gt[0, 0, 0] = 1
 
 
-def test_fewer_frames_than_announced_leave_true_headers(tmp_path: Path) -> None:
+def test_fewer_frames_than_announced_leave_true_headers(tmp_path):
     write_sequence(tmp_path / "train" / "short", (pair(i) for i in range(5)), 9, {})
     sequence = PairSequence(tmp_path / "train" / "short")
     assert sequence.clip.rgb_gt.shape == (5, 32, 48, 3)
@@ -38,13 +38,13 @@ def test_fewer_frames_than_announced_leave_true_headers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sequence.clip.rgb_gt[4], pair(4).rgb_gt)
 
 
-def test_sequence_is_as_long_as_its_shortest_channel(tmp_path: Path) -> None:
+def test_sequence_is_as_long_as_its_shortest_channel(tmp_path):
     sequence = make(tmp_path)
     np.save(sequence.folder / "opacity.npy", np.load(sequence.folder / "opacity.npy")[:8])
     assert len(PairSequence(sequence.folder).clip) == 8
 
 
-def test_failure_in_the_middle_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:
+def test_failure_in_the_middle_leaves_nothing_and_keeps_what_was_there(tmp_path):
     before = make(tmp_path)
 
     def breaks() -> object:
@@ -57,7 +57,7 @@ def test_failure_in_the_middle_leaves_nothing_and_keeps_what_was_there(tmp_path:
     assert len(PairSequence(before.folder).clip) == 12
 
 
-def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_path: Path) -> None:
+def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_path):
     make(tmp_path, name="b")
     unfinished = tmp_path / "train" / ".c.1.part"
     unfinished.mkdir()
@@ -84,14 +84,14 @@ def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_pat
         (lambda f: (f / "opacity.npy").write_bytes(b"\x93NUMPY\x01\x00"), "opacity.npy"),
     ],
 )
-def test_damaged_channel_is_named(tmp_path: Path, damage: object, message: str) -> None:
+def test_damaged_channel_is_named(tmp_path, damage, message):
     folder = make(tmp_path).folder
     damage(folder)  # type: ignore[operator]
     with pytest.raises(InputError, match=message):
         _ = PairSequence(folder).clip
 
 
-def test_frames_of_changing_size_are_refused(tmp_path: Path) -> None:
+def test_frames_of_changing_size_are_refused(tmp_path):
     frames = [
         pair(0),
         Pair(
@@ -105,7 +105,7 @@ def test_frames_of_changing_size_are_refused(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     not Path("/proc/self/fd").is_dir(), reason="counts the open files of the process"
 )
-def test_many_sequences_are_read_with_few_open_files(tmp_path: Path) -> None:
+def test_many_sequences_are_read_with_few_open_files(tmp_path):
     first = make(tmp_path, name="0", frames=2, height=4, width=4)
     for i in range(1, OPEN_CLIPS + 8):
         shutil.copytree(first.folder, tmp_path / "train" / str(i))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ EMPTY = Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0)
 
 
 @pytest.fixture
-def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scenario:
+def street(tmp_path, monkeypatch):
     """Give 0.4 s of a bare street, 64 x 36 pixels, with a cache of its own."""
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "cache"))
     scenario = with_camera(straight(actors=(parked("car", 22.0, -1.8),), environment=EMPTY), 64, 36)
@@ -32,8 +31,8 @@ def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scenario:
 
 
 def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_render(
-    street: Scenario,
-) -> None:
+    street,
+):
     def largest(scenario: Scenario) -> list[float]:
         return [
             float(np.abs(lateral_offsets(scenario, PairRecipe(), seed)).max()) for seed in range(60)
@@ -47,9 +46,7 @@ def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_
     assert set(largest(replace(street, degradation=Degradation("cycle")))) == {0.0}
 
 
-def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(
-    street: Scenario, tmp_path: Path
-) -> None:
+def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street, tmp_path):
     recipe, folder = PairRecipe(), tmp_path / "pairs" / "val" / "s"
     cycle = replace(street, degradation=Degradation("cycle", share=0.1))
     assert make_sequence(cycle, folder, recipe, 0, split="val", family="street")
@@ -69,7 +66,7 @@ def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(
     assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "none"
 
 
-def test_unknown_camera_names_the_known_ones(street: Scenario, tmp_path: Path) -> None:
+def test_unknown_camera_names_the_known_ones(street, tmp_path):
     with pytest.raises(InputError):
         make_sequence(
             street, tmp_path / "x", PairRecipe(camera="rear"), 0, split="val", family="street"
@@ -77,8 +74,8 @@ def test_unknown_camera_names_the_known_ones(street: Scenario, tmp_path: Path) -
 
 
 def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_view(
-    street: Scenario, tmp_path: Path
-) -> None:
+    street, tmp_path
+):
     folder = tmp_path / "pairs" / "val" / "s"
     exact = replace(street, degradation=Degradation("reconstruction", share=0.02))
     make_sequence(exact, folder, PairRecipe(offset_m=0.4), 0, split="val", family="street")
@@ -94,8 +91,8 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
 
 
 def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_refused(
-    street: Scenario, tmp_path: Path
-) -> None:
+    street, tmp_path
+):
     folder = tmp_path / "pairs" / "val" / "s"
     make_sequence(street, folder, PairRecipe(source="clean"), 0, split="val", family="street")
     assert open_references(PairSequence(folder)) is None

@@ -69,7 +69,7 @@ def write(
     return folder
 
 
-def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path: Path) -> None:
+def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path):
     dots = np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0], [-1.0, 0.8, 4.0]])
     found = read_photographs(write(tmp_path, dots), 256)
     assert (len(found.views), found.listed, found.missing) == (2, 3, ("images/lost.png",))
@@ -99,8 +99,8 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path:
 
 
 def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     path = (
         write(tmp_path, np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0]]))
         / "transforms.json"
@@ -129,9 +129,7 @@ def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(
         ({"frames": []}, "0 of 0"),
     ],
 )
-def test_what_cannot_be_a_set_of_photographs_is_refused(
-    tmp_path: Path, change: dict[str, object], found: str
-) -> None:
+def test_what_cannot_be_a_set_of_photographs_is_refused(tmp_path, change, found):
     path = write(tmp_path, np.array([[0.0, 0.0, 4.0]])) / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(InputError) as caught:
@@ -139,7 +137,7 @@ def test_what_cannot_be_a_set_of_photographs_is_refused(
     assert found in caught.value.message
 
 
-def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> None:
+def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not():
     K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
     cameras = [
         PinholeCamera.from_pose(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -21,7 +19,7 @@ def scaled(images: np.ndarray) -> Tensor:
 
 
 @pytest.mark.parametrize("holes", first_of(["noise", "everywhere"]))
-def test_streaming_equals_the_rollout_of_the_training(tmp_path: Path, holes: str) -> None:
+def test_streaming_equals_the_rollout_of_the_training(tmp_path, holes):
     bundle = write_bundle(tmp_path / "small.safetensors")
     streamed = pixels(run(session(bundle, "keep_render=false", f"holes={holes}"), FRAMES, MAPS))
     render, sdmap = scaled(pixels(FRAMES))[None], scaled(np.stack(MAPS))[None]

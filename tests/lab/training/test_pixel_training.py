@@ -102,7 +102,7 @@ def generator() -> PixelGenerator:
     return PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=4))
 
 
-def test_terms_are_what_they_are_called() -> None:
+def test_terms_are_what_they_are_called():
     net, s = generator(), sample()
     found = pixel_losses(
         net,
@@ -148,7 +148,7 @@ def test_terms_are_what_they_are_called() -> None:
     assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
 
 
-def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays() -> None:
+def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays():
     net, s = generator(), sample()
     start = net.start(s.render[:, 0])
     users = torch.zeros_like(s.opacity, dtype=torch.bool)
@@ -170,7 +170,7 @@ def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays() -> N
 
 
 @pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])
-def test_gradients_pass_through_the_last_k_frames(horizon: int, reaches: int) -> None:
+def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
     net, s = generator(), sample()
     eps = s.eps.clone().requires_grad_()
     found = pixel_losses(
@@ -186,7 +186,7 @@ def test_gradients_pass_through_the_last_k_frames(horizon: int, reaches: int) ->
     assert not found.state.hidden.requires_grad
 
 
-def test_switches_of_the_ablation() -> None:
+def test_switches_of_the_ablation():
     net, s = generator(), sample()
     start = net.start(s.render[:, 0])
 
@@ -204,7 +204,7 @@ def test_switches_of_the_ablation() -> None:
     assert float(pixel_losses(net, s, start, PixelObjectives(flow=0, temporal=0), None).flow) == 0
 
 
-def test_a_redenoised_history_is_the_truth_noised_and_denoised() -> None:
+def test_a_redenoised_history_is_the_truth_noised_and_denoised():
     net, s = generator(), sample()
     found = pixel_losses(
         net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None
@@ -219,7 +219,7 @@ def test_a_redenoised_history_is_the_truth_noised_and_denoised() -> None:
         _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
 
 
-def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
+def test_flow_matching_alone_sends_no_gradient_through_the_rollout():
     net, s = generator(), sample()
     flow_alone = pixel_variant("V2").stages[0]
     found = pixel_losses(net, s, net.start(s.render[:, 0]), flow_alone, None)
@@ -246,7 +246,7 @@ def weights(path: Path) -> dict[str, Tensor]:
     return load_weights(path / STATE_FILE)
 
 
-def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None:
+def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path):
     train_per_frame(run_of(), tmp_path / "whole", None)
     train_per_frame(run_of(), tmp_path / "cut", None, stop_at=2)
     bundle = train_per_frame(run_of(), tmp_path / "cut", None)
@@ -258,7 +258,7 @@ def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None
     assert torch.equal(saved["mix.weight"], one["average.mix.weight"].half())
 
 
-def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:
+def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path):
     train_per_frame(run_of(), tmp_path / "first", None)
     begin = tmp_path / "first" / STATE_FILE
     train_per_frame(run_of(init=begin, keep_every=1), tmp_path / "next", None, stop_at=1)
@@ -270,7 +270,7 @@ def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:
         train_per_frame(replace(run_of(init=begin), settings=wide), tmp_path / "wide", None)
 
 
-def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path: Path) -> None:
+def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path):
     shallow = train_per_frame(run_of(), tmp_path / "shallow", None)
     deeper = fixer_settings("onefixer", (*SMALL, "generator.blocks=[1,2,2,2,2]"))
     assert isinstance(deeper, PixelFixerSettings)
@@ -284,17 +284,15 @@ def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path: Path) -> Non
     assert torch.equal(net(*inputs)[0], before(*inputs)[0])
 
 
-def test_it_learns(tmp_path: Path) -> None:
-    seen: list[float] = []
+def test_it_learns(tmp_path):
+    seen = []
     train_per_frame(
         run_of(24, 20), tmp_path, None, report=lambda step, numbers: seen.append(numbers["picture"])
     )
     assert sum(seen[-4:]) < 0.7 * sum(seen[:4])
 
 
-def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_where_the_picture_teaches_nothing() -> (
-    None
-):
+def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_where_the_picture_teaches_nothing():
     truth = torch.zeros(1, 16, 16, 3)
     colour = torch.stack(
         [torch.full_like(truth, 0.1), truth], dim=1

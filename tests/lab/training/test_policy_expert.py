@@ -40,7 +40,7 @@ def speeds(
 
 
 @pytest.mark.parametrize("offset_m", [-1.5, 0.0, 0.7])
-def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m: float) -> None:
+def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m):
     points, heading = expert_path(STRAIGHT, 50.0, se2(50.0, offset_m, 0.0), 10.0)
     assert points[-1, 1] == pytest.approx(-offset_m, abs=0.05)
     assert np.abs(heading[-1]) < 0.01
@@ -50,7 +50,7 @@ def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m: f
     assert (np.diff(np.abs(points[:, 1])) > -0.2).all()
 
 
-def test_car_on_a_bend_stays_on_it() -> None:
+def test_car_on_a_bend_stays_on_it():
     s = 20.0
     xyz, yaw = LEFT_CIRCLE.at(s)
     points, heading = expert_path(
@@ -62,14 +62,14 @@ def test_car_on_a_bend_stays_on_it() -> None:
     assert heading[k] == pytest.approx(22.0 / 40.0, abs=0.04)
 
 
-def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it() -> None:
+def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it():
     np.testing.assert_allclose(speeds(10.0), 10.0, atol=1e-6)
     after = speeds(0.0)
     assert (np.diff(after) > 0).all()
     assert after[0] == pytest.approx(0.75, abs=0.1)
 
 
-def test_car_stops_before_what_stands_and_stays_there() -> None:
+def test_car_stops_before_what_stands_and_stays_there():
     for gap_m in (12.0, 20.0, 30.0):
         s = 20.0
         v = 8.0
@@ -82,12 +82,12 @@ def test_car_stops_before_what_stands_and_stays_there() -> None:
     assert speeds(8.0, Leader(12.0, 0.0, 0))[TIMES_S.index(2.5)] < 2.0
 
 
-def test_bend_is_entered_slowly() -> None:
+def test_bend_is_entered_slowly():
     line = ReferenceLine.along(LEFT_CIRCLE, 20.0)
     assert speeds(12.0, line=line, s_m=5.0)[-1] == pytest.approx(np.sqrt(2.0 * 40.0), abs=0.5)
 
 
-def test_only_bodies_that_reach_into_the_way_are_leaders() -> None:
+def test_only_bodies_that_reach_into_the_way_are_leaders():
     line, car = ReferenceLine.along(STRAIGHT, 20.0), Box(4.5, 1.8, 1.5)
     there = bodies_from(
         np.array([[40.0, 3.4], [60.0, 0.3]]),
@@ -102,7 +102,7 @@ def test_only_bodies_that_reach_into_the_way_are_leaders() -> None:
     assert leader_on(line, 10.0, 3.8, 0.94, NO_BODIES).index == -1
 
 
-def test_headings_of_a_circle_lay_out_the_circle() -> None:
+def test_headings_of_a_circle_lay_out_the_circle():
     heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
     points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
     s = path_grid()

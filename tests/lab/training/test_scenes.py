@@ -4,7 +4,6 @@ them can be driven.
 
 import itertools
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 
@@ -23,12 +22,12 @@ def drawn(split: Split) -> list[dict]:
     return [draw_spec(split, families[i % len(families)], f"s{i}", i, 6.0) for i in range(DRAWN)]
 
 
-def test_seeds_of_splits_do_not_meet() -> None:
+def test_seeds_of_splits_do_not_meet():
     ranges = sorted((r.first_seed, r.first_seed + 10 * r.count * DRAWS) for r in SPLITS.values())
     assert all(a[1] <= b[0] for a, b in itertools.pairwise(ranges))
 
 
-def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training() -> None:
+def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training():
     assert not set(KNOWN_FAMILIES) & set(UNSEEN_FAMILIES)
     parts = {
         split: {s["kind"] for spec in drawn(split) for s in spec["road"]["segments"]}
@@ -43,7 +42,7 @@ def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training() -> N
     assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
 
 
-def test_every_unseen_scene_looks_as_no_training_scene_can() -> None:
+def test_every_unseen_scene_looks_as_no_training_scene_can():
     def strange(around: dict) -> bool:
         low, high = around["building_height_m"]
         return (
@@ -59,7 +58,7 @@ def test_every_unseen_scene_looks_as_no_training_scene_can() -> None:
         assert not any(strange(spec["environment"]) for spec in drawn(split))
 
 
-def test_every_unseen_scene_is_damaged_beyond_some_range_of_training() -> None:
+def test_every_unseen_scene_is_damaged_beyond_some_range_of_training():
     def beyond(damage: dict) -> bool:
         names = [f.name for f in fields(KNOWN_DAMAGE) if f.name in damage and f.name != "shift_m"]
         return any(
@@ -80,14 +79,14 @@ def test_every_unseen_scene_is_damaged_beyond_some_range_of_training() -> None:
 
 
 @pytest.mark.parametrize(("split", "family"), ALL)
-def test_draws_repeat_and_differ_by_seed(split: Split, family: str) -> None:
+def test_draws_repeat_and_differ_by_seed(split, family):
     one, again, other = (draw_spec(split, family, "s", seed, 10.0) for seed in (3, 3, 4))
     assert one == again
     assert one["road"] != other["road"]
     assert one["degradation"] != other["degradation"]
 
 
-def test_scenes_can_be_driven_and_files_are_kept(tmp_path: Path) -> None:
+def test_scenes_can_be_driven_and_files_are_kept(tmp_path):
     paths = [
         *write_scenes(tmp_path, "train", 2, 2.0),
         *write_scenes(tmp_path, "test-unseen", 1, 2.0),
@@ -103,7 +102,7 @@ def test_scenes_can_be_driven_and_files_are_kept(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("split", list(SPLITS))
-def test_every_family_can_be_driven(split: Split, tmp_path: Path) -> None:
+def test_every_family_can_be_driven(split, tmp_path):
     paths = list(
         write_scenes(tmp_path, split, len(SPLITS[split].families), SPLITS[split].duration_s)
     )

@@ -35,7 +35,7 @@ def uniform(name: str, *shape: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def net() -> CosmosCausalDiT:
+def net():
     return make_net(16)
 
 
@@ -103,7 +103,7 @@ def slow_rollout(net: CosmosCausalDiT, s: Sample) -> Tensor:
     return made
 
 
-def test_rollout_and_flow_matching_are_the_equations(net: CosmosCausalDiT) -> None:
+def test_rollout_and_flow_matching_are_the_equations(net):
     s = sample()
     with torch.no_grad():
         result = losses(net, s, TEXT, Objectives(horizon=0), window=None)
@@ -123,9 +123,7 @@ def test_rollout_and_flow_matching_are_the_equations(net: CosmosCausalDiT) -> No
 
 @pytest.mark.parametrize("k", first_of([2, 8, 1, 4], 2))
 @pytest.mark.parametrize("w", first_of([5, 0, 4, 7], 2))
-def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(
-    net: CosmosCausalDiT, k: int, w: int
-) -> None:
+def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net, k, w):
     result = losses(net, sample(w), TEXT, Objectives(flow=None, horizon=k), at_w)
     live = [z for z in result.predictions if z.requires_grad]
     grads = torch.autograd.grad(result.total, [*live, *net.parameters()], allow_unused=True)
@@ -148,7 +146,7 @@ def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(
     assert all(g is None or torch.isfinite(g).all() for g in grads)
 
 
-def test_predictions_with_gradient_have_the_values_of_the_rollout(net: CosmosCausalDiT) -> None:
+def test_predictions_with_gradient_have_the_values_of_the_rollout(net):
     for k in (1, 2, 3, 8):
         result = losses(net, sample(5), TEXT, Objectives(horizon=k), at_w)
         torch.testing.assert_close(
@@ -157,7 +155,7 @@ def test_predictions_with_gradient_have_the_values_of_the_rollout(net: CosmosCau
         assert not result.rollout.requires_grad
 
 
-def test_flow_matching_sends_no_gradient_through_its_history(net: CosmosCausalDiT) -> None:
+def test_flow_matching_sends_no_gradient_through_its_history(net):
     s = sample()
     leaf = s.z_r.clone().requires_grad_(True)
     later = replace(s, z_r=leaf, m=torch.ones_like(s.m))
@@ -182,7 +180,7 @@ def test_flow_matching_sends_no_gradient_through_its_history(net: CosmosCausalDi
     torch.testing.assert_close(grad, own, atol=1e-7, rtol=1e-4)
 
 
-def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> None:
+def test_history_of_every_kind_is_what_its_name_says(net):
     s = sample()
     with torch.no_grad():
         own, clean, again = (
@@ -200,7 +198,7 @@ def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> No
     torch.testing.assert_close(near, clean, atol=0, rtol=0)
 
 
-def test_channel_weights_weigh_the_error_of_channels_and_nothing_else(net: CosmosCausalDiT) -> None:
+def test_channel_weights_weigh_the_error_of_channels_and_nothing_else(net):
     s, ones = sample(), torch.ones(16)
     with torch.no_grad():
         plain = losses(net, s, TEXT, Objectives(horizon=0)).flow
@@ -218,7 +216,7 @@ def test_channel_weights_weigh_the_error_of_channels_and_nothing_else(net: Cosmo
     assert len({round(float(p), 6) for p in parts if p is not None}) > 8
 
 
-def test_decoder_sends_no_gradient_to_earlier_latents() -> None:
+def test_decoder_sends_no_gradient_to_earlier_latents():
     vae = TinyVAE.random()
     with torch.no_grad():
         vae.decoder.head.weight.copy_(0.02 * noise("head", *vae.decoder.head.weight.shape))
@@ -233,7 +231,7 @@ def test_decoder_sends_no_gradient_to_earlier_latents() -> None:
         assert (torch.cat([reached[:w], reached[w + 1 :]]) == 0).all()
 
 
-def test_decoded_frames_are_those_of_the_whole_clip() -> None:
+def test_decoded_frames_are_those_of_the_whole_clip():
     vae = TinyVAE.random()
     with torch.no_grad():
         vae.decoder.head.weight.copy_(0.02 * noise("head", *vae.decoder.head.weight.shape))
@@ -254,7 +252,7 @@ def test_decoded_frames_are_those_of_the_whole_clip() -> None:
         )
 
 
-def test_impossible_objectives_are_refused(net: CosmosCausalDiT) -> None:
+def test_impossible_objectives_are_refused(net):
     with pytest.raises(InputError):
         Objectives(flow=None, horizon=0)
     with pytest.raises(InputError):

@@ -25,7 +25,7 @@ ALL_KINDS = StreamShares(0.25, 0.25, 0.25, 0.25)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     folder = tmp_path_factory.mktemp("streams")
     for i, frames in enumerate((12, 7, 5)):
         make(folder / "pairs", name=f"street_{i:03d}", frames=frames, height=40, width=64)
@@ -49,7 +49,7 @@ def equal(a: StreamBatch, b: StreamBatch) -> bool:
     return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
 
 
-def test_update_is_a_pure_function_of_its_number_and_the_seed(root: Path) -> None:
+def test_update_is_a_pure_function_of_its_number_and_the_seed(root):
     one, other = streams(root), streams(root)
     forward = [one.update(i) for i in range(9)]
     for i in (7, 0, 3, 8):  # out of order, by another object
@@ -57,7 +57,7 @@ def test_update_is_a_pure_function_of_its_number_and_the_seed(root: Path) -> Non
     assert not equal(streams(root, seed=1).update(7), forward[7])
 
 
-def test_shapes_types_and_ranges_are_those_promised(root: Path) -> None:
+def test_shapes_types_and_ranges_are_those_promised(root):
     batch = streams(root).update(5)
     for name, channels, low in (
         ("render", 3, -1),
@@ -74,7 +74,7 @@ def test_shapes_types_and_ranges_are_those_promised(root: Path) -> None:
     assert batch.fresh.shape == batch.kind.shape == (3,)
 
 
-def test_frames_follow_one_another_across_updates(root: Path) -> None:
+def test_frames_follow_one_another_across_updates(root):
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     for slot in range(3):
         for i in range(1, 30):
@@ -87,7 +87,7 @@ def test_frames_follow_one_another_across_updates(root: Path) -> None:
             assert np.abs(np.diff(there_and_back(raw, length))).max() <= abs(episode.step)
 
 
-def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root: Path) -> None:
+def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root):
     made, seen = streams(root), set()
     for i in range(24):
         batch = made.update(i)
@@ -101,7 +101,7 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
     assert seen == set(KINDS)
 
 
-def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
+def test_render_and_target_are_relit_by_the_same_levels(root):
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     compared = 0
     for i in range(0, 120, 4):
@@ -124,13 +124,13 @@ def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
     assert compared > 3
 
 
-def test_held_out_video_is_never_shown(root: Path) -> None:
+def test_held_out_video_is_never_shown(root):
     made = streams(root, shares=StreamShares(0, 0, 0.5, 0.5))
     shown = {made.episode_of(slot, i)[0].sequence.folder for slot in range(3) for i in range(60)}
     assert shown == {root / "video" / "train" / "drive"}
 
 
-def test_a_count_keeps_the_list_while_more_are_made(root: Path, tmp_path: Path) -> None:
+def test_a_count_keeps_the_list_while_more_are_made(root, tmp_path):
     for i in (0, 10, 2):
         make(tmp_path, name=f"{'z' if i < 5 else 'a'}_{i:03d}", height=32, width=48)
     shares = StreamShares(1, 0, 0, 0)
@@ -153,12 +153,12 @@ def test_a_count_keeps_the_list_while_more_are_made(root: Path, tmp_path: Path) 
         ({"crop": (48, 48)}, "smaller than the crop"),
     ],
 )
-def test_what_makes_no_batch_is_refused(root: Path, settings: dict, found: str) -> None:
+def test_what_makes_no_batch_is_refused(root, settings, found):
     with pytest.raises(InputError, match=found):
         streams(root, **settings)
 
 
-def test_video_needs_a_folder_and_shares_must_add_up(root: Path) -> None:
+def test_video_needs_a_folder_and_shares_must_add_up(root):
     with pytest.raises(InputError):
         TrainingStreams(root / "pairs", None, crop=(32, 48))
     with pytest.raises(InputError):
@@ -166,8 +166,8 @@ def test_video_needs_a_folder_and_shares_must_add_up(root: Path) -> None:
 
 
 def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_better(
-    root: Path,
-) -> None:
+    root,
+):
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     batch = made.update(3)
     assert batch.references.shape == (3, 2, SLOTS, 32, 48, 4)
@@ -189,7 +189,7 @@ def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_bett
     assert np.array_equal(_lit_references(images, replace(exact, flip=True)), shown[:, :, :, ::-1])
 
 
-def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path: Path) -> None:
+def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path):
     for i in range(8):
         make(
             tmp_path / "pairs",

@@ -44,7 +44,7 @@ def trainer(
     return Trainer(model, folder, schedule, batch, loss, {"data": facts})
 
 
-def test_learns_and_averages(tmp_path: Path) -> None:
+def test_learns_and_averages(tmp_path):
     t = trainer(tmp_path, Schedule(steps=300, peak_lr=0.03, warmup=5, weight_decay=0.0, ema=0.9))
     t.run()
     torch.testing.assert_close(t.module.weight, TRUTH, atol=0.02, rtol=0)
@@ -52,7 +52,7 @@ def test_learns_and_averages(tmp_path: Path) -> None:
     assert set(t.averaged()) == {"weight", "bias", "fixed"}
 
 
-def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
+def test_resumed_run_ends_with_equal_weights_and_log(tmp_path):
     schedule = Schedule(steps=20, warmup=3, accumulate=2, save_every=7)
     whole = trainer(tmp_path / "whole", schedule)
     whole.run()
@@ -68,7 +68,7 @@ def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
     assert steps == [f'{{"step": {i}' for i in range(1, 21)]
 
 
-def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) -> None:
+def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path):
     schedule = Schedule(steps=9)
     t = trainer(tmp_path, schedule, bad_at=4)
     with pytest.raises(InfrastructureError):
@@ -81,7 +81,7 @@ def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) ->
     assert again.step == 9
 
 
-def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+def test_folder_of_another_run_is_refused(tmp_path):
     trainer(tmp_path, Schedule(steps=2)).run()
     with pytest.raises(InputError):
         trainer(tmp_path, Schedule(steps=2), facts="b")
@@ -89,7 +89,7 @@ def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path, Schedule(steps=3))
 
 
-def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
+def test_learning_rate_rises_then_falls_along_a_cosine():
     s = Schedule(steps=110, peak_lr=1.0, warmup=10)
     assert s.lr(0) == pytest.approx(0.1)
     assert s.lr(10) == pytest.approx(1.0)
@@ -97,7 +97,7 @@ def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
     assert s.lr(110) == pytest.approx(0.01)
 
 
-def test_learning_rate_falls_exponentially_or_stays() -> None:
+def test_learning_rate_falls_exponentially_or_stays():
     s = Schedule(steps=110, peak_lr=2.0, warmup=10, decay="exponential", last_share=0.01)
     assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx(
         [1.0, 2.0, 0.2, 0.02, 0.02]
@@ -109,15 +109,13 @@ def test_learning_rate_falls_exponentially_or_stays() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
-def test_full_disk_under_the_log_is_an_error(tmp_path: Path) -> None:
+def test_full_disk_under_the_log_is_an_error(tmp_path):
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
     with pytest.raises(InfrastructureError):
         trainer(tmp_path, Schedule(steps=2)).run()
 
 
-def test_full_disk_under_the_checkpoint_is_an_error_and_keeps_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_under_the_checkpoint_is_an_error_and_keeps_the_old_one(tmp_path, monkeypatch):
     t = trainer(tmp_path, Schedule(steps=4, save_every=2))
     t.run(until=2)
 
@@ -155,8 +153,8 @@ PARTS = {"student": PartSchedule(rate=0.5), "critic": PartSchedule(betas=(0.0, 0
 
 
 def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     schedule = Schedule(steps=6, peak_lr=0.01, warmup=1, weight_decay=0.0, clip=100.0)
     t = two_parts(tmp_path, schedule, PARTS)
     t.run(until=1)
@@ -175,7 +173,7 @@ def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(
     assert [group["weight_decay"] for group in t.optimiser.param_groups] == [0.0] * 4
 
 
-def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path: Path) -> None:
+def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path):
     schedule = Schedule(steps=6, save_every=1)
     whole = two_parts(tmp_path / "whole", schedule, PARTS)
     whole.run()
@@ -187,6 +185,6 @@ def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path: Pat
         two_parts(tmp_path / "cut", schedule, {**PARTS, "student": PartSchedule(rate=1.0)})
 
 
-def test_a_trained_parameter_of_no_part_is_refused(tmp_path: Path) -> None:
+def test_a_trained_parameter_of_no_part_is_refused(tmp_path):
     with pytest.raises(InputError):
         two_parts(tmp_path, Schedule(steps=1), {"student": PartSchedule()})

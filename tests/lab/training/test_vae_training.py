@@ -2,8 +2,6 @@
 says.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -20,7 +18,7 @@ from tests.lab.training.pair_files import make
 SIZE = CropSize(5, 16, 32)
 
 
-def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None:
+def test_a_draw_repeats_and_its_channels_belong_together(tmp_path):
     sequences = [make(tmp_path, name="a"), make(tmp_path, name="b")]
     one, again = (draw_pair_clip(sequences, SIZE, 7, 3) for _ in range(2))
     assert torch.equal(one.target, again.target)
@@ -35,14 +33,14 @@ def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None
     )
 
 
-def test_clip_larger_than_the_frames_is_refused(tmp_path: Path) -> None:
+def test_clip_larger_than_the_frames_is_refused(tmp_path):
     with pytest.raises(InputError):
         draw_pair_clip([make(tmp_path)], CropSize(5, 64, 64), 0, 0)
     with pytest.raises(InputError):
         draw_video_clip([np.zeros((4, 32, 48, 3), np.uint8)], SIZE, 0, 0)
 
 
-def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
+def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path):
     vae = TinyVAE.random()
     video = make(tmp_path, name="v").clip.rgb_gt
     task = VaeTask(
@@ -66,7 +64,7 @@ def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
         assert after[kind] < before[kind]
 
 
-def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels() -> None:
+def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels():
     vae = TinyVAE.random(TinySizes(16, 16, 16, 16, 16))
     weights = channel_amplitudes(vae)
     assert float(weights.mean()) == pytest.approx(1.0)

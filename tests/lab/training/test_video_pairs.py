@@ -4,8 +4,6 @@ along.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -46,7 +44,7 @@ def damaged(
     return np.stack(images), np.stack(opacities)
 
 
-def test_damage_depends_on_its_generator_alone() -> None:
+def test_damage_depends_on_its_generator_alone():
     frames = moving(3)
     one = damaged(frames, MILD)
     again = damaged(frames, MILD)
@@ -55,7 +53,7 @@ def test_damage_depends_on_its_generator_alone() -> None:
     assert not np.array_equal(one[0], other[0])
 
 
-def test_damage_is_that_of_a_poor_reconstruction() -> None:
+def test_damage_is_that_of_a_poor_reconstruction():
     frames = moving(6)
     images, opacity = damaged(frames, MILD)
     errors_db = [psnr_db(a, b) for a, b in zip(images, frames, strict=True)]
@@ -66,7 +64,7 @@ def test_damage_is_that_of_a_poor_reconstruction() -> None:
     assert psnr_db(coarse[0], frames[0]) < errors_db[0]
 
 
-def test_holes_are_where_opacity_is_low_and_show_what_is_behind() -> None:
+def test_holes_are_where_opacity_is_low_and_show_what_is_behind():
     bright = np.full((4, 48, 80, 3), 200, np.uint8)
     holed = SplatDamage(2.5, 0.75, 0.2, 0.0, 0.0, 0.25, 0, 60.0, 0.0)
     for seed in range(12):
@@ -82,7 +80,7 @@ def test_holes_are_where_opacity_is_low_and_show_what_is_behind() -> None:
     assert (whole < 128).mean() < 0.02
 
 
-def test_damage_moves_with_the_image() -> None:
+def test_damage_moves_with_the_image():
     frames = moving(8)
     images, _ = damaged(frames, SplatDamage(3.5, 0.7, 0.4, 0.0, 0.03, 0.05, 0, 200.0, 0.0))
     error = images.astype(float) - frames
@@ -96,7 +94,7 @@ def test_damage_moves_with_the_image() -> None:
     assert along < 0.75 * min(fixed, afresh)
 
 
-def test_drawn_damages_differ_and_grow_with_the_frames() -> None:
+def test_drawn_damages_differ_and_grow_with_the_frames():
     drawn = [draw_damage(np.random.default_rng(i), 256) for i in range(40)]
     assert min(d.hole_share for d in drawn) < 0.02 < 0.05 < max(d.hole_share for d in drawn)
     assert draw_damage(np.random.default_rng(0), 1024).cell_px == pytest.approx(
@@ -104,7 +102,7 @@ def test_drawn_damages_differ_and_grow_with_the_frames() -> None:
     )
 
 
-def test_parts_of_a_video_do_not_meet() -> None:
+def test_parts_of_a_video_do_not_meet():
     for count in (20, 30, 221):
         parts = split_frames(count, VideoRecipe())
         assert parts[TRAIN].stop < parts[HELD_OUT].start
@@ -113,7 +111,7 @@ def test_parts_of_a_video_do_not_meet() -> None:
         split_frames(1, VideoRecipe())
 
 
-def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path: Path) -> None:
+def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path):
     source, out = tmp_path / "drive.mp4", tmp_path / "video"
     write_mp4(source, moving(20), 10, crf=4)
     command = [

@@ -43,27 +43,27 @@ def slow_ssim(a: U8, b: U8) -> float:
 
 
 @pytest.mark.parametrize("noise", [1, 10, 60])
-def test_ssim_equals_the_slow_one(noise: int) -> None:
+def test_ssim_equals_the_slow_one(noise):
     made = np.clip(
         SMOOTH.astype(int) + RNG.integers(-noise, noise + 1, SMOOTH.shape), 0, 255
     ).astype(np.uint8)
     assert ssim(made, SMOOTH)[0] == pytest.approx(slow_ssim(made[0], SMOOTH[0]), abs=2e-5)
 
 
-def test_ssim_of_black_against_white_and_of_flat_frames() -> None:
+def test_ssim_of_black_against_white_and_of_flat_frames():
     black, white = np.zeros((1, 16, 16, 3), np.uint8), np.full((1, 16, 16, 3), 255, np.uint8)
     assert ssim(black, white)[0] == pytest.approx(slow_ssim(black[0], white[0]), abs=2e-5)
     assert ssim(black, black)[0] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_pictures_smaller_than_the_window_have_an_ssim() -> None:
+def test_pictures_smaller_than_the_window_have_an_ssim():
     small = TRUTH[:1, :7, :6]
     assert ssim(small[:, ::-1], small)[0] == pytest.approx(
         slow_ssim(small[0, ::-1], small[0]), abs=2e-5
     )
 
 
-def test_psnr_of_a_known_error_and_of_identical_frames() -> None:
+def test_psnr_of_a_known_error_and_of_identical_frames():
     made = TRUTH.copy()
     made[1] = np.where(made[1] > 127, made[1] - 10, made[1] + 10)
     found = psnr_db(made, TRUTH)
@@ -71,7 +71,7 @@ def test_psnr_of_a_known_error_and_of_identical_frames() -> None:
     assert list(found[[0, 2]]) == [CAP_DB, CAP_DB]
 
 
-def test_one_wrong_value_in_a_large_frame_stays_below_the_cap() -> None:
+def test_one_wrong_value_in_a_large_frame_stays_below_the_cap():
     truth = np.zeros((1, 500, 500, 3), np.uint8)
     made = truth.copy()
     made[0, 3, 4, 1] = 1
@@ -88,12 +88,12 @@ def test_one_wrong_value_in_a_large_frame_stays_below_the_cap() -> None:
         (TRUTH[..., 0], "uint8"),
     ],
 )
-def test_videos_that_do_not_belong_together_are_refused(metric, made, words) -> None:
+def test_videos_that_do_not_belong_together_are_refused(metric, made, words):
     with pytest.raises(EvaluatorError, match=words):
         metric(made, TRUTH)
 
 
-def test_equal_images_have_ssim_one_and_noise_lowers_it() -> None:
+def test_equal_images_have_ssim_one_and_noise_lowers_it():
     a = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
     assert image_metrics.ssim(a, a) == pytest.approx(1.0)
     near, far = (
@@ -104,14 +104,14 @@ def test_equal_images_have_ssim_one_and_noise_lowers_it() -> None:
 
 
 @pytest.mark.parametrize(("low", "peak"), [(0, 255.0), (0, 1.0), (-1, 2.0)])
-def test_the_range_of_values_does_not_change_psnr(low: int, peak: float) -> None:
+def test_the_range_of_values_does_not_change_psnr(low, peak):
     a = np.full((2, 2, 3), low, np.float32)
     assert image_metrics.psnr_db(a, a + np.float32(peak / 255), peak) == pytest.approx(
         20 * np.log10(255), abs=1e-4
     )
 
 
-def test_ssim_of_floats_equals_that_of_their_eight_bits() -> None:
+def test_ssim_of_floats_equals_that_of_their_eight_bits():
     a, b = TRUTH[0], TRUTH[1]
     assert image_metrics.ssim(a / np.float32(255), b / np.float32(255), peak=1.0) == pytest.approx(
         image_metrics.ssim(a, b), abs=1e-6

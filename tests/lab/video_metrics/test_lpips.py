@@ -34,12 +34,12 @@ def pictures(seed: int, count: int = 2, side: int = 64) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def net(request: pytest.FixtureRequest) -> LPIPS:
+def net(request):
     torch.manual_seed(0)
     return LPIPS(request.param).requires_grad_(False)
 
 
-def test_activations_have_the_published_channels_and_sizes(net: LPIPS) -> None:
+def test_activations_have_the_published_channels_and_sizes(net):
     channels = {"alex": [64, 192, 384, 256, 256], "vgg": [64, 128, 256, 512, 512]}[net.kind]
     sides = {"alex": [15, 7, 3, 3, 3], "vgg": [64, 32, 16, 8, 4]}[net.kind]
     found = net.activations(pictures(0, 1))
@@ -49,7 +49,7 @@ def test_activations_have_the_published_channels_and_sizes(net: LPIPS) -> None:
     assert all(float(x.min()) >= 0 for x in found)
 
 
-def test_identity_symmetry_and_independence_of_the_batch(net: LPIPS) -> None:
+def test_identity_symmetry_and_independence_of_the_batch(net):
     a, b = pictures(0), pictures(1)
     assert torch.equal(net.distance(a, a), torch.zeros(2))
     there = net.distance(a, b)
@@ -59,7 +59,7 @@ def test_identity_symmetry_and_independence_of_the_batch(net: LPIPS) -> None:
     torch.testing.assert_close(net.distance(a.flip(0), b.flip(0)), there.flip(0))
 
 
-def test_colours_are_shifted_and_scaled_before_the_trunk(net: LPIPS) -> None:
+def test_colours_are_shifted_and_scaled_before_the_trunk(net):
     middle = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1).expand(1, 3, 64, 64)
     first = net.plan.convolutions[0]
     x = net.features[str(first.index)](
@@ -89,9 +89,7 @@ def write(folder: Path, kind: Kind) -> None:
     torch.save(heads, folder / plan.heads_file)
 
 
-def test_missing_weights_are_named_and_no_number_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_weights_are_named_and_no_number_is_made(tmp_path, monkeypatch):
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     with pytest.raises(InputError):
         load_lpips("alex", tmp_path)
@@ -103,15 +101,13 @@ def test_missing_weights_are_named_and_no_number_is_made(
     assert distance_for_training(tmp_path)[0] == "perceptual-syn"
 
 
-def test_files_with_other_content_are_refused(tmp_path: Path) -> None:
+def test_files_with_other_content_are_refused(tmp_path):
     write(tmp_path, "alex")
     with pytest.raises(InputError):
         load_lpips("alex", tmp_path)
 
 
-def test_published_layout_is_read_tensor_by_tensor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_published_layout_is_read_tensor_by_tensor(tmp_path, monkeypatch):
     """With the digests of made-up files in place of the published ones; everything else is as for a
     user.
     """
@@ -141,7 +137,7 @@ def test_published_layout_is_read_tensor_by_tensor(
         load_lpips("alex", tmp_path)
 
 
-def test_published_values_where_the_weights_are_there(shared_data: Path) -> None:
+def test_published_values_where_the_weights_are_there(shared_data):
     folder = os.environ.get(FOLDER_VARIABLE)
     if folder is None or "lpips_alex" not in available(folder):
         pytest.skip(f"no AlexNet weights ({FOLDER_VARIABLE})")

@@ -4,8 +4,6 @@ here.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -37,27 +35,27 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def net() -> PerceptualDistance:
+def net():
     return load_perceptual()
 
 
 def test_distance_is_zero_for_equal_and_symmetric_for_other_pictures(
-    net: PerceptualDistance,
-) -> None:
+    net,
+):
     a, b = pictures(), pictures(seed=1)
     assert torch.equal(net.distance(a, a), torch.zeros(2))
     torch.testing.assert_close(net.distance(a, b), net.distance(b, a))
     assert torch.all(net.distance(a, b) > 0)
 
 
-def test_pictures_of_a_batch_do_not_meet(net: PerceptualDistance) -> None:
+def test_pictures_of_a_batch_do_not_meet(net):
     a, b = pictures(3), pictures(3, seed=1)
     alone = torch.cat([net.distance(a[i : i + 1], b[i : i + 1]) for i in range(3)])
     torch.testing.assert_close(net.distance(a, b), alone)
     torch.testing.assert_close(net.distance(a.flip(0), b.flip(0)), alone.flip(0))
 
 
-def test_distance_is_the_sum_over_stages_written_out(net: PerceptualDistance) -> None:
+def test_distance_is_the_sum_over_stages_written_out(net):
     a, b = pictures(1), pictures(1, seed=1)
     wanted = 0.0
     for x, y, head in zip(net.trunk(a), net.trunk(b), net.heads, strict=True):
@@ -70,7 +68,7 @@ def test_distance_is_the_sum_over_stages_written_out(net: PerceptualDistance) ->
     assert float(net.distance(a, b)) == pytest.approx(wanted, rel=1e-5)
 
 
-def test_gradient_is_that_of_finite_differences() -> None:
+def test_gradient_is_that_of_finite_differences():
     torch.manual_seed(0)
     net = PerceptualDistance((2, 3, 4, 5)).double().requires_grad_(False)
     a, b = pictures(1, 16, 24).double().requires_grad_(), pictures(1, 16, 24, seed=1).double()
@@ -83,7 +81,7 @@ def test_gradient_is_that_of_finite_differences() -> None:
         )
 
 
-def test_equal_and_flat_pictures_have_a_finite_gradient(net: PerceptualDistance) -> None:
+def test_equal_and_flat_pictures_have_a_finite_gradient(net):
     for value in (-1.0, 0.0, 1.0):
         flat = torch.full((1, 3, 32, 32), value, requires_grad=True)
         net.distance(flat, flat.detach()).sum().backward()
@@ -91,7 +89,7 @@ def test_equal_and_flat_pictures_have_a_finite_gradient(net: PerceptualDistance)
         assert torch.equal(flat.grad, torch.zeros_like(flat))
 
 
-def test_shipped_distance_grows_with_blur_and_noise(net: PerceptualDistance) -> None:
+def test_shipped_distance_grows_with_blur_and_noise(net):
     a = pictures(4, 64, 96)
     noise = torch.from_numpy(stream("nets", 0, "noise").standard_normal(a.shape)).float()
     for damaged in (
@@ -103,8 +101,8 @@ def test_shipped_distance_grows_with_blur_and_noise(net: PerceptualDistance) -> 
 
 
 def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_does_not(
-    shared_data: Path, net: PerceptualDistance
-) -> None:
+    shared_data, net
+):
     """The example pictures of LPIPS: p0 is blurred, p1 is warped and nearer to the eye (and to
     LPIPS); by SSIM it is farther.
     """
@@ -121,7 +119,7 @@ def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_d
     assert float(net.distance(ref, p1)) < float(net.distance(ref, p0))
 
 
-def test_saved_weights_load_as_they_were(tmp_path: Path) -> None:
+def test_saved_weights_load_as_they_were(tmp_path):
     torch.manual_seed(1)
     net = PerceptualDistance((4, 5, 6, 7))
     net.save(tmp_path / "n.safetensors", {"steps": "1"})
@@ -134,14 +132,12 @@ def test_saved_weights_load_as_they_were(tmp_path: Path) -> None:
     ("a", "b"),
     [((1, 3, 32, 32), (2, 3, 32, 32)), ((3, 32, 32), (3, 32, 32)), ((1, 3, 8, 32), (1, 3, 8, 32))],
 )
-def test_pictures_that_cannot_be_compared_are_refused(
-    net: PerceptualDistance, a: tuple[int, ...], b: tuple[int, ...]
-) -> None:
+def test_pictures_that_cannot_be_compared_are_refused(net, a, b):
     with pytest.raises(InputError):
         net.distance(torch.zeros(a), torch.zeros(b))
 
 
-def test_foreign_and_incomplete_files_are_refused(tmp_path: Path) -> None:
+def test_foreign_and_incomplete_files_are_refused(tmp_path):
     with pytest.raises(InputError):
         load_perceptual(tmp_path / "none.safetensors")
     save_file({"x": torch.zeros(1)}, tmp_path / "x.safetensors")

@@ -19,7 +19,7 @@ def texture(height: int, width: int) -> U8:
     return np.clip(127 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
 
 
-def test_picture_that_moves_three_pixels_is_followed() -> None:
+def test_picture_that_moves_three_pixels_is_followed():
     wide = texture(120, 200)
     video = np.stack(
         [wide[:, 3 * i : 3 * i + 160] for i in range(3)]
@@ -33,19 +33,19 @@ def test_picture_that_moves_three_pixels_is_followed() -> None:
     assert np.all(found < 0.05 * plain)
 
 
-def test_video_that_stands_still_has_no_error() -> None:
+def test_video_that_stands_still_has_no_error():
     still = np.repeat(texture(64, 96)[None], 3, axis=0)
     grey = cv2.cvtColor(still[0], cv2.COLOR_RGB2GRAY)
     assert np.abs(backward_flow(grey, grey))[8:-8, 8:-8].max() < 0.03  # Farneback wavers at the rim
     assert np.all(warp_l1(still) < 3e-4)
 
 
-def test_white_noise_keeps_most_of_its_change() -> None:
+def test_white_noise_keeps_most_of_its_change():
     noise = RNG.integers(0, 256, (3, 120, 200, 3)).astype(np.uint8)
     assert float(warp_l1(noise).mean()) == pytest.approx(0.287, abs=0.01)  # 1/3 without warping
 
 
-def test_flow_out_of_the_picture_is_left_out() -> None:
+def test_flow_out_of_the_picture_is_left_out():
     wide = texture(64, 140)
     video = np.stack([wide[:, 5 * i : 5 * i + 96] for i in range(2)])
     video[0, :, :2] = 255  # seen only where the flow points outside the second frame's past
@@ -55,10 +55,10 @@ def test_flow_out_of_the_picture_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("pairs", "first"), [(197, 131), (899, 599), (90, 60), (89, 59), (30, 0), (5, 0)]
 )
-def test_late_window_is_the_last_third_but_at_least_thirty(pairs: int, first: int) -> None:
+def test_late_window_is_the_last_third_but_at_least_thirty(pairs, first):
     assert len(range(pairs)[late_window(pairs)]) == pairs - first
 
 
-def test_one_frame_has_no_motion_to_follow() -> None:
+def test_one_frame_has_no_motion_to_follow():
     with pytest.raises(EvaluatorError):
         warp_l1(texture(32, 32)[None])
