@@ -242,10 +242,12 @@ class Renaming:
     Attributes:
         session_uuid: The new session id; empty keeps the log's.
         cameras: Old name -> new name; others keep theirs.
+        renderer: The new name of the renderer in the header; empty keeps the log's.
     """
 
     session_uuid: str = ""
     cameras: Mapping[str, str] = field(default_factory=dict)
+    renderer: str = ""
 
     def __call__(self, entry: logging_pb2.LogEntry) -> list[logging_pb2.LogEntry]:
         """Rename within an entry, in place; a stage of `copy_log`."""
@@ -256,6 +258,8 @@ class Renaming:
         owner = message.session_metadata if kind == "rollout_metadata" else message
         if self.session_uuid and "session_uuid" in owner.DESCRIPTOR.fields_by_name:
             owner.session_uuid = self.session_uuid
+        if self.renderer and kind == "rollout_metadata":
+            message.version_ids.sensorsim_version.version_id = self.renderer
         if self.cameras:
             for holder, name in _names(kind, message):
                 old = getattr(holder, name)

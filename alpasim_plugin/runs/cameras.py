@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -10,14 +10,16 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,
+    Actor,
     CameraSpec,
     RenderRequest,
+    RolloutLog,
     Scenario,
     SensorSpec,
     Trajectory,
@@ -199,13 +201,30 @@ class CameraRig:
 
 def recorded_requests(scenario: Scenario, t_us: int) -> list[RenderRequest]:
     """Return a request for each camera of a scenario at an instant of its recorded path."""
-    poses = {
-        actor.actor_id: interpolate(actor.track, t_us)
-        for actor in scenario.actors
-        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
-    }
+    poses = _poses_of(scenario.actors, t_us)
     T_world_rig = interpolate(scenario.ego_log, t_us)
     return [
         RenderRequest(t_us, camera, np.stack([T_world_rig @ camera.T_rig_camera] * 2), poses)
         for camera in scenario.cameras
     ]
+
+
+def logged_request(log: RolloutLog, camera: CameraSpec, t_us: int) -> RenderRequest:
+    """Return the request for a camera's frame whose shutter ends at an instant of a log, from the
+    logged poses.
+    """
+    shutter_us = [max(t_us - camera.shutter_us, int(log.ego.t_us[0])), t_us]
+    T_world_rig = interpolate(log.ego, shutter_us) @ inverse(log.T_rig_box)
+    shown = drawn(_poses_of(log.actors.values(), t_us))
+    before = drawn(_poses_of(log.actors.values(), t_us - log.control_us))
+    exposure = rolling_exposure(camera, before, shown, log.control_us)
+    return RenderRequest(t_us, camera, T_world_rig @ camera.T_rig_camera, shown, exposure=exposure)
+
+
+def _poses_of(actors: Iterable[Actor], t_us: int) -> dict[str, F64]:
+    """Return ``T_world_box`` of the actors whose tracks cover an instant, by id."""
+    return {
+        actor.actor_id: interpolate(actor.track, t_us)
+        for actor in actors
+        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
+    }

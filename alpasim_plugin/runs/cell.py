@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,6 +24,7 @@ from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.log.asl import Renaming, copy_log
 from alpasim_plugin.log.run_folder.manifests import (
     Action,
     RolloutState,
@@ -29,6 +32,7 @@ from alpasim_plugin.log.run_folder.manifests import (
     write_manifest,
 )
 from alpasim_plugin.log.run_folder.schema import (
+    DEBUG_NAME,
     DERIVED,
     DRIVEN,
     FRAMES_NAME,
@@ -39,8 +43,10 @@ from alpasim_plugin.log.run_folder.schema import (
     VIDEO_NAME,
     WHY_NAME,
 )
-from alpasim_plugin.log.run_folder.writer import write_steps
+from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
+from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.renderers.weather import in_weather
+from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.lenses import through_lenses
 from alpasim_plugin.runs.plan import Cell, RunOptions
@@ -49,6 +55,22 @@ from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
+
+# Of a manifest: what driving and scoring found, which holds for a copy too.
+COPIED = (
+    "frames",
+    "first_call_frames",
+    "steps",
+    "frame_events",
+    "passed_path_end",
+    "has_camera",
+    "fixer",
+    "policy_facts",
+    "metrics",
+    "events",
+    "contacts",
+    "censored",
+)
 
 
 @dataclass(frozen=True)
@@ -78,32 +100,30 @@ class NotAsked(Renderer):
         """Refuse."""
         raise AssertionError("a renderer that was not built is asked for a frame")
 
-    def facts(self) -> Mapping[str, Any]:
-        """Say that the renderer was left out."""
-        return {"built": False, "why": "the policy has no camera"}
-
 
 def build_parts(
     cell: Cell, options: RunOptions, scenario: Scenario, threads: int, is_shown: bool = False
 ) -> RolloutParts:
     """Build the parts that a cell names; of a policy without a camera, whose rollout no renderer
-    changes, no renderer unless its frames are kept or ``is_shown``.
+    changes, no renderer unless ``is_shown``.
     """
-    name, fixer = cell.renderer.name, cell.renderer.fixer
     policy = build(cell.policy, scenario=scenario)
     renderer: Renderer = NotAsked()
-    if is_shown or options.video != "none" or complete(policy, Policy).sensors:
+    if is_shown or complete(policy, Policy).sensors:
         renderer = make_renderer(cell.renderer, scenario, cell.seed, options.device, threads)
     return RolloutParts(
         renderer,
         policy,
         cell.rollout_key,
-        {
-            "sensorsim": name if fixer is None else f"{name} ({fixer.label})",
-            "egodriver": cell.policy.name,
-        },
+        {"sensorsim": _service_name(cell.renderer), "egodriver": cell.policy.name},
         build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
     )
+
+
+def _service_name(renderer: RendererSpec) -> str:
+    """Return what a log calls a renderer."""
+    fixer = renderer.fixer
+    return renderer.name if fixer is None else f"{renderer.name} ({fixer.label})"
 
 
 def run_cell(
@@ -129,6 +149,69 @@ def run_cell(
         load: Gives the scenario; None reads it from its file.
     """
     folder = root / cell.folder
+    with _writing_manifest(cell, options, folder) as manifest:
+        scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
+        with parts_print_to_stderr(folder / OUTPUT_NAME):
+            announce(f"loading {cell.renderer.name} and {cell.policy.name}")
+            parts = builder(cell, options, scenario, threads)
+            announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
+            recorder = _drive(parts, cell, options, scenario, folder)
+        manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
+        announce(f"scoring {cell.scene}")
+        manifest |= _score(folder, cell, options, scenario)
+        if _wants_film(options, manifest):
+            if manifest["has_camera"]:
+                recorder.save_video()
+            else:
+                _render_film(cell, options, scenario, folder, threads)
+    return manifest
+
+
+def is_copied(manifest: Mapping[str, Any]) -> bool:
+    """Tell whether the same rollout behind other renderers is a copy of this one, which their
+    images could not have changed.
+    """
+    return manifest["status"] == "ok" and not manifest["has_camera"]
+
+
+def copy_cell(
+    cell: Cell, options: RunOptions, root: Path, threads: int, original: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Copy the rollout of a policy without a camera into the cell of another renderer and return
+    the manifest. It is neither driven nor scored again; its film is rendered.
+
+    The log names the cell's own renderer and session: it is the log that driving would have made.
+
+    Args:
+        cell: The copy.
+        options: Of the run.
+        root: The run folder.
+        threads: Of the film.
+        original: Manifest of the rollout that was driven; see `is_copied`.
+    """
+    folder, source = root / cell.folder, root / original["path"]
+    with _writing_manifest(cell, options, folder) as manifest:
+        announce(f"copying {cell.scene}")
+        session = session_uuid(cell.seed, cell.rollout_key)
+        renaming = Renaming(session_uuid=session, renderer=_service_name(cell.renderer))
+        copy_log(source / LOG_NAME, folder / LOG_NAME, renaming)
+        for name in (FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME):
+            if os.path.exists(source / name):
+                shutil.copyfile(source / name, folder / name)
+        copy_steps(source, folder, cell.renderer.name)
+        manifest |= {key: original[key] for key in COPIED if key in original}
+        manifest |= {"copied_from": original["path"], "session_uuid": session}
+        if _wants_film(options, manifest):
+            with parts_print_to_stderr(folder / OUTPUT_NAME):
+                _render_film(cell, options, _scenario(cell.ref), folder, threads)
+    return manifest
+
+
+@contextmanager
+def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator[dict[str, Any]]:
+    """Clear the folder of a rollout, yield its manifest, and write it after the block; what the
+    block raises becomes the rollout's failure.
+    """
     began = time.perf_counter()
     # OpenCV's pool is outside the thread budget, and frames are too small to gain from it.
     cv2.setNumThreads(1)
@@ -142,25 +225,26 @@ def run_cell(
         # The manifest first: without it nothing is trusted.
         for name in (MANIFEST, *DRIVEN, *DERIVED, SAME_POSES, WHY_NAME):
             (folder / name).unlink(missing_ok=True)
-        scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
-        with parts_print_to_stderr(folder / OUTPUT_NAME):
-            announce(f"loading {cell.renderer.name} and {cell.policy.name}")
-            parts = builder(cell, options, scenario, threads)
-            announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
-            recorder = _drive(parts, cell, options, scenario, folder)
-        manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
-        announce(f"scoring {cell.scene}")
-        manifest |= _score(folder, cell, options, scenario)
-        has_failed = bool(manifest["events"])
-        if options.video == "all" or (options.video == "failures" and has_failed):
-            recorder.save_video()
+        yield manifest
         manifest["status"] = "ok"
     except Exception as error:
         manifest |= _failure(error, folder)
         _log_traceback(error, folder)
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
-    return manifest
+
+
+def _wants_film(options: RunOptions, manifest: Mapping[str, Any]) -> bool:
+    has_failed = bool(manifest["events"])
+    return options.video == "all" or (options.video == "failures" and has_failed)
+
+
+def _render_film(
+    cell: Cell, options: RunOptions, scenario: Scenario, folder: Path, threads: int
+) -> None:
+    announce(f"film of {cell.renderer.name}")
+    renderer = make_renderer(cell.renderer, scenario, cell.seed, options.device, threads)
+    write_film(folder, scenario, renderer)
 
 
 def _begun(cell: Cell) -> dict[str, Any]:
@@ -199,7 +283,8 @@ def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
     """
     rendered = dict(complete(parts.renderer, Renderer).facts())
     driven = dict(complete(parts.policy, Policy).facts())
-    facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}}
+    has_camera = bool(complete(parts.policy, Policy).sensors)
+    facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}, "has_camera": has_camera}
     if rendered and not has_fixer:
         facts["renderer_facts"] = rendered
     if driven:

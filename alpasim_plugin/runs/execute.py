@@ -18,14 +18,24 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.stage import shown_in
-from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.log.run_folder.manifests import Action, RolloutState, write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
-from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runs.cell import (
+    copy_cell,
+    failed_manifest,
+    find_rollout_state,
+    is_copied,
+    rescore_cell,
+    run_cell,
+)
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
+Job = tuple[Cell, dict[str, Any] | None]  # with the manifest of the rollout that it is a copy of
+Done = Iterator[tuple[Cell, dict[str, Any]]]
+ACTIONS: dict[Action, str] = {"none": "used", "score": "scoring", "drive": "driving"}
 
 
 @dataclass(frozen=True)
@@ -78,10 +88,14 @@ class HowToRun:
         return {} if self.executor.is_local else {"executor": str(self.executor)}
 
     @property
+    def here(self) -> Threads:
+        """Give the workers of this machine and their threads."""
+        return self.threads if self.executor.is_local else thread_budget(1, 1)
+
+    @property
     def cores_here(self) -> int:
         """Give the cores of this machine that a rollout may use when the others are done."""
-        here = self.threads if self.executor.is_local else thread_budget(1, 1)
-        return here.workers * here.per_worker
+        return self.here.workers * self.here.per_worker
 
 
 def execute(
@@ -94,8 +108,9 @@ def execute(
     """Run every unfinished cell and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
-    scored again from their logs; damaged ones are driven again. On SIGINT, SIGTERM or SIGHUP the
-    workers are stopped; finished rollouts stay on disk.
+    scored again from their logs; damaged ones are driven again. A policy without a camera drives
+    behind the first renderer alone, and its other rollouts are copies of that one. On SIGINT,
+    SIGTERM or SIGHUP the workers are stopped; finished rollouts stay on disk.
 
     Args:
         plan: The run.
@@ -106,11 +121,24 @@ def execute(
     """
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
+    copies: list[tuple[Cell, Cell]] = []  # with the rollout that each is a copy of
+    changed: set[Path] = set()  # rollouts of which no copy is kept
+    originals: dict[tuple[str, str, int], Cell] = {}
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
+        if action != "none":
+            changed.add(cell.folder)
+        original = cell
+        if cell.policy.is_blind:
+            original = originals.setdefault((cell.policy.name, cell.scene, cell.seed), cell)
+        known = manifests.get(original.folder)
+        waits = original is not cell and (known is None or is_copied(known))
         if state.damage:
-            doing = "driving again" if action == "drive" else "scoring again"
+            doing = "copying again" if waits else f"{ACTIONS[action]} again"
             notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
+        if waits and (changed & {cell.folder, original.folder} or not _is_copy(state, original)):
+            copies.append((cell, original))
+            continue
         if action == "drive" or state.manifest is None:
             todo.append(cell)
             continue
@@ -119,49 +147,71 @@ def execute(
             manifest = rescore_cell(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
-    if how.executor.is_local:
-        driven = _run_local(todo, plan, root, how)
-    else:
-        driven = _run_on_ray(todo, plan, root, how)
-    try:
-        for cell, manifest in driven:
+
+    def take(done: Done) -> None:
+        for cell, manifest in done:
             manifests[cell.folder] = manifest
             on_done(manifest, False)
+
+    try:
+        take(_run(todo, plan, root, how))
+        jobs: list[Job] = []
+        todo = []
+        for cell, original in copies:
+            driven = manifests[original.folder]
+            if is_copied(driven):
+                jobs.append((cell, driven))
+            else:
+                todo.append(cell)
+        take(_run(todo, plan, root, how))
+        take(_run_local(jobs, plan, root, how))
     finally:
         shutil.rmtree(root / STAGES, ignore_errors=True)
     return [manifests[cell.folder] for cell in plan.cells]
 
 
-Done = Iterator[tuple[Cell, dict[str, Any]]]
+def _is_copy(state: RolloutState, original: Cell) -> bool:
+    """Tell whether a rollout on disk is the copy of another one."""
+    copied_from = None if state.manifest is None else state.manifest.get("copied_from")
+    return bool(copied_from == original.folder.as_posix())
 
 
-def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Run cells in this process, or in workers that write the run folder themselves."""
-    workers = how.threads.workers
+def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
+    """Drive cells where the executor says."""
+    if not todo:
+        return iter(())
+    if how.executor.is_local:
+        return _run_local([(cell, None) for cell in todo], plan, root, how)
+    return _run_on_ray(todo, plan, root, how)
+
+
+def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
+    """Drive or copy cells in this process, or in workers that write the run folder themselves."""
+    workers, threads = how.here.workers, how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
-        todo = sorted(todo, key=lambda cell: cell.renderer.fixer is None)
-    threads = how.threads.per_worker
-    drive = partial(_drive, plan.options, root, threads)
+        jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
+    work = partial(_work, plan.options, root, threads)
 
-    def written(cell: Cell) -> dict[str, Any] | None:
+    def written(job: Job) -> dict[str, Any] | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
-        action, state = find_rollout_state(cell, root, reuse_undigested=True)
+        action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for cell, result in run_jobs(drive, todo, workers, threads, how.limit_s, written):
+    for (cell, _), result in run_jobs(work, jobs, workers, threads, how.limit_s, written):
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-def _drive(options: RunOptions, root: Path, threads: int, cell: Cell) -> dict[str, Any]:
-    """Run a cell in a worker of this machine."""
+def _work(options: RunOptions, root: Path, threads: int, job: Job) -> dict[str, Any]:
+    """Drive or copy a cell in a worker of this machine."""
+    cell, original = job
     with shown_in(root / STAGES):
-        return run_cell(cell, options, root, threads)
+        if original is None:
+            return run_cell(cell, options, root, threads)
+        return copy_cell(cell, options, root, threads, original)
 
 
 def _run_on_ray(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Run cells on the nodes of a cluster; only this process writes the run folder."""
-    if not todo:
-        return
     from alpasim_plugin.runs.executors.ray_backend import run_on_ray
 
     workers = how.threads.workers

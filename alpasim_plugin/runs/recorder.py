@@ -8,7 +8,7 @@ import hashlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -127,7 +127,6 @@ class Recorder:
         self._film: list[U8] = []
         self._film_camera = ""
         self._film_period_us = 0
-        self._only_watched = False
         self._last_query_us = -1
         self._steps = 0
         self._n_steps = 0
@@ -157,20 +156,8 @@ class Recorder:
         """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under
         their own names.
         """
-        if self._only_watched:
-            return nullcontext()
         self._first_call = self._first_call or frames
         return self._times.measure("render", frames, lambda: renderer.stage_ms)
-
-    def watch(self, scenario: Scenario) -> tuple[SensorSpec, ...]:
-        """Return the camera to render for a policy without one: the scenario's first if a video is
-        kept, else none.
-
-        Its frames go into the pictures alone: neither the log nor times nor scores depend on
-        whether somebody watches.
-        """
-        self._only_watched = self._keep_frames and bool(scenario.cameras)
-        return (SensorSpec(scenario.cameras[0].name),) if self._only_watched else ()
 
     # --- in the loop's order
 
@@ -185,7 +172,7 @@ class Recorder:
             self._scenario, self._session, self._seed, clock.n_steps, self._versions
         )
         self._writer = AslWriter(self.folder / LOG_NAME, header)
-        self._writer.begin([] if self._only_watched else list(cameras.values()))
+        self._writer.begin(list(cameras.values()))
 
     def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
         """Log the true poses of the ego and the actors."""
@@ -194,20 +181,19 @@ class Recorder:
 
     def frame(self, frame: Frame, request: RenderRequest) -> None:
         """Log one camera frame."""
-        if not self._only_watched:
-            with self.stage("log"):
-                if self._images != "none":
-                    self._log.render_request([request], self._images)
-                    self._log.camera_image(frame, self._images, request.camera.shutter_us)
-                opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
-                facts = {
-                    "t_us": frame.t_us,
-                    "camera": frame.camera,
-                    "opacity_mean": opacity,
-                    "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
-                    "events": " ".join(frame.events),
-                }
-                self._frames.append(facts | dict(frame.facts))
+        with self.stage("log"):
+            if self._images != "none":
+                self._log.render_request([request], self._images)
+                self._log.camera_image(frame, self._images, request.camera.shutter_us)
+            opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
+            facts = {
+                "t_us": frame.t_us,
+                "camera": frame.camera,
+                "opacity_mean": opacity,
+                "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
+                "events": " ".join(frame.events),
+            }
+            self._frames.append(facts | dict(frame.facts))
         if frame.camera == self._film_camera:
             self._film.append(frame.rgb)
 

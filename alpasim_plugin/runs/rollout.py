@@ -103,15 +103,12 @@ class Loop:
         self._plans = PlanQueue(scenario.latency)
         self.state = LoopState.at_start(scenario, clock.n_steps)
         self.actors: Mapping[str, F64] = {}
-        self._watched = (
-            () if sensors else recorder.watch(scenario)
-        )  # what a policy without cameras does can be seen all the same
         self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
         self.path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
         forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
         self._rig = CameraRig(
             scenario,
-            sensors or self._watched,
+            sensors,
             clock,
             self._cadence,
             forecaster,
@@ -131,7 +128,6 @@ class Loop:
         plans = self._plans
         state = self.state
         recorder.start(clock, self._rig.specs)
-        seen = {} if self._watched else self._rig.specs
         for tick in clock.ticks():
             with recorder.stage("actors"):
                 self.actors = self._world.step(tick.t_us, state.ego)
@@ -139,16 +135,15 @@ class Loop:
             requests = self._rig.requests(tick, state.history, self.actors)
             with recorder.rendering(renderer, len(requests)):
                 frames = checked_frames(renderer, requests)
-            if frames and not self._watched:
+            if frames:
                 plans.frames(tick.t_us, renderer.stage_ms)
             for frame, request in zip(frames, requests, strict=True):
-                if frame.camera in seen:
-                    state.frames[frame.camera] = frame
+                state.frames[frame.camera] = frame
                 recorder.frame(frame, request)
             if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
                 return
             if self._cadence.queries_at(tick.t_us):
-                observation = state.observe(seen)
+                observation = state.observe(self._rig.specs)
                 recorder.policy_query(observation, clock)
                 began = time.perf_counter()
                 with recorder.stage("policy"):

@@ -10,16 +10,15 @@ from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import SimrunError
-from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.parts import RendererSpec
-from alpasim_plugin.core.types import CameraSpec, LoggedImage, RenderRequest, RolloutLog
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import encode_image, read_asl
 from alpasim_plugin.log.debug import WIDTH_PX
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
+from alpasim_plugin.runs.cameras import logged_request
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
-from alpasim_plugin.runs.loop_state import drawn
 from alpasim_plugin.runs.plan import Cell, RunPlan
 from evaluators.metrics.outcomes import first_failure
 
@@ -63,22 +62,10 @@ def _images(
     try:
         renderer = make_renderer(spec, scenario, cell.seed, plan.options.device, threads)
         for image in until[-FRAMES:] if renderer.block is None else ():
-            request = _request(log, image, cameras[image.camera])
+            request = logged_request(log, cameras[image.camera], image.end_us)
             frame = checked_frames(renderer, [request])[0]
             data = encode_image(smaller(frame.rgb, WIDTH_PX), "jpeg", 85)
             images.append((image.end_us, base64.b64encode(data).decode()))
     except SimrunError:
         return []  # its own rollouts show the error
     return images
-
-
-def _request(log: RolloutLog, image: LoggedImage, camera: CameraSpec) -> RenderRequest:
-    """Return the request for an image of a log, from the logged poses."""
-    t_us = image.end_us
-    poses = {
-        name: interpolate(actor.track, t_us)
-        for name, actor in log.actors.items()
-        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
-    }
-    shutter = interpolate(log.ego, [image.start_us, t_us]) @ inverse(log.T_rig_box)
-    return RenderRequest(t_us, camera, shutter @ camera.T_rig_camera, drawn(poses))

@@ -145,7 +145,7 @@ def _at(own: Own, name: str, t_us: int) -> float | None:
 
 
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
-MAX_TEXT = 300  # letters of a failure's message
+MAX_TEXT = 300  # letters of a note
 COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
 CLIP = "front.mp4"
 
@@ -181,10 +181,7 @@ def rollout_block(run: Run) -> RolloutBlock:
         "seed": [str(r.seed) for r in rollouts],
         "folder": [quote(r.path) for r in rollouts],
         "outcome": [in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts],
-        "failure": [
-            "" if r.ok else f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT]
-            for r in rollouts
-        ],
+        "note": [_note(r)[:MAX_TEXT] for r in rollouts],
     }
     walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
     numbers = [walls | {"data": [_short(r.wall_s) for r in rollouts]}]
@@ -209,6 +206,13 @@ def rollout_block(run: Run) -> RolloutBlock:
     plain = json.dumps(document, separators=(",", ":")).encode()
     data = base64.b64encode(gzip.compress(plain, mtime=0)).decode()
     return RolloutBlock(data, len(rollouts), len(run.rollouts) - len(rollouts))
+
+
+def _note(rollout: Rollout) -> str:
+    """Say why a rollout failed, or which one it is a copy of."""
+    if not rollout.ok:
+        return f"{rollout.failure_class or 'unknown cause'}: {rollout.failure}"
+    return f"copied from {rollout.copied_from}" if rollout.copied_from else ""
 
 
 def _short(value: float | None) -> float | None:

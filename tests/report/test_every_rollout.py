@@ -48,7 +48,7 @@ def test_every_row_and_number_of_the_table_is_in_the_block(run: Run) -> None:
         assert bool(state & COLLIDED) is (rollout.ok and rollout.flag("collision_any"))
         assert bool(state & OTHERWISE) is (rollout.ok and rollout.flag("offroad"))
         assert bool(state & HAS_FOLDER) is (run.folder / rollout.path).is_dir()
-        assert texts["failure"][i].startswith(rollout.failure_class if not rollout.ok else "")
+        assert texts["note"][i].startswith(rollout.failure_class if not rollout.ok else "")
     for column in found["numbers"][1:]:
         for got, rollout in zip(column["data"], run.rollouts, strict=True):
             exact = rollout.metrics.get(column["name"])

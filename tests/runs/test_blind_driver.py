@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin import load_scenario, make_policy, make_renderer, run_rollout
-from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.log.run_folder.manifests import read_manifest
 from evaluators import reduce_rollout, score
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
@@ -49,16 +47,3 @@ def test_every_shipped_suite_is_listed() -> None:
         path.stem for path in (Path(__file__).parents[2] / "scenarios" / "suites").glob("*.yaml")
     }
     assert shipped - {"all"} == set(NEEDS_EYES)  # `all` is the union of the others
-
-
-def test_no_renderer_is_built_for_a_driver_without_a_camera_and_the_rollout_says_so(tmp_path):
-    command = ["--renderer", f"clean,{GREY}", "--policy", "log-replay", "--workers", "1"]
-    settings = ["--set", "timing.duration_us=1500000", "--no-report", "--out", str(tmp_path / "r")]
-    assert run_command([*command, "--video", "none", *settings, "smoke/straight"]) == 0
-    manifests = [read_manifest(path.parent) for path in (tmp_path / "r").rglob("manifest.json")]
-    assert [one["renderer_facts"]["built"] for one in manifests] == [False, False]
-    assert manifests[0]["metrics"] == manifests[1]["metrics"]
-    film = [*command, "--video", "all", *settings[:-1], str(tmp_path / "f"), "smoke/straight"]
-    assert run_command(film) == 0
-    manifests = [read_manifest(path.parent) for path in (tmp_path / "f").rglob("manifest.json")]
-    assert not any("built" in one.get("renderer_facts", {}) for one in manifests)

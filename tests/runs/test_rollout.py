@@ -205,25 +205,6 @@ def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
     assert recorder.facts()["frame_events"] == {"black": 30}
 
 
-def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(
-    straight_road: Scenario, tmp_path: Path
-) -> None:
-    logs, facts = [], []
-    for keep in (False, True):
-        folder = tmp_path / str(keep)
-        folder.mkdir()
-        recorder = Recorder(straight_road, 0, folder, keep_frames=keep)
-        policy = make_policy("log-replay", straight_road)
-        run_rollout(straight_road, make_renderer("clean", straight_road), policy, 0, recorder)
-        recorder.save_video()
-        logs.append((folder / LOG_NAME).read_bytes())
-        facts.append({key: value for key, value in recorder.facts().items() if key != "stage_ms"})
-    assert (tmp_path / "True" / "front.mp4").stat().st_size > 1000
-    assert not (tmp_path / "False" / "front.mp4").exists()
-    assert logs[0] == logs[1]
-    assert facts[0] == facts[1]
-
-
 def test_a_failed_rollout_leaves_no_finished_log(straight_road: Scenario, tmp_path: Path) -> None:
     recorder = Recorder(straight_road, 0, tmp_path)
     with pytest.raises(PolicyError), recorder:

@@ -238,6 +238,7 @@ ROLLOUTS_TABLE = TableSchema(
         Column("failure_class", "text"),
         Column("failure", "text"),
         Column("path", "text"),
+        Column("copied_from", "text"),
         Column("wall_s", "number", least=0.0),
         Column("frames", "integer", least=0),
         Column("steps", "integer", least=0),

@@ -134,8 +134,8 @@
       const facts = make("dl");
       for (const one of numbers) facts.append(make("dt", one.name), make("dd", number(one, row)));
       const title = make("h3", `${text("scene", row)}, ${text("renderer", row)}, ${text("policy", row)}, seed ${text("seed", row)}: ${outcome(row)}`);
-      const failure = text("failure", row);
-      picked.replaceChildren(title, ...(failure ? [make("p", failure, { className: "message" })] : []), links, facts);
+      const note = text("note", row);
+      picked.replaceChildren(title, ...(note ? [make("p", note, { className: "message" })] : []), links, facts);
       picked.hidden = false;
       draw();
     };
