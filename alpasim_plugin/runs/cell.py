@@ -160,9 +160,8 @@ def run_cell(
         announce(f"scoring {cell.scene}")
         manifest |= _score(folder, cell, options, scenario)
         if _wants_film(options, manifest):
-            if manifest["has_camera"]:
-                recorder.save_video()
-            else:
+            recorder.save_video()
+            if not manifest["has_camera"]:
                 _render_film(cell, options, scenario, folder, threads)
     return manifest
 
@@ -235,8 +234,7 @@ def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator
 
 
 def _wants_film(options: RunOptions, manifest: Mapping[str, Any]) -> bool:
-    has_failed = bool(manifest["events"])
-    return options.video == "all" or (options.video == "failures" and has_failed)
+    return options.video == "all" or (options.video == "failures" and bool(manifest["events"]))
 
 
 def _render_film(

@@ -18,7 +18,7 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.stage import shown_in
-from alpasim_plugin.log.run_folder.manifests import Action, RolloutState, write_manifest
+from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
     copy_cell,
@@ -35,7 +35,6 @@ from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 Job = tuple[Cell, dict[str, Any] | None]  # with the manifest of the rollout that it is a copy of
 Done = Iterator[tuple[Cell, dict[str, Any]]]
-ACTIONS: dict[Action, str] = {"none": "used", "score": "scoring", "drive": "driving"}
 
 
 @dataclass(frozen=True)
@@ -122,23 +121,20 @@ def execute(
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     copies: list[tuple[Cell, Cell]] = []  # with the rollout that each is a copy of
-    changed: set[Path] = set()  # rollouts of which no copy is kept
     originals: dict[tuple[str, str, int], Cell] = {}
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
-        if action != "none":
-            changed.add(cell.folder)
         original = cell
         if cell.policy.is_blind:
             original = originals.setdefault((cell.policy.name, cell.scene, cell.seed), cell)
-        known = manifests.get(original.folder)
-        waits = original is not cell and (known is None or is_copied(known))
         if state.damage:
-            doing = "copying again" if waits else f"{ACTIONS[action]} again"
-            notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
-        if waits and (changed & {cell.folder, original.folder} or not _is_copy(state, original)):
-            copies.append((cell, original))
-            continue
+            notify(f"damaged: {'; '.join(map(str, state.damage))}; it is made again")
+        driven = manifests.get(original.folder)  # None where it is still to be driven
+        if original is not cell and (driven is None or is_copied(driven)):
+            copied_from = state.manifest and state.manifest.get("copied_from")
+            if driven is None or action != "none" or copied_from != driven["path"]:
+                copies.append((cell, original))
+                continue
         if action == "drive" or state.manifest is None:
             todo.append(cell)
             continue
@@ -155,34 +151,24 @@ def execute(
 
     try:
         take(_run(todo, plan, root, how))
-        jobs: list[Job] = []
-        todo = []
-        for cell, original in copies:
-            driven = manifests[original.folder]
-            if is_copied(driven):
-                jobs.append((cell, driven))
-            else:
-                todo.append(cell)
-        take(_run(todo, plan, root, how))
-        take(_run_local(jobs, plan, root, how))
+        jobs = [(cell, manifests[original.folder]) for cell, original in copies]
+        take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
+        take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
     finally:
         shutil.rmtree(root / STAGES, ignore_errors=True)
     return [manifests[cell.folder] for cell in plan.cells]
 
 
-def _is_copy(state: RolloutState, original: Cell) -> bool:
-    """Tell whether a rollout on disk is the copy of another one."""
-    copied_from = None if state.manifest is None else state.manifest.get("copied_from")
-    return bool(copied_from == original.folder.as_posix())
-
-
 def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Drive cells where the executor says."""
-    if not todo:
-        return iter(())
+    """Drive cells where the executor says; with Ray only this process writes the run folder."""
     if how.executor.is_local:
-        return _run_local([(cell, None) for cell in todo], plan, root, how)
-    return _run_on_ray(todo, plan, root, how)
+        yield from _run_local([(cell, None) for cell in todo], plan, root, how)
+    elif todo:
+        from alpasim_plugin.runs.executors.ray_backend import run_on_ray
+
+        workers = how.threads.workers
+        for cell, got in run_on_ray(plan, todo, root, how.executor, workers, how.limit_s):
+            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
 def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
@@ -208,15 +194,6 @@ def _work(options: RunOptions, root: Path, threads: int, job: Job) -> dict[str, 
         if original is None:
             return run_cell(cell, options, root, threads)
         return copy_cell(cell, options, root, threads, original)
-
-
-def _run_on_ray(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Run cells on the nodes of a cluster; only this process writes the run folder."""
-    from alpasim_plugin.runs.executors.ray_backend import run_on_ray
-
-    workers = how.threads.workers
-    for cell, got in run_on_ray(plan, todo, root, how.executor, workers, how.limit_s):
-        yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:

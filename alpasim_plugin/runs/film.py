@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import RenderRequest, Scenario, SensorSpec
+from alpasim_plugin.core.types import U8, Scenario, SensorSpec
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, VIDEO_NAME
 from alpasim_plugin.runs.cameras import logged_request
@@ -35,21 +34,13 @@ def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
     log = read_asl(folder / LOG_NAME)
     times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
     requests = [logged_request(log, camera, t_us) for t_us in times]
-    blocks = list(_blocks(requests, renderer.block or BlockRule(1, 1), renderer.lookahead))
-    images = (frame.rgb for block in blocks for frame in checked_frames(renderer, block))
-    if blocks:
+    rule = renderer.block or BlockRule(1, 1)
+    images: list[U8] = []
+    for number in count():
+        end = len(images) + rule.frames(number)
+        if end > len(requests):
+            break
+        frames = checked_frames(renderer, requests[len(images) : end])
+        images += [frame.rgb for frame in frames]
+    if images:
         write_mp4(folder / VIDEO_NAME, images, 1e6 / period_us)
-
-
-def _blocks(
-    requests: Sequence[RenderRequest], rule: BlockRule, lookahead: int
-) -> Iterator[list[RenderRequest]]:
-    """Yield whole blocks of requests, each request with so many of the next ones."""
-    start, number = 0, 0
-    while start + rule.frames(number) <= len(requests):
-        end = start + rule.frames(number)
-        yield [
-            replace(requests[i], ahead=requests[i + 1 : i + 1 + lookahead])
-            for i in range(start, end)
-        ]
-        start, number = end, number + 1
