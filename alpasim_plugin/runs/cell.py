@@ -56,22 +56,6 @@ from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
-# Of a manifest: what driving and scoring found, which holds for a copy too.
-COPIED = (
-    "frames",
-    "first_call_frames",
-    "steps",
-    "frame_events",
-    "passed_path_end",
-    "has_camera",
-    "fixer",
-    "policy_facts",
-    "metrics",
-    "events",
-    "contacts",
-    "censored",
-)
-
 
 @dataclass(frozen=True)
 class RolloutParts:
@@ -159,7 +143,7 @@ def run_cell(
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         announce(f"scoring {cell.scene}")
         manifest |= _score(folder, cell, options, scenario)
-        if _wants_film(options, manifest):
+        if _wants_film(options.video, manifest):
             recorder.save_video()
             if not manifest["has_camera"]:
                 _render_film(cell, options, scenario, folder, threads)
@@ -174,7 +158,7 @@ def is_copied(manifest: Mapping[str, Any]) -> bool:
 
 
 def copy_cell(
-    cell: Cell, options: RunOptions, root: Path, threads: int, original: Mapping[str, Any]
+    cell: Cell, options: RunOptions, root: Path, threads: int, original: dict[str, Any]
 ) -> dict[str, Any]:
     """Copy the rollout of a policy without a camera into the cell of another renderer and return
     the manifest. It is neither driven nor scored again; its film is rendered.
@@ -198,9 +182,9 @@ def copy_cell(
             if os.path.exists(source / name):
                 shutil.copyfile(source / name, folder / name)
         copy_steps(source, folder, cell.renderer.name)
-        manifest |= {key: original[key] for key in COPIED if key in original}
-        manifest |= {"copied_from": original["path"], "session_uuid": session}
-        if _wants_film(options, manifest):
+        manifest |= original | manifest
+        manifest |= {"copied_from": original["path"], "session_uuid": session, "stage_ms": {}}
+        if _wants_film(options.video, manifest):
             with parts_print_to_stderr(folder / OUTPUT_NAME):
                 _render_film(cell, options, _scenario(cell.ref), folder, threads)
     return manifest
@@ -227,14 +211,15 @@ def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator
         yield manifest
         manifest["status"] = "ok"
     except Exception as error:
+        manifest.pop("metrics", None)  # a film that failed leaves a rollout without values
         manifest |= _failure(error, folder)
         _log_traceback(error, folder)
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
 
 
-def _wants_film(options: RunOptions, manifest: Mapping[str, Any]) -> bool:
-    return options.video == "all" or (options.video == "failures" and bool(manifest["events"]))
+def _wants_film(video: str, manifest: Mapping[str, Any]) -> bool:
+    return video == "all" or (video == "failures" and bool(manifest["events"]))
 
 
 def _render_film(
@@ -369,8 +354,8 @@ def find_rollout_state(
     stops_alike = manifest.get("stops_at_path_end") == cell.stops_at_path_end
     if manifest.get("passed_path_end") and not stops_alike:
         return "drive", state
-    wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
-    if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
+    is_filmed = VIDEO_NAME in manifest["files"] or manifest.get("video") == video
+    if _wants_film(video, manifest) and not is_filmed:
         return "drive", state
     if state.action == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state

@@ -6,8 +6,7 @@ AlpaSim's own evaluation takes as it is.
     OUT/scenes/SCENE.usdz
 
 The logs are copied entry by entry. What differs: the main camera is called as AlpaSim's image check
-expects it, and the session ids of runs of older versions are replaced by ones that sort as their
-seeds.
+expects it.
 """
 
 from __future__ import annotations
@@ -39,7 +38,6 @@ from alpasim_plugin.log.asl import Renaming, copy_log
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
-from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.score_logs import check_vouched
 from evaluators.alpasim import EvalSettings
@@ -291,7 +289,6 @@ def _export_rollout(
     source = root / manifest["path"] / LOG_NAME
     check_vouched(source)
     rollout = read_asl(source)
-    uuid = session_uuid(int(manifest["seed"]), str(manifest["rollout_key"]))
     cameras = alpasim_cameras(scenario.cameras)
     names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
     if not rollout.images:
@@ -299,9 +296,9 @@ def _export_rollout(
             f"{manifest['path']}: the log holds no camera image, and AlpaSim's evaluation needs them",
             f"run again without {manifest['policy']}: it uses no camera",
         )
-    target = folder / "rollouts" / manifest["scene"] / uuid
+    target = folder / "rollouts" / manifest["scene"] / rollout.session_uuid
     target.mkdir(parents=True)
-    copy_log(source, target / LOG_NAME, Renaming(uuid, names))
+    copy_log(source, target / LOG_NAME, Renaming(cameras=names))
     (target / COMPLETE).touch()
     # Note what AlpaSim's minADE will lack.
     reach_us = [

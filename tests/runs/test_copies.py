@@ -89,7 +89,7 @@ def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path: Pa
         sorted(reused for _, reused in drive(plan, tmp_path)[1].results) == [False] * 2 + [True] * 2
     )
     assert origins(tmp_path) == made
-    assert inspect_run(tmp_path, full=True).whole
+    assert inspect_run(tmp_path, full=True).damage == ()
 
 
 def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: Path) -> None:
