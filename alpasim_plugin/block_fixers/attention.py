@@ -140,21 +140,6 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     return out.transpose(1, 2).flatten(2)
 
 
-def visible_latents(start: int, end: int, window: int | None, sink: int) -> list[int]:
-    """Return the latents that are visible to the block ``[start, end)``, oldest first.
-
-    Example:
-        >>> visible_latents(8, 10, 6, 2)
-        [0, 1, 6, 7, 8, 9]
-        >>> visible_latents(8, 10, 1, 0)
-        [8, 9]
-    """
-    if window is None:
-        return list(range(end))
-    oldest = min(start, end - (window - sink))
-    return [i for i in range(end) if i < sink or i >= oldest]
-
-
 def block_causal_attention(
     q: Tensor,
     k: Tensor,

@@ -4,24 +4,24 @@ end of each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from alpasim_plugin.core.errors import RendererError
-from alpasim_plugin.core.interfaces import Fixer, Renderer
+from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import Frame, RenderRequest
-from alpasim_plugin.fixers.loop import BlockRunner
+from alpasim_plugin.fixers.loop import BlockRunner, FixedRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 
 
-class ChunkRenderer(Renderer):
-    """A renderer session that renders all frames of a block at once, of all cameras.
+class ChunkRenderer(FixedRenderer):
+    """A session that renders all frames of a block at once, of all cameras.
 
     Args:
         runner: Renders and calls the fixer.
-        make_fixer: Makes a fixer at the start of its history.
+        make_fixer: Makes a fixer at the start of its history; not used.
         settings: Not used.
-        first: One that is made already.
+        first: A fixer that is made already.
     """
 
     def __init__(
@@ -29,31 +29,15 @@ class ChunkRenderer(Renderer):
         runner: BlockRunner,
         make_fixer: Callable[[], Fixer],
         settings: FixerSettings,
-        first: Fixer | None = None,
+        first: Fixer,
     ) -> None:
-        self.runner, self.fixer = runner, first or make_fixer()
-        self.block = self.fixer.blocks
+        super().__init__(runner, first, "chunk")
+        self.block = first.blocks
         self.frames = self.blocks = 0
 
-    @property
-    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
-        """Times of the last call by stage, without the base renderer's."""
-        return self.runner.stage_ms
-
-    def facts(self) -> dict[str, Any]:
-        """Return the fixer's label and the counts so far."""
-        fixer = self.fixer
-        return {
-            "label": fixer.label,
-            "trained": fixer.trained,
-            "mode": "chunk",
-            "frames": self.frames,
-            "blocks": self.blocks,
-        }
-
-    def render(self, request: RenderRequest) -> Frame:
-        """Render a block of one frame; see `render_batch`."""
-        return self.render_batch([request])[0]
+    def counts(self) -> dict[str, Any]:
+        """Return the number of frames and of blocks so far."""
+        return {"frames": self.frames, "blocks": self.blocks}
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Return the frames of one block, in the order of the requests.

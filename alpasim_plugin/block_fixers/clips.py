@@ -7,6 +7,7 @@ the size to crop to after decoding.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,38 +24,25 @@ SIDE = 8  # spatial compression: pixels per latent along a side
 TOKEN_PX = 16  # side of a token
 
 
-def on_grid(frames: int, group: int = GROUP) -> int:
-    """Return the smallest 1 + ``group`` * k that is not below ``frames``.
-
-    Example:
-        >>> [on_grid(n) for n in (1, 2, 5, 6)]
-        [1, 5, 5, 9]
-    """
-    return 1 + -(-(frames - 1) // group) * group
-
-
-def group_ends(frames: int, first: bool, groups: int | None = 1) -> list[int]:
-    """Return where each pass over an encoder ends.
-
-    Args:
-        frames: Frames at hand.
-        first: Whether they start a video, so that the first latent holds one frame.
-        groups: Latents of a pass; None for all in one.
-
-    Example:
-        >>> group_ends(13, first=True), group_ends(12, first=False), group_ends(13, first=True, groups=2)
-        ([1, 5, 9, 13], [4, 8, 12], [5, 13])
-    """
-    latents = frames // GROUP + first
-    ends = [GROUP * n - (GROUP - 1 if first else 0) for n in range(1, latents + 1)]
-    step = groups or latents
-    return [*ends[step - 1 : -1 : step], ends[-1]]
-
-
 def pass_ends(latents: int, size: int | None = 1) -> list[int]:
-    """Return where each pass over a decoder ends, ``size`` latents a pass (None: all in one)."""
+    """Return where each pass over ``latents`` ends, ``size`` latents a pass; None: all in one.
+
+    Example:
+        >>> pass_ends(4), pass_ends(4, 3)
+        ([1, 2, 3, 4], [3, 4])
+    """
     step = size or latents
     return [*range(step, latents, step), latents]
+
+
+def frame_ends(latent_ends: Sequence[int], first: bool) -> list[int]:
+    """Return where the frames of each pass end; the first latent of a video holds one frame.
+
+    Example:
+        >>> frame_ends([1, 2, 3], first=True), frame_ends([1, 2, 3], first=False)
+        ([1, 5, 9], [4, 8, 12])
+    """
+    return [GROUP * end - (GROUP - 1) * first for end in latent_ends]
 
 
 def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tensor, ClipSize]:
@@ -70,7 +58,7 @@ def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tenso
         The padded clip and the size to crop to (`crop_clip`).
     """
     size = ClipSize(*video.shape[2:])
-    extra = (-size.width % side, -size.height % side, on_grid(size.frames, group) - size.frames)
+    extra = (-size.width % side, -size.height % side, (1 - size.frames) % group)
     if any(extra):
         video = F.pad(video, (0, extra[0], 0, extra[1], 0, extra[2]), mode="replicate")
     return video, size
@@ -81,35 +69,30 @@ def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
     return video[:, :, : size.frames, : size.height, : size.width]
 
 
-def check_frames(
-    video: Tensor, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3
-) -> None:
+def check_frames(video: Tensor, first: bool) -> None:
     """Refuse clips of an invalid size.
 
     Args:
-        video: Meant to be ``(B, channels, T, H, W)`` floating point.
-        first: Whether these frames start the video (1 + group * k) or continue it (group * k).
-        group: Frames of a latent after the first.
-        side: What height and width must be a multiple of.
-        channels: Colour channels.
+        video: Meant to be ``(B, 3, T, H, W)`` floating point.
+        first: Whether these frames start the video (1 + 4k) or continue it (4k).
 
     Raises:
-        InputError: The found size, with the nearest valid one.
+        InputError: Another shape or dtype.
     """
-    if video.ndim != 5 or video.shape[1] != channels or not video.is_floating_point():
+    if video.ndim != 5 or video.shape[1] != 3 or not video.is_floating_point():
         raise InputError(
             f"a tensor {list(video.shape)} of {video.dtype} is not a floating-point video",
-            f"give (B, {channels}, T, H, W) with values in [-1, 1]",
+            "give (B, 3, T, H, W) with values in [-1, 1]",
         )
     frames, height, width = video.shape[2:]
-    if not height or not width or height % side or width % side:
+    if not height or not width or height % SIDE or width % SIDE:
         raise InputError(
-            f"frames of {height} x {width} pixels: height and width must be multiples of {side}",
+            f"frames of {height} x {width} pixels: height and width must be multiples of {SIDE}",
             "pad them with pad_clip and crop the result with crop_clip",
         )
-    if frames < 1 or (frames - first) % group:
+    if frames < 1 or (frames - first) % GROUP:
         raise InputError(
-            f"{frames} frames at the {'start' if first else 'middle'} of a stream, not {'1 + ' if first else ''}{group}k",
+            f"{frames} frames at the {'start' if first else 'middle'} of a stream, not {'1 + ' if first else ''}{GROUP}k",
             "pad them with pad_clip, which repeats the last frame",
         )
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.streaming import Float32Buffers
 from alpasim_plugin.core import seeding
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import channels_last
@@ -76,7 +75,7 @@ def fill_random(net: nn.Module, seed: int, component: str) -> None:
     net.load_state_dict(filled, assign=True)
 
 
-class LatentStats(Float32Buffers):
+class LatentStats(nn.Module):
     """Normalise and de-normalise latents; the statistics stay float32 in every precision of the
     latents.
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.attention import Attend, Rope3D, RopeTable, block_causal_attention
 from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues, TimeSignal
-from alpasim_plugin.block_fixers.kv_cache import BlockCache, GraphCache, RollingCache
+from alpasim_plugin.block_fixers.kv_cache import BlockCache, RollingCache
 from alpasim_plugin.block_fixers.layers import (
     PatchEmbed,
     RMSNorm,
@@ -87,7 +87,6 @@ class CosmosCausalDiT(nn.Module):
         sd: Mapping[str, Tensor],
         rope_ratios: tuple[float, float, float] = RELEASED_ROPE_RATIOS,
         *,
-        dtype: torch.dtype = torch.float32,
         source: str = "state dict",
     ) -> Self:
         """Build a network with sizes read from the tensors, and copy them.
@@ -96,8 +95,6 @@ class CosmosCausalDiT(nn.Module):
             sd: Tensors under the original's keys (docs/fixers.md), with or without the prefix
                 ``net.`` and an outer ``model`` or ``state_dict``.
             rope_ratios: Height, width, time; not stored in checkpoints.
-            dtype: Precision of the weights; half-precision tensors are widened by the default. Time
-                embedding and modulation stay float32.
             source: Name for error messages.
 
         Raises:
@@ -108,7 +105,7 @@ class CosmosCausalDiT(nn.Module):
         sizes = read_sizes(tensors, source)
         with torch.device("meta"):
             net = cls(sizes, rope_ratios)
-        checkpoints.load_checked(net, tensors, dtype, source, HINT, FLOAT32_KEYS)
+        checkpoints.load_checked(net, tensors, source, HINT)
         return net
 
     @property
@@ -224,29 +221,17 @@ class CosmosCausalDiT(nn.Module):
         batch: int,
         height: int,
         width: int,
-        window: int | None = 6,
+        window: int = 6,
         sink: int = 0,
-        *,
-        keeps_graph: bool = False,
-    ) -> BlockCache:
-        """Make an empty cache.
+    ) -> RollingCache:
+        """Make an empty cache for inference.
 
         Args:
             batch: Sequences (or camera views) side by side.
             height, width: Latent size, even.
-            window: Latents that a token attends to, own block and sink included; None (all) needs
-                ``keeps_graph``.
+            window: Latents that a token attends to, own block and sink included.
             sink: First latents of the rollout that stay visible (attention sink).
-            keeps_graph: Use a growing list with gradients (training) instead of a fixed rolling
-                buffer (inference).
         """
-        if keeps_graph:
-            return GraphCache(self.rope, batch, height, width, window, sink, self.device)
-        if window is None:
-            raise InputError(
-                "window: None: a fixed buffer needs a length",
-                "give the number of latents to hold, or keeps_graph=True",
-            )
         return RollingCache(
             self.rope,
             self.sizes.blocks,

@@ -1,12 +1,11 @@
-"""KV caches: a fixed rolling buffer for inference and a list with gradients for training.
+"""KV caches: what every cache is, and the fixed rolling buffer for inference.
 
-Both have the same visibility rule (see `attention`): the window includes the sink and the own
+Every cache has the same visibility rule (see `attention`): the window includes the sink and the own
 block. Keys are stored after the rotary embedding at their absolute positions.
 
 `RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink +
 (i - sink) % (window - sink)``, so the newest latents overwrite the oldest without moves. Attention
-is invariant to the order of keys, so the buffer is used unsorted. `GraphCache` keeps the tensors of
-every block with their gradients and grows. It is the reference implementation of the rolling cache.
+is invariant to the order of keys, so the buffer is used unsorted.
 
 A block is a series of forwards at one position: `begin` opens or reopens it, `attend` serves one
 layer, `commit` keeps the keys and values of the last forward and advances.
@@ -19,7 +18,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.attention import Rope3D, RopeTable, attend, visible_latents
+from alpasim_plugin.block_fixers.attention import Rope3D, RopeTable, attend
 from alpasim_plugin.core.errors import InputError
 
 
@@ -65,7 +64,6 @@ class BlockCache(ABC):
         # latents committed since reset; differs from position in a rollout that does not start at 0
         self.filled = 0
         self.open_latents = 0  # length of the open block; 0 between blocks
-        self._table: tuple[int, int, RopeTable] | None = None  # position, latents and rotation
 
     def reset(self, position: int = 0) -> None:
         """Clear the cache and start at an absolute latent index."""
@@ -76,10 +74,7 @@ class BlockCache(ABC):
         tokens.
         """
         self.open_latents = latents
-        if self._table is None or self._table[:2] != (self.position, latents):
-            table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
-            self._table = self.position, latents, table
-        return self._table[2]
+        return self.rope.table(self.position, latents, self.rows, self.columns, self.device)
 
     def commit(self) -> None:
         """Keep the keys and values of the last forward and advance by its block.
@@ -181,77 +176,3 @@ class RollingCache(BlockCache):
     def _token_rows(self, latents: list[int]) -> Tensor:
         first = torch.tensor(latents, dtype=torch.long, device=self.device)[:, None] * self.tokens
         return (first + torch.arange(self.tokens, device=self.device)).flatten()
-
-
-class GraphCache(BlockCache):
-    """Keep every block's keys and values with their gradients; memory grows with the rollout."""
-
-    keeps_graph = True
-
-    def __init__(
-        self,
-        rope: Rope3D,
-        batch: int,
-        height: int,
-        width: int,
-        window: int | None,
-        sink: int,
-        device: torch.device,
-    ) -> None:
-        super().__init__(rope, batch, height, width, window, sink, device)
-        self._kept: dict[
-            int, list[tuple[Tensor, Tensor]]
-        ] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
-        self._open: dict[int, tuple[Tensor, Tensor]] = {}
-
-    def reset(self, position: int = 0) -> None:
-        """Clear the cache and start at an absolute latent index."""
-        super().reset(position)
-        self._kept, self._open = {}, {}
-
-    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Attend to the concatenation of the visible past and the block."""
-        self._open[layer] = (k, v)
-        kept = self._kept.get(layer, [])
-        visible = [
-            i
-            for i in visible_latents(
-                self.filled, self.filled + self.open_latents, self.window, self.sink
-            )
-            if i < self.filled
-        ]
-        return attend(
-            q,
-            torch.cat([*(kept[i][0] for i in visible), k], dim=1),
-            torch.cat([*(kept[i][1] for i in visible), v], dim=1),
-        )
-
-    def commit(self) -> None:
-        """Keep the tensors of the last forward."""
-        for layer, (k, v) in self._open.items():
-            pairs = zip(
-                torch.split(k, self.tokens, dim=1), torch.split(v, self.tokens, dim=1), strict=True
-            )
-            self._kept.setdefault(layer, []).extend(pairs)
-        self._open = {}
-        super().commit()
-
-    def fork(self) -> GraphCache:
-        """Return an independent cache with the same, detached past.
-
-        Raises:
-            InputError: A block is open.
-        """
-        if self.open_latents:
-            raise InputError(
-                f"latent {self.position}: an open block with forwards that were not committed",
-                "commit the block first, or reset the cache",
-            )
-        copy = GraphCache(
-            self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device
-        )
-        copy.position, copy.filled = self.position, self.filled
-        copy._kept = {
-            layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()
-        }
-        return copy

@@ -30,7 +30,6 @@ from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, read_bundle, weights_to_give
-from alpasim_plugin.fixers.network import checkpoints
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.settings import FixerSettings
 
@@ -53,13 +52,17 @@ def at_precision(net: Net, precision: Precision, float32: Sequence[str] = ()) ->
     Raises:
         InputError: A weight that overflows the precision.
     """
-    copies: dict[int, object] = {}
-    for key, value in net.named_parameters():
-        is_float32 = any(part in key for part in float32)
-        dtype = torch.float32 if is_float32 else DTYPES[precision]
-        converted = checkpoints.convert(key, value.detach(), dtype, "network")
-        copies[id(value)] = nn.Parameter(converted, requires_grad=False)
-    return copy.deepcopy(net, copies)
+    copied = copy.deepcopy(net).requires_grad_(False)
+    for key, value in copied.named_parameters():
+        if any(part in key for part in float32):
+            continue
+        value.data = value.data.to(DTYPES[precision])
+        if not value.is_meta and not bool(value.isfinite().all()):
+            raise InputError(
+                f"network: {key} holds values beyond {precision}",
+                "choose bf16 or fp32",
+            )
+    return copied
 
 
 @dataclass(frozen=True, eq=False)

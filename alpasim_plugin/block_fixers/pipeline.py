@@ -2,14 +2,13 @@
 Tensors in, tensors out.
 
 A run leaves the history unchanged: it may be repeated from the same state, with other frames, any
-number of times. `BlockPipeline.keep` adds its result to the history. Only one draft is open at a
-time, for the cache has one open block.
+number of times. `BlockPipeline.keep` adds the last run's result to the history.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,7 +21,6 @@ from alpasim_plugin.block_fixers.sampling import (
     opacity_mask,
     opacity_values,
     sample_block,
-    sources_needed,
 )
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.streaming import State
@@ -66,29 +64,17 @@ def map_video(settings: OneFixerSettings, rgb: Tensor, sdmap: Tensor | None) -> 
     return torch.full_like(rgb, -1.0) if sdmap is None and settings.no_map == "black" else sdmap
 
 
-@dataclass(eq=False)
-class History:
-    """The transformer's cache, the state at its end, and the open block."""
-
-    cache: RollingCache
-    kept: PipelineState | None = None
-    draft: PipelineState | None = None
-    write: Callable[[], None] = field(
-        default=lambda: None, repr=False
-    )  # adds the open block to the cache
-
-
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """State of a rollout before a block. Everything is immutable but the cache, which `History`
-    guards.
-    """
+    """State of a rollout before a block. Everything is immutable but the cache."""
 
     latent: int  # absolute index of the next block's first latent
     encoder: State | None  # render and map views as one batch
     decoder: State | None
     with_map: bool | None  # None before the first block
-    history: History
+    cache: RollingCache
+    # adds the block before to the cache, where it is still open; to be called at most once
+    write: Callable[[], None] | None = None
 
 
 class BlockPipeline:
@@ -100,13 +86,16 @@ class BlockPipeline:
     """
 
     def __init__(self, networks: Networks, settings: OneFixerSettings) -> None:
-        self.networks, self.settings = networks, settings
+        self.networks = networks
+        self.settings = settings
         self.schedule = from_names(settings.steps)
 
     @property
     def draws(self) -> int:
-        """How many draws of noise a block takes."""
-        return sources_needed(self.schedule, self.settings.history)
+        """How many draws of noise a block takes: one for each step, and one for a cache write by a
+        forward.
+        """
+        return len(self.schedule) + self.settings.finalises
 
     def start(self, batch: int, height: int, width: int) -> PipelineState:
         """Return the state before a rollout's first block.
@@ -118,10 +107,7 @@ class BlockPipeline:
         cache = self.networks.dit.new_cache(
             batch, height // 8, width // 8, self.settings.window, self.settings.sink
         )
-        assert isinstance(cache, RollingCache), "a cache for inference"
-        history = History(cache)
-        history.kept = PipelineState(0, None, None, None, history)
-        return history.kept
+        return PipelineState(0, None, None, None, cache)
 
     @torch.inference_mode()
     def run(
@@ -135,7 +121,7 @@ class BlockPipeline:
         """Fix one block.
 
         Args:
-            state: From `start` or an earlier run; a draft's state is kept first.
+            state: From `start` or `keep`; the newest of its rollout.
             rgb: ``(B, 3, T, H, W)`` render in [-1, 1]; T is ``1 + 4 (block_latents - 1)`` in the
                 first block, then ``4 block_latents``.
             alpha: ``(B, 1, T, H, W)`` opacity, or None where all is opaque.
@@ -144,15 +130,13 @@ class BlockPipeline:
             noise: `draws` standard normal tensors ``(B, 16, block_latents, H / 8, W / 8)``.
 
         Returns:
-            ``(B, 3, T, H, W)``, not clipped to [-1, 1], and the state after the block, still a
-            draft.
+            ``(B, 3, T, H, W)``, not clipped to [-1, 1], and the state after the block, which is
+            still open: give it to `keep`, or run the block again.
 
         Raises:
-            InputError: A state that is out of date, a map in some blocks of a rollout only, or
-                another shape.
+            InputError: A map in some blocks of a rollout only, or another shape.
         """
-        self.keep(state)
-        settings = self.settings
+        settings, nets = self.settings, self.networks
         if state.with_map not in (None, sdmap is not None):
             found = (
                 "a map after blocks without one"
@@ -163,7 +147,6 @@ class BlockPipeline:
                 f"latent {state.latent}: {found}",
                 "give the map in every block of a rollout, or in none",
             )
-        nets, cache, history = self.networks, state.history.cache, state.history
         is_first = state.latent == 0
         opacity = opacity_input(settings, rgb, alpha, first=is_first)
         shown = map_video(settings, rgb, sdmap)
@@ -180,65 +163,35 @@ class BlockPipeline:
             mask = opacity_mask(alpha, first=is_first)
             sources = [mixed_source(z_render, mask, eps) for eps in sources]
         condition = condition_of(settings, z_map, z_render, opacity)
-        z_0 = sample_block(
-            nets.dit,
-            sources,
-            nets.text,
-            condition,
-            cache,
-            self.schedule,
-            "last-forward",
-            commit=False,
-        )
+        cache = state.cache
+        z_0 = sample_block(nets.dit, sources, nets.text, condition, cache, self.schedule)
         out, decoder = decode(nets, settings, z_0, rgb, alpha, state.decoder)
-        new = PipelineState(
-            state.latent + z_0.shape[2], encoder, decoder, sdmap is not None, history
-        )
 
         def write() -> None:
-            if settings.history == "finalise":
-                finalise(nets.dit, z_0, noise[-1], nets.text, condition, cache, commit=False)
-            cache.commit()
+            if settings.finalises:
+                finalise(nets.dit, z_0, noise[-1], nets.text, condition, cache)
+            else:
+                cache.commit()
 
-        history.draft, history.write = new, write
-        return out, new
+        latent = state.latent + z_0.shape[2]
+        return out, PipelineState(latent, encoder, decoder, sdmap is not None, cache, write)
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:
-        """Add the block that led to ``state`` to the history; does nothing if it is part of it
-        already.
-
-        Raises:
-            InputError: Another run or later blocks came since.
-        """
-        history = state.history
-        if state is history.draft:
-            history.write()
-            history.kept, history.draft, history.write = state, None, lambda: None
-        elif state is not history.kept:
-            raise InputError(
-                f"latent {state.latent}: an out-of-date state: another run or later blocks came since",
-                "continue from the newest state, or start a new rollout",
-            )
-        return state
+        """Add the block that led to ``state`` to the history, and return the state after it."""
+        if state.write is not None:
+            state.write()
+        return replace(state, write=None)
 
     @torch.inference_mode()
     def drop_history(self, state: PipelineState) -> PipelineState:
         """Return a state at the same latent without NaN: the KV cache is emptied, NaN in the
         codecs' states becomes 0.
         """
-        history = state.history
-        history.cache.reset(state.latent)
+        state.cache.reset(state.latent)
 
         def clean(codec: State | None) -> State | None:
-            return (
-                None
-                if codec is None
-                else tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in codec)
-            )
+            return codec and tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in codec)
 
-        history.kept = PipelineState(
-            state.latent, clean(state.encoder), clean(state.decoder), state.with_map, history
-        )
-        history.draft, history.write = None, lambda: None
-        return history.kept
+        encoder, decoder = clean(state.encoder), clean(state.decoder)
+        return replace(state, encoder=encoder, decoder=decoder, write=None)

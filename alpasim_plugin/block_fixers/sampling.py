@@ -9,26 +9,24 @@ that of the nearest entry in the table (0.12993; OmniDreams' self-forcing sample
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.dit import TextContext
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import TABLE, NoiseLevel, interpolant, shifted
 from alpasim_plugin.fixers.views import SLACK
 
 CONTEXT_STEP = 128.0
-History = Literal["finalise", "last-forward", "none"]
 POOL = (4, 8, 8)  # frames, rows, columns of one latent
 OPACITY_CHANNELS = 16  # of `opacity_values`: 4 frames, 2 rows, 2 columns of a latent
 
 
-def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
-    """Return the noise level of the cache write: time input ``t``, sigma of the table's nearest
+def context_level() -> NoiseLevel:
+    """Return the noise level of the cache write: time input 128, sigma of the table's nearest
     entry.
 
     Example:
@@ -36,26 +34,8 @@ def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
         0.12993
     """
     table = (shifted(1 - i / TABLE) for i in range(TABLE))
-    return NoiseLevel(t, min(table, key=lambda sigma: abs(TABLE * sigma - t)))
-
-
-class BlockNet(Protocol):
-    """The network interface of the sampler; `CosmosCausalDiT` and its folded copies implement
-    it.
-    """
-
-    def step(
-        self,
-        x_block: Tensor,
-        t_block: Tensor | float,
-        text: Tensor | TextContext,
-        hdmap_block: Tensor,
-        cache: BlockCache,
-        write: bool = True,
-        condition_mask: Tensor | None = None,
-    ) -> Tensor:
-        """Predict the velocity of one block; see `CosmosCausalDiT.step`."""
-        ...
+    sigma = min(table, key=lambda sigma: abs(TABLE * sigma - CONTEXT_STEP))
+    return NoiseLevel(CONTEXT_STEP, sigma)
 
 
 def opacity_mask(opacity: Tensor, first: bool = True) -> Tensor:
@@ -142,83 +122,62 @@ def flow_step(z_t: Tensor, v: Tensor, t: Tensor | float = 1.0) -> Tensor:
     return (z_t.to(wide) - t * v.to(wide)).to(z_t.dtype)
 
 
-def sources_needed(schedule: Sequence[NoiseLevel], history: History) -> int:
-    """Return the number of noise tensors for one block: one per step, and one for the cache
-    write.
-    """
-    return len(schedule) + (history == "finalise")
-
-
 def sample_block(
-    net: BlockNet,
+    net: CosmosCausalDiT,
     sources: Sequence[Tensor],
     text: Tensor | TextContext,
     hdmap: Tensor,
     cache: BlockCache,
     schedule: Sequence[NoiseLevel],
-    history: History = "finalise",
-    commit: bool = True,
 ) -> Tensor:
-    """Sample one block of clean latents and write its keys and values into the cache.
+    """Sample one block of clean latents and leave it open in the cache.
 
     Each step predicts the clean latents; between steps they are noised again to the next level with
-    a *fresh* source (stochastic, not Euler). The cache keeps the keys and values of the block's
-    last forward: either an extra one over the clean latents, slightly noised at t = 128
-    (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With
-    ``none`` nothing is kept.
+    a *fresh* source (stochastic, not Euler). Then the block may be sampled again, for example with
+    its true poses. Its keys and values enter the cache by ``cache.commit()``, which keeps those of
+    the last step, or by `finalise`.
 
     Args:
-        net: The network; a folded copy if ``schedule`` has its one step.
-        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each
-            renoising between steps (mixed again with fresh noise, or noise), then the noise of the
-            cache write. Each ``(B, C, T, H, W)``.
+        net: The network.
+        sources: One for each step: ``z_1`` at the start (Eq. 1, or noise), then one for each
+            renoising (mixed again with fresh noise, or noise). Each ``(B, C, T, H, W)``.
         text: Prompt, best as a `TextContext`.
         hdmap: ``(B, map_channels, T, H, W)``.
         cache: KV cache of this rollout.
         schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
-        history: What the cache keeps.
-        commit: False leaves the block open: run it again (for example with its true poses), or keep
-            it with ``cache.commit()``.
 
     Returns:
         ``(B, C, T, H, W)`` clean latents.
 
     Raises:
-        InputError: A wrong number of sources.
+        InputError: Another number of sources than of steps.
     """
-    if len(sources) != sources_needed(schedule, history) or not schedule:
+    if len(sources) != len(schedule):
         raise InputError(
-            f"{len(sources)} sources for {len(schedule)} steps with history {history!r}",
-            "give one per step, and one for the cache write of finalise",
+            f"{len(sources)} sources for {len(schedule)} steps",
+            "give one source for each step",
         )
-    z = sources[0]
-    for i, level in enumerate(schedule):
-        last = i == len(schedule) - 1
-        is_write = commit and last and history == "last-forward"
-        v = net.step(z, level.t, text, hdmap, cache, is_write)
-        z_0 = flow_step(z, v, level.sigma)
-        if not last:
-            z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
-    if history == "finalise":
-        finalise(net, z_0, sources[-1], text, hdmap, cache, commit)
+    z_0 = sources[0]
+    for source, level in zip(sources, schedule, strict=True):
+        z_t = interpolant(z_0, source, level.sigma)
+        z_0 = flow_step(z_t, net.step(z_t, level.t, text, hdmap, cache, write=False), level.sigma)
     return z_0
 
 
 def finalise(
-    net: BlockNet,
+    net: CosmosCausalDiT,
     z_0: Tensor,
     eps: Tensor,
     text: Tensor | TextContext,
     hdmap: Tensor,
     cache: BlockCache,
-    commit: bool = True,
 ) -> None:
     """Write clean latents into the cache by a forward over them, slightly noised, at t = 128.
 
     Args:
-        net, text, hdmap, cache, commit: As in `sample_block`.
+        net, text, hdmap, cache: As in `sample_block`.
         z_0: ``(B, C, T, H, W)`` clean latents of the open block.
         eps: Standard normal noise like ``z_0``.
     """
     level = context_level()
-    net.step(interpolant(z_0, eps, level.sigma), level.t, text, hdmap, cache, commit)
+    net.step(interpolant(z_0, eps, level.sigma), level.t, text, hdmap, cache)

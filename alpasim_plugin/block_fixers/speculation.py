@@ -11,16 +11,16 @@ frame is shown.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.errors import RendererError
-from alpasim_plugin.core.interfaces import Fixer, Renderer
+from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
-from alpasim_plugin.fixers.loop import BlockRunner, ConditionedFrame
+from alpasim_plugin.fixers.loop import BlockRunner, ConditionedFrame, FixedRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 
 # beyond this distance an actor's displacement counts in proportion to its size in the image
@@ -100,24 +100,23 @@ class SpeculationStats:
     drafts: int = 0
     redrafts: int = 0  # drafts made in the middle of a block
     forecasts: list[Deviation] = field(default_factory=list)  # of predicted frames
-    shown: list[Deviation] = field(
-        default_factory=list
-    )  # between the pose of the frame shown and the true one
+    # between the pose of the frame shown and the true one
+    shown: list[Deviation] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and, in metres and degrees, the errors of the forecasts and of the
         frames shown.
         """
         counts = {key: value for key, value in vars(self).items() if isinstance(value, int)}
-        errors = {
+        return {
+            **counts,
             "forecast_error": _percentiles(self.forecasts),
             "shown_error": _percentiles(self.shown),
         }
-        return counts | errors
 
 
-class SpeculativeRenderer(Renderer):
-    """A renderer session whose frames are fixed block by block and returned one by one.
+class SpeculativeRenderer(FixedRenderer):
+    """A session whose frames are fixed block by block and returned one by one.
 
     Cameras with the same frame times are one group and go through the fixer together, as views of
     one batch; every group has its own fixer.
@@ -126,7 +125,7 @@ class SpeculativeRenderer(Renderer):
         runner: Renders and calls the fixer.
         make_fixer: Makes a fixer at the start of its history.
         settings: Tolerances.
-        first: One that is made already.
+        first: The fixer of the first group.
     """
 
     def __init__(
@@ -134,34 +133,20 @@ class SpeculativeRenderer(Renderer):
         runner: BlockRunner,
         make_fixer: Callable[[], Fixer],
         settings: FixerSettings,
-        first: Fixer | None = None,
+        first: Fixer,
     ) -> None:
-        self.runner = runner
+        super().__init__(runner, first, "speculative")
         self.settings = settings
         self._make = make_fixer
-        fixer = first or make_fixer()
-        self._spare: Fixer | None = fixer
-        self.label = fixer.label
-        self.trained = fixer.trained
         # At least the next frame, which distinguishes cameras of other rates.
-        self.lookahead = max(1, fixer.blocks.first - 1, fixer.blocks.then - 1)
+        self.lookahead = max(1, first.blocks.first - 1, first.blocks.then - 1)
         self._groups: dict[tuple[int, ...], _CameraGroup] = {}
         self._group_of: dict[str, _CameraGroup] = {}
         self.stats = SpeculationStats()
 
-    @property
-    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
-        """Times of the last call by stage, without the base renderer's."""
-        return self.runner.stage_ms
-
-    def facts(self) -> dict[str, Any]:
-        """Return the fixer's label and the counts so far."""
-        facts = {"label": self.label, "trained": self.trained, "mode": "speculative"}
-        return facts | self.stats.as_dict()
-
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame; see `render_batch`."""
-        return self.render_batch([request])[0]
+    def counts(self) -> dict[str, Any]:
+        """Return the counts so far."""
+        return self.stats.as_dict()
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Return the frames of one instant, in the order of the requests.
@@ -184,8 +169,7 @@ class SpeculativeRenderer(Renderer):
         if name not in self._group_of:
             times = (request.t_us, *(coming.t_us for coming in request.ahead))
             if times not in self._groups:
-                fixer = self._spare or self._make()
-                self._spare = None
+                fixer = self._make() if self._groups else self.fixer
                 self._groups[times] = _CameraGroup(self.runner, fixer, self.settings, self.stats)
             self._group_of[name] = self._groups[times]
             self._groups[times].cameras.append(name)
@@ -319,6 +303,6 @@ def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | No
         finite = values[np.isfinite(values)]
         out[name] = None
         if len(finite):
-            levels = np.percentile(finite, (50, 95, 100)).round(6).tolist()
-            out[name] = dict(zip(("p50", "p95", "max"), levels, strict=True))
+            p50, p95, largest = np.percentile(finite, (50, 95, 100)).round(6).tolist()
+            out[name] = {"p50": p50, "p95": p95, "max": largest}
     return out

@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.clips import GROUP, frame_ends, pass_ends
 from alpasim_plugin.core.errors import InputError
 
 State = tuple[Tensor, ...]
@@ -163,21 +164,6 @@ def conv_frames(
     return out.reshape(b, t, *out.shape[1:])
 
 
-class Float32Buffers(nn.Module):
-    """A module whose buffers stay float32 when the network changes precision
-    (``net.to(torch.bfloat16)``).
-    """
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        before = dict(self._buffers)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        for name, old in before.items():
-            new = self._buffers[name]
-            if old is not None and new is not None and new.dtype != old.dtype:
-                self._buffers[name] = old.to(new.device)
-        return self
-
-
 class FrameConv(nn.Conv2d):
     """3x3 convolution of every frame, zero padding."""
 
@@ -241,6 +227,10 @@ class StreamingDecoder(nn.Module, ABC):
         (frames, state)``.
         """
 
+    def decode_in_passes(self, step: Step, z: Tensor, state: State | None) -> tuple[Tensor, State]:
+        """Apply a step of a decoder to ``latents_per_pass`` latents at a time."""
+        return in_passes(step, z, state, pass_ends(z.shape[2], self.latents_per_pass))
+
     def decode(self, z: Tensor, **options: Any) -> Tensor:
         """Decode a whole clip.
 
@@ -265,6 +255,14 @@ class StreamingCodec(StreamingDecoder):
         """Encode the next frames of a stream; a pure function ``(frames, state) -> (latents,
         state)``.
         """
+
+    def encode_in_passes(
+        self, step: Step, frames: Tensor, state: State | None
+    ) -> tuple[Tensor, State]:
+        """Apply a step of an encoder to the frames of ``latents_per_pass`` latents at a time."""
+        first = state is None
+        ends = pass_ends(frames.shape[2] // GROUP + first, self.latents_per_pass)
+        return in_passes(step, frames, state, frame_ends(ends, first))
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode a whole clip.

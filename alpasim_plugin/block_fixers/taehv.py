@@ -19,7 +19,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, check_latents, pass_ends
+from alpasim_plugin.block_fixers.clips import GROUP, check_latents
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
@@ -34,7 +34,6 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_first,
     channels_last,
     channels_to_frames,
-    in_passes,
     run_layers,
 )
 from alpasim_plugin.core.errors import InputError
@@ -129,7 +128,6 @@ class TinyDecoder(StreamingDecoder):
         sd: Mapping[str, Tensor],
         scaled: bool = False,
         *,
-        dtype: torch.dtype = torch.float32,
         source: str = "a state dict",
     ) -> Self:
         """Build the decoder that ``sd`` holds, at whatever widths it has (256, 128, 64, 64 as
@@ -139,7 +137,6 @@ class TinyDecoder(StreamingDecoder):
             sd: Original keys, alone or under ``model`` or ``state_dict``; ``encoder.*`` is ignored.
                 Of a temporal upsampling layer with more rows than needed, the last ones are used.
             scaled: True for LightTAE, whose weights expect ``z * std + mean``.
-            dtype: Precision of the network.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
@@ -153,7 +150,7 @@ class TinyDecoder(StreamingDecoder):
         latent, widths = _read_widths(tensors, source)
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
-        load_checked(net, _last_rows(tensors, widths), dtype, source, DO)
+        load_checked(net, _last_rows(tensors, widths), source, DO)
         net.stats = LatentStats() if scaled else None
         return net
 
@@ -186,12 +183,7 @@ class TinyDecoder(StreamingDecoder):
             InputError: Another shape.
         """
         check_latents(z, self.latent)
-        video, state = in_passes(
-            self._pass,
-            z.to(self.dtype),
-            state,
-            pass_ends(z.shape[2], self.latents_per_pass),
-        )
+        video, state = self.decode_in_passes(self._pass, z.to(self.dtype), state)
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
     def _pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:

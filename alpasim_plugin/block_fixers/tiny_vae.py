@@ -36,7 +36,7 @@ from alpasim_plugin.block_fixers.clips import (
     SIDE,
     check_frames,
     check_latents,
-    group_ends,
+    frame_ends,
     pass_ends,
 )
 from alpasim_plugin.block_fixers.codec_weights import LatentStats, fill_random
@@ -47,7 +47,6 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_first,
     channels_last,
     channels_to_frames,
-    in_passes,
     split_last,
 )
 from alpasim_plugin.block_fixers.tiny_vae_nets import (
@@ -108,7 +107,6 @@ class TinyVAE(StreamingCodec):
         cls,
         sd: Mapping[str, Tensor],
         *,
-        dtype: torch.dtype = torch.float32,
         source: str = "a state dict",
     ) -> Self:
         """Build the network that ``sd`` holds, at whatever widths it has, frozen.
@@ -120,19 +118,19 @@ class TinyVAE(StreamingCodec):
         sizes = TinySizes.read(tensors, source, DO)
         with torch.device("meta"):
             vae = cls(sizes)
-        load_checked(vae, tensors, dtype, source, DO)
+        load_checked(vae, tensors, source, DO)
         vae.transform = CosineTransform()
         vae.requires_grad_(False)
         return vae
 
     @classmethod
-    def load(cls, path: str | Path, *, dtype: torch.dtype = torch.float32) -> Self:
+    def load(cls, path: str | Path) -> Self:
         """Read a safetensors file.
 
         Raises:
             InputError: No such file, not safetensors, or other keys.
         """
-        return cls.from_state_dict(load_weights(path), dtype=dtype, source=str(path))
+        return cls.from_state_dict(load_weights(path), source=str(path))
 
     def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
         """Write a safetensors file atomically."""
@@ -143,8 +141,7 @@ class TinyVAE(StreamingCodec):
         `WanVAE.encode_next`.
         """
         check_frames(frames, first=state is None)
-        ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(self._encode_pass, frames.float(), state, ends)
+        return self.encode_in_passes(self._encode_pass, frames.float(), state)
 
     def decode_next(
         self,
@@ -177,12 +174,11 @@ class TinyVAE(StreamingCodec):
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
         _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
-        latent_ends = pass_ends(m, self.latents_per_pass)
-        frame_ends = group_ends(frames, state is None, self.latents_per_pass)
         parts = []
         start = 0
         first = 0
-        for end, last in zip(latent_ends, frame_ends, strict=True):
+        ends = pass_ends(m, self.latents_per_pass)
+        for end, last in zip(ends, frame_ends(ends, state is None), strict=True):
             condition = [
                 None if x is None else x[:, :, first:last].float() for x in (render, opacity)
             ]

@@ -27,7 +27,6 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import GROUP, SIDE
 from alpasim_plugin.block_fixers.streaming import (
-    Float32Buffers,
     FrameConv,
     PointwiseConv,
     StreamingState,
@@ -88,7 +87,7 @@ def from_grid(grid: Tensor) -> Tensor:
     )
 
 
-class CosineTransform(Float32Buffers):
+class CosineTransform(nn.Module):
     """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them
     back.
 

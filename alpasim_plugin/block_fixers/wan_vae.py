@@ -13,7 +13,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import check_frames, check_latents, group_ends, pass_ends
+from alpasim_plugin.block_fixers.clips import check_frames, check_latents
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
@@ -25,7 +25,6 @@ from alpasim_plugin.block_fixers.streaming import (
     StreamingState,
     channels_first,
     channels_last,
-    in_passes,
     run_layers,
 )
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
@@ -130,7 +129,6 @@ class WanVAE(StreamingCodec):
         cls,
         sd: Mapping[str, Tensor],
         *,
-        dtype: torch.dtype = torch.float32,
         source: str = "a state dict",
     ) -> Self:
         """Build the network that ``sd`` holds, at whatever width it has (96 as published, 24 for
@@ -139,7 +137,6 @@ class WanVAE(StreamingCodec):
         Args:
             sd: Original keys, alone or under ``model`` or ``state_dict``; any floating precision,
                 also mixed.
-            dtype: Precision of the network.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
@@ -149,7 +146,7 @@ class WanVAE(StreamingCodec):
         layout = read_layout(tensors, source)
         with torch.device("meta"):
             vae = cls(layout)
-        load_checked(vae, tensors, dtype, source, DO)
+        load_checked(vae, tensors, source, DO)
         vae.stats = LatentStats()
         return vae
 
@@ -176,9 +173,8 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: An invalid number of frames or size.
         """
-        check_frames(frames, first=state is None, channels=self.layout.colours)
-        ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(self._encode_pass, frames.to(self.dtype), state, ends)
+        check_frames(frames, first=state is None)
+        return self.encode_in_passes(self._encode_pass, frames.to(self.dtype), state)
 
     def decode_next(
         self, z: Tensor, state: State | None, *, clamp: bool = True
@@ -198,8 +194,7 @@ class WanVAE(StreamingCodec):
             InputError: Another shape.
         """
         check_latents(z, self.layout.latent)
-        ends = pass_ends(z.shape[2], self.latents_per_pass)
-        video, state = in_passes(self._decode_pass, z.to(self.dtype), state, ends)
+        video, state = self.decode_in_passes(self._decode_pass, z.to(self.dtype), state)
         return video.clamp(-1, 1) if clamp else video, state
 
     def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:

@@ -21,7 +21,7 @@ from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration, Fixer
 from alpasim_plugin.core.reading.arrays import read_metadata, read_weight_names
-from alpasim_plugin.core.reading.files import kind_of, parse_json
+from alpasim_plugin.core.reading.files import parse_json
 from alpasim_plugin.fixers.settings import WeightedSettings
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that
             were made for other settings.
     """
-    header, trained_with = _header(path)
+    header, trained_with = bundle_header(path)
     kind = settings.bundle_kind
     found_kind = header.get("kind")
     if found_kind != kind.name:
@@ -214,26 +214,6 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     return Bundle(parts, trained, ", ".join(filter(None, notes)) or "trained")
 
 
-def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
-    """Return the fixer that a bundle is for and the overrides that make its settings those of the
-    weights, the bundle included.
-
-    Raises:
-        InputError: Not a bundle.
-    """
-    _, trained_with = _header(path)
-    name = trained_with.pop("name")
-    if not isinstance(name, str):
-        raise InputError(
-            f"{path}, settings in its header: name: {kind_of(name)}",
-            "give a file that save_bundle wrote",
-        )
-    return name, (
-        *(f"{key}={json.dumps(value)}" for key, value in _leaves(trained_with).items()),
-        f"weights.bundle={json.dumps(str(Path(path).absolute()))}",
-    )
-
-
 def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
     """Group tensors by the part of their keys before the first dot; keys lose it."""
     parts: dict[str, StateDict] = {}
@@ -243,7 +223,7 @@ def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
     return parts
 
 
-def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
+def bundle_header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
     """Return a bundle's header and the settings in it.
 
     Raises:
@@ -257,17 +237,6 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
             f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae",
         )
     return header, settings
-
-
-def _leaves(data: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    """Return the leaves of nested settings by dotted key."""
-    out: dict[str, object] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            out |= _leaves(value, f"{prefix}{key}.")
-        else:
-            out[f"{prefix}{key}"] = value
-    return out
 
 
 def _at(data: object, key: str) -> object:

@@ -15,18 +15,15 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState, sparse_source
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
     DETAIL,
     HALF,
-    MATCH_CELLS,
     NOWHERE,
     BlendHeads,
     Operations,
     ReferenceCells,
-    offsets,
 )
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
@@ -35,40 +32,6 @@ LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow,
 def _array(x: Tensor) -> np.ndarray:
     """Return a tensor's values as a contiguous array; float32 where they are floats."""
     return np.ascontiguousarray((x.float() if x.is_floating_point() else x).numpy())
-
-
-def gather_cells(
-    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
-) -> GatheredCells:
-    """Return the same as `network.pixel_generator.gather_cells`, bit for bit."""
-    cover = 2 * opacity - 1
-    noise = torch.zeros_like(render) if source is render else source - render
-    coarse = render, cover, sdmap, state.output, state.render, noise
-    at4 = torch.cat([_joined_cells(coarse, CELL), state.hidden], dim=-1)
-    return GatheredCells(at4, _joined_cells((render, cover, state.output), DETAIL))
-
-
-def _joined_cells(images: tuple[Tensor, ...], side: int) -> Tensor:
-    """Return the cells of images ``(B, H, W, C)`` side by side."""
-    b, h, w, _ = images[0].shape
-    sizes = [side * side * image.shape[-1] for image in images]
-    out = torch.empty(b, h // side, w // side, sum(sizes))
-    first = 0
-    for image, size in zip(images, sizes, strict=True):
-        _put_cells(_array(image).reshape(b * h, -1), side, out.flatten(0, 1).numpy(), first)
-        first += size
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _put_cells(rows, side, out, first):
-    """Write the cells of rows of pixels ``(B H, W C)`` into ``out``, from column ``first`` on."""
-    run = rows.shape[1] // out.shape[1]  # values of a cell's row
-    for y in range(rows.shape[0]):
-        begin = first + (y % side) * run
-        for j in range(out.shape[1]):
-            for k in range(run):
-                out[y // side, j, begin + k] = rows[y, run * j + k]
 
 
 def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
@@ -142,48 +105,6 @@ def _put_runs(row, cells, at, run):
         cell = cells[j]
         for i in range(run):
             cell[at + i] = row[run * j + i]
-
-
-def likeness(sought: Tensor, shown: Tensor) -> Tensor:
-    """Return the same as `network.reference_blend.likeness`."""
-    reach = 2 * MATCH_CELLS + 1
-    out = torch.empty(*shown.shape[:3], reach * reach)
-    _likeness(_array(sought), _array(shown), out.numpy())
-    return out.to(sought.dtype)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _likeness(sought, shown, out):
-    """Multiply and add with a row's cells as the lanes of vectors: channels are few, cells are
-    many.
-    """
-    images, height, width, channels = shown.shape
-    reach, border = 2 * MATCH_CELLS + 1, MATCH_CELLS
-    count = images // sought.shape[0]
-    around = np.zeros((height + 2 * border, channels, width + 2 * border), np.float32)
-    own = np.empty((channels, width), np.float32)
-    alike = np.empty((reach * reach, width), np.float32)
-    share = np.float32(1.0) / np.float32(channels)
-    for n in range(images):
-        for i in range(height):
-            for j in range(width):
-                for c in range(channels):
-                    around[i + border, c, j + border] = shown[n, i, j, c]
-        for i in range(height):
-            for j in range(width):
-                for c in range(channels):
-                    own[c, j] = sought[n // count, i, j, c] * share
-            alike[:] = np.float32(0.0)
-            for di in range(reach):
-                for c in range(channels):
-                    line, mine = around[i + di, c], own[c]
-                    for dj in range(reach):
-                        sums = alike[reach * di + dj]
-                        for j in range(width):
-                            sums[j] += mine[j] * line[j + dj]
-            for j in range(width):
-                for place in range(reach * reach):
-                    out[n, i, j, place] = alike[place, j]
 
 
 def blend(
@@ -291,10 +212,8 @@ def _blend(repaired, references, weight, offset_px, correction, scale, out, reco
                             _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
                 upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
                 for x in range(width):
-                    share[x] = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
-                _exponentials(share)
-                for x in range(width):
-                    share[x] *= min(max(looked_up[3, x] * half, nowhere), one)
+                    logarithm = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
+                    share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
                     total[x] += share[x]
                 for c in range(3):
                     for x in range(width):
@@ -349,32 +268,6 @@ def _correction_row(weight, correction, row, out):
             out[3, DETAIL * j + half] = weight[i, j, into + half]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _exponentials(values):
-    """Replace float32 values by their exponentials, within 3e-7 of them; those below -87 by that of
-    -87.
-
-    A whole power of two, written as the exponent of a float, times a polynomial on [-1/2, 1/2]
-    (Taylor, degree 6, in the natural logarithm of two).
-    """
-    power = np.empty(len(values), np.int32)
-    scale = power.view(np.float32)
-    for i in range(len(values)):
-        t = max(values[i], np.float32(-87.0)) * np.float32(1.4426950408889634)
-        whole = np.int32(np.floor(t + np.float32(0.5)))
-        f = (t - np.float32(whole)) * np.float32(0.6931471805599453)
-        power[i] = (whole + np.int32(127)) << np.int32(23)
-        p = np.float32(1 / 720)
-        p = p * f + np.float32(1 / 120)
-        p = p * f + np.float32(1 / 24)
-        p = p * f + np.float32(1 / 6)
-        p = p * f + np.float32(1 / 2)
-        p = p * f + np.float32(1.0)
-        values[i] = p * f + np.float32(1.0)
-    for i in range(len(values)):
-        values[i] *= scale[i]
-
-
 def smaller(x: Tensor, scale: int) -> Tensor:
     """Average images ``(B, H, W, C)`` of at most four channels over squares of ``scale`` pixels."""
     return _resize(x, 1 / scale, cv2.INTER_AREA)
@@ -396,14 +289,4 @@ def _resize(x: Tensor, factor: float, method: int) -> Tensor:
     return out
 
 
-CPU = Operations(
-    gather_cells,
-    gather_references,
-    likeness,
-    offsets,
-    blend,
-    smaller,
-    larger,
-    sparse_source,
-    asks=True,
-)
+CPU = Operations(gather_references, blend, smaller, larger)

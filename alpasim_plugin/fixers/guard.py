@@ -106,10 +106,10 @@ def render_share(
     opacity: Tensor,
     sdmap: Tensor,
     before: Tensor,
-    asks: bool = False,
 ) -> Tensor | None:
     """Return the weight ``(B, H, W, 1)`` with which the render is put back where the change is not
-    believable: 0 nearly everywhere.
+    believable, or None where the weight is found to be 0 everywhere; on a GPU finding that would
+    wait, and the weight is returned.
 
     Args:
         out: ``(B, H, W, 3)`` generated frame, in the range from -1 to 1 or a little beyond.
@@ -117,10 +117,9 @@ def render_share(
         opacity: ``(B, H, W, 1)``.
         sdmap: Like ``out``; black where it shows nothing.
         before: The last output, like ``out``.
-        asks: Return None as soon as it is known that the weight is 0 everywhere; see `Operations`.
     """
     change = _cells((out - render).abs_()).mean(1, keepdim=True)
-    if asks and float(change.amax()) <= LARGE[0]:
+    if not out.is_cuda and float(change.amax()) <= LARGE[0]:
         return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED
@@ -130,8 +129,6 @@ def render_share(
     below = torch.relu(low - now).amax(1, keepdim=True)
     unseen = _ramp(above + below, LARGE[0] / 2, LARGE[1] / 2)
     share = trusted * unseen * ~mapped
-    if asks and not share.any():
-        return None
     whole = F.interpolate(share, scale_factor=CELL, mode="bilinear", align_corners=False)
     return whole.permute(0, 2, 3, 1)
 

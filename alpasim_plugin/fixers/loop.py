@@ -128,18 +128,19 @@ def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
     return ""
 
 
-class PerFrameRenderer(Renderer):
-    """A renderer session whose frames are fixed at once, at every camera's own rate; the cameras of
-    an instant are one batch.
+class FixedRenderer(Renderer):
+    """A renderer session whose frames are fixed: what every way to call a fixer shares.
 
     Args:
         runner: Renders and calls the fixer.
-        fixer: At the start of its history; its blocks are single frames.
+        fixer: At the start of its history.
+        mode: Its name, for facts.
     """
 
-    def __init__(self, runner: BlockRunner, fixer: Fixer) -> None:
-        self.runner, self.fixer = runner, fixer
-        self.frames = 0
+    def __init__(self, runner: BlockRunner, fixer: Fixer, mode: str) -> None:
+        self.runner = runner
+        self.fixer = fixer
+        self.mode = mode
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
@@ -147,18 +148,39 @@ class PerFrameRenderer(Renderer):
         return self.runner.stage_ms
 
     def facts(self) -> dict[str, Any]:
-        """Return the fixer's label and the number of frames so far."""
-        fixer = self.fixer
-        return {
-            "label": fixer.label,
-            "trained": fixer.trained,
-            "mode": "frame",
-            "frames": self.frames,
-        }
+        """Return the fixer's label and the counts so far."""
+        label, trained = self.fixer.label, self.fixer.trained
+        return {"label": label, "trained": trained, "mode": self.mode, **self.counts()}
+
+    def counts(self) -> dict[str, Any]:
+        """Return what was counted so far."""
+        return {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame; see `render_batch`."""
+        """Render one frame; see ``render_batch``."""
         return self.render_batch([request])[0]
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Return the frames of the requests, in their order."""
+        raise NotImplementedError
+
+
+class PerFrameRenderer(FixedRenderer):
+    """A session whose frames are fixed at once, at every camera's own rate; the cameras of an
+    instant are one batch.
+
+    Args:
+        runner: Renders and calls the fixer.
+        fixer: At the start of its history; its blocks are single frames.
+    """
+
+    def __init__(self, runner: BlockRunner, fixer: Fixer) -> None:
+        super().__init__(runner, fixer, "frame")
+        self.frames = 0
+
+    def counts(self) -> dict[str, Any]:
+        """Return the number of frames so far."""
+        return {"frames": self.frames}
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Return the frames of one instant, in the order of the requests.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +25,7 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     PixelState,
     content_key,
     noise_key,
+    sparse_source,
 )
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
@@ -81,9 +81,7 @@ def fix_frame(
         t = render.new_full((len(render),), level.sigma)
         out, after = predict(interpolant(out, source(index), level.sigma), t)
     if settings.keep_render:
-        share = render_share(
-            out, render, inputs.opacity, inputs.sdmap, state.output, generator.operations.asks
-        )
+        share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
         if share is not None:
             out = torch.lerp(out, render, share * (1 - after.recorded))
             after = after._replace(output=out.clamp(-1, 1))
@@ -195,20 +193,20 @@ class PixelFixer(Fixer):
             check_continues(view, pasts)
         out, after = list(block), dict(pasts)
         for view in views:
-            for fixed in self._fix(view, pasts):
-                frame = replace(block[fixed.index], references=())
-                if fixed.event:  # the render is returned, and nothing of the network's
-                    frame = replace(frame, events=(*frame.events, fixed.event))
-                else:
-                    facts = {**frame.facts, **fixed.facts}
-                    frame = replace(frame, rgb=fixed.history.fixed, facts=facts)
-                out[fixed.index] = frame
-                after[fixed.camera] = fixed.history
+            fixed = self._fix(view, block, pasts)
+            for camera, (index,), (frame, history) in zip(
+                view.cameras, view.index, fixed, strict=True
+            ):
+                out[index] = frame
+                after[camera] = history
         return tuple(out), after
 
-    def _fix(self, view: Views, histories: Mapping[str, CameraHistory]) -> list[FixedView]:
-        start, device = self.generator.net.start, self.generator.device
-        inputs = to_inputs(view, device, self.settings.scale_of(*view.shape))
+    def _fix(
+        self, view: Views, block: Sequence[Frame], histories: Mapping[str, CameraHistory]
+    ) -> list[tuple[Frame, CameraHistory]]:
+        """Fix the frame of each camera of a view; return it and the camera's past for the next."""
+        start = self.generator.net.start
+        inputs = to_inputs(view, self.generator.device, self.settings.scale_of(*view.shape))
         pasts = [histories.get(camera) for camera in view.cameras]
         states = [
             start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state
@@ -217,36 +215,30 @@ class PixelFixer(Fixer):
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
 
-        frames = [
-            count if self.settings.noise == "rollout" else content_key(t_us[0], rgb[0])
-            for count, t_us, rgb in zip(counts, view.t_us, view.rgb, strict=True)
-        ]
-
         def source(draw: int) -> Tensor:
             everywhere = self.settings.holes == "everywhere"
             if self.settings.holes == "render" or (view.alpha is None and not everywhere):
                 return inputs.render
+            frames = counts
+            if self.settings.noise == "content":
+                contents = zip(view.t_us, view.rgb, strict=True)
+                frames = [content_key(t_us[0], rgb[0]) for t_us, rgb in contents]
             keys = [
                 noise_key(self.scene_id, self.seed, camera, draw, frame)
                 for camera, frame in zip(view.cameras, frames, strict=True)
             ]
             opacity = torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity
-            return self.generator.operations.source(inputs.render, opacity, keys)
+            return sparse_source(inputs.render, opacity, keys)
 
-        joined = (
-            PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
-            if len(states) > 1
-            else states[0]
-        )
+        joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
         visible = slice(None), slice(height), slice(width)
-        images, measured, sums = download(
-            _grey_levels(after.output[visible]),
-            guard.measures(video[visible]),
-            trust_sums(after.output[visible], after.render[visible], after.recorded[visible]),
-        )
+        output = after.output[visible]
+        images = _grey_levels(output).cpu().numpy()
+        measured = guard.measures(video[visible]).cpu().numpy()
+        sums = trust_sums(output, after.render[visible], after.recorded[visible]).cpu().numpy()
         fixed = []
-        for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
+        for b, past in enumerate(pasts):
             before = None if past is None else (past.fixed, past.raw)
             raw = view.rgb[b, 0]
             at = slice(b, b + 1)
@@ -255,44 +247,20 @@ class PixelFixer(Fixer):
             if event == guard.NAN:  # it would stay in the state for ever
                 state = start(inputs.render[at], inputs.scale)
             history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b])
-            facts = {} if event else trust_facts(sums[b], height, width)
-            fixed.append(FixedView(camera, view.index[b][0], history, event, facts))
+            frame = replace(block[view.index[b][0]], references=())
+            if event:  # the render is returned, and nothing of the network's
+                frame = replace(frame, events=(*frame.events, event))
+            else:
+                facts = {**frame.facts, **trust_facts(sums[b], height, width)}
+                frame = replace(frame, rgb=images[b], facts=facts)
+            fixed.append((frame, history))
         return fixed
-
-
-@dataclass(frozen=True)
-class FixedView:
-    """One camera's frame after the network.
-
-    Attributes:
-        camera: Its name.
-        index: Place of its frame in the block.
-        history: Its past for the next frame.
-        event: What the guard found; empty where the frame is fine.
-        facts: Where the image comes from.
-    """
-
-    camera: str
-    index: int
-    history: CameraHistory
-    event: str
-    facts: dict[str, float | str]
 
 
 def _grey_levels(images: Tensor) -> Tensor:
     """Convert images in [-1, 1] to bytes, rounded to nearest; what is no number becomes black."""
     levels = (images * HALF).add_(HALF).round_().clamp_(0, 255)
     return levels.nan_to_num_(0.0).to(torch.uint8)
-
-
-def download(*parts: Tensor) -> list[Any]:
-    """Return tensors as arrays, brought to the host in one copy."""
-    data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
-    pieces = torch.split(data.cpu(), [part.nbytes for part in parts])
-    return [
-        piece.clone().view(part.dtype).view(part.shape).numpy()
-        for piece, part in zip(pieces, parts, strict=True)
-    ]
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:

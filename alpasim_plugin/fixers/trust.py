@@ -9,8 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
+from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS
 
 # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
 MADE_UP = 0.25
@@ -52,7 +51,8 @@ def trust_facts(sums: F32, height: int, width: int) -> dict[str, float | str]:
 
     Returns:
         `RECORDED_SHARE` and `GUESSED_SHARE`: means over the image. `TRUST_CELLS`: both by cell,
-        as `trust_cells` reads it.
+        ``COLUMNSxROWS:`` and two hexadecimal digits a cell, recorded and guessed in fifteenths,
+        row by row from the top.
     """
     side = cell_px(width)
     heights = np.diff(np.arange(0, height, side), append=height)
@@ -66,28 +66,3 @@ def trust_facts(sums: F32, height: int, width: int) -> dict[str, float | str]:
         GUESSED_SHARE: float(guessed),
         TRUST_CELLS: f"{sums.shape[1]}x{sums.shape[0]}:{text}",
     }
-
-
-def trust_cells(text: str) -> U8:
-    """Return the shares of every cell of an image ``(rows, columns, 2)``, recorded and guessed, in
-    fifteenths.
-
-    Args:
-        text: ``COLUMNSxROWS:`` and two hexadecimal digits a cell, row by row from the top.
-
-    Raises:
-        InputError: It is no such text.
-
-    Example:
-        >>> trust_cells("2x1:f00a").tolist()
-        [[[15, 0], [0, 10]]]
-    """
-    size, _, digits = text.partition(":")
-    try:
-        columns, rows = (int(part) for part in size.split("x"))
-        return np.array([int(digit, 16) for digit in digits], np.uint8).reshape(rows, columns, 2)
-    except ValueError as error:
-        raise InputError(
-            f"{TRUST_CELLS}: {text[:40]!r}",
-            "run the rollout again: its frames.jsonl is damaged",
-        ) from error

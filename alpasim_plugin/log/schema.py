@@ -7,11 +7,9 @@ must use a local origin. Times are integer microseconds in 64 bits and exact.
 from __future__ import annotations
 
 import hashlib
-import math
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 
 import numpy as np
 
@@ -36,31 +34,6 @@ SEED_BITS, DIGEST_BITS = 64, 58
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
 MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
-# One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each
-# number.
-_TAGS = {
-    "head": (
-        "x",
-        b"\x0a\x32\x0a\x27\x0a\x0f\x0d",
-    ),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
-    "tag_y": ("y", b"\x15"),
-    "tag_z": ("z", b"\x1d"),
-    "tag_qw": ("qw", b"\x12\x14\x0d"),  # quat of 20 bytes, w
-    "tag_qx": ("qx", b"\x15"),
-    "tag_qy": ("qy", b"\x1d"),
-    "tag_qz": ("qz", b"\x25"),
-    "tag_t": ("t_us", b"\x11"),
-}
-_POSE_AT_TIME = np.dtype(
-    [
-        field
-        for name, (number, tag) in _TAGS.items()
-        for field in ((name, "u1", (len(tag),)), (number, "<u8" if number == "t_us" else "<f4"))
-    ]
-)
-_BLANK = np.zeros(1, dtype=_POSE_AT_TIME)  # the tags, before numbers that are all zero
-for _name, (_, _tag) in _TAGS.items():
-    _BLANK[_name] = np.frombuffer(_tag, dtype=np.uint8)
 
 
 def session_uuid(seed: int, identity: str) -> str:
@@ -179,19 +152,6 @@ def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
         InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for
             float32.
     """
-    rows = _checked_rows(xyz, quat, what).tolist()
-    return [
-        common_pb2.Pose(
-            vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w, x=qx, y=qy, z=qz)
-        )
-        for x, y, z, w, qx, qy, qz in rows
-    ]
-
-
-def _checked_rows(xyz: F64, quat: F64, what: str) -> F64:
-    """Return ``(N, 7)``: positions and unit quaternions that float32 can hold; raises as
-    `wire_poses` says.
-    """
     norm = np.linalg.norm(quat, axis=-1, keepdims=True)
     near, long = np.abs(xyz) < MAX_LOCAL_M, (norm > 0) & (norm < np.inf)  # neither is true of NaN
     if not (near.all() and long.all()):
@@ -200,57 +160,28 @@ def _checked_rows(xyz: F64, quat: F64, what: str) -> F64:
             f"{what}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
-    return np.concatenate([xyz, quat / norm], axis=1)
+    vec, rotation = common_pb2.Vec3, common_pb2.Quat
+    return [
+        common_pb2.Pose(vec=vec(x=x, y=y, z=z), quat=rotation(w=w, x=qx, y=qy, z=qz))
+        for (x, y, z), (w, qx, qy, qz) in zip(xyz.tolist(), (quat / norm).tolist(), strict=True)
+    ]
 
 
 def wire_pose(transform: F64, what: str) -> common_pb2.Pose:
-    """Return the message of one ``(4, 4)`` transform; see `wire_poses`, whose arithmetic it does
-    without arrays.
-    """
-    (x, y, z), quat = transform[:3, 3].tolist(), quat_from_matrix(transform[:3, :3])
-    w, qx, qy, qz = quat.tolist()
-    norm = math.sqrt(w * w + qx * qx + qy * qy + qz * qz)
-    if not (
-        abs(x) < MAX_LOCAL_M
-        and abs(y) < MAX_LOCAL_M
-        and abs(z) < MAX_LOCAL_M
-        and 0.0 < norm < math.inf
-    ):
-        return wire_poses(transform[None, :3, 3], quat[None], what)[0]  # which says what is wrong
-    return common_pb2.Pose(
-        vec=common_pb2.Vec3(x=x, y=y, z=z),
-        quat=common_pb2.Quat(w=w / norm, x=qx / norm, y=qy / norm, z=qz / norm),
-    )
+    """Return the message of one ``(4, 4)`` transform; see `wire_poses`."""
+    return wire_poses(transform[None, :3, 3], quat_from_matrix(transform[None, :3, :3]), what)[0]
 
 
 def wire_trajectory(trajectory: Trajectory, what: str) -> common_pb2.Trajectory:
     """Return the message of a trajectory; see `wire_poses`."""
-    message: common_pb2.Trajectory = common_pb2.Trajectory.FromString(
-        wire_bytes([trajectory], what)[0]
+    poses = wire_poses(trajectory.xyz, trajectory.quat, what)
+    at_time = common_pb2.PoseAtTime
+    return common_pb2.Trajectory(
+        poses=[
+            at_time(pose=pose, timestamp_us=t_us)
+            for pose, t_us in zip(poses, trajectory.t_us.tolist(), strict=True)
+        ]
     )
-    return message
-
-
-def wire_bytes(trajectories: Sequence[Trajectory], what: str) -> list[bytes]:
-    """Return the messages of trajectories, serialised; see `wire_poses`.
-
-    The poses are laid out by array operations, to be parsed once: twenty times faster than building
-    a message a pose, and plans with their alternatives are most of what a log holds. A message that
-    takes them parses them in place: one given to a constructor is copied.
-    """
-    xyz, quat, t_us = (
-        np.concatenate([getattr(one, name) for one in trajectories])
-        for name in ("xyz", "quat", "t_us")
-    )
-    rows = _checked_rows(xyz, quat, what)
-    table = np.repeat(_BLANK, len(rows))
-    for i, name in enumerate(("x", "y", "z", "qw", "qx", "qy", "qz")):
-        table[name] = rows[:, i]
-    table["t_us"] = t_us
-    ends = list(accumulate(map(len, trajectories)))
-    return [
-        table[end - len(one) : end].tobytes() for one, end in zip(trajectories, ends, strict=True)
-    ]
 
 
 def wire_dynamics(state: EgoState) -> common_pb2.DynamicState:

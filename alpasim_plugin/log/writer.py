@@ -25,7 +25,6 @@ from alpasim_plugin.log.schema import (
     EGO,
     RolloutHeader,
     wire_box,
-    wire_bytes,
     wire_camera,
     wire_dynamics,
     wire_image,
@@ -162,14 +161,14 @@ class AslWriter:
         self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=items))
 
     def camera_image(
-        self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0, quality: int = 95
+        self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0
     ) -> None:
         """Write one frame as the driver received it."""
         self.encoded_image(
             frame.camera,
             frame.t_us - shutter_us,
             frame.t_us,
-            encode_image(frame.rgb, encoding, quality),
+            encode_image(frame.rgb, encoding),
         )
 
     def encoded_image(self, camera: str, start_us: int, end_us: int, data: bytes) -> None:
@@ -208,30 +207,23 @@ class AslWriter:
             )
         )
 
-    def driver_return(
-        self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False
-    ) -> None:
+    def driver_return(self, plan: Trajectory, samples: Sequence[Trajectory] = ()) -> None:
         """Write the driver's plan.
 
         Args:
             plan: Absolute rig poses in the world, the first at the time of the request; empty where
                 the driver gave none.
             samples: Alternatives it considered, the same way; they feed minADE.
-            terminate: The driver ends the rollout.
         """
+        first, *others = (
+            wire_trajectory(one, "the driver's plan and its samples") for one in (plan, *samples)
+        )
         message = egodriver_pb2.DriveResponse
-        entry = logging_pb2.LogEntry(
+        self._write(
             driver_return=message(
-                trajectory=common_pb2.Trajectory(),
-                debug_info=message.DebugInfo(),
-                terminate_session=terminate,
+                trajectory=first, debug_info=message.DebugInfo(sampled_trajectories=others)
             )
         )
-        first, *others = wire_bytes([plan, *samples], "the driver's plan and its samples")
-        entry.driver_return.trajectory.MergeFromString(first)
-        for other in others:
-            entry.driver_return.debug_info.sampled_trajectories.add().MergeFromString(other)
-        self._file.write(entry)
 
     def controller_request(
         self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False
@@ -248,7 +240,7 @@ class AslWriter:
         if len(plan):
             poses = se3(plan.xyz, plan.quat)
             plan = trajectory_from_poses(plan.t_us, inverse(poses[0]) @ poses)
-        entry = logging_pb2.LogEntry(
+        self._write(
             controller_request=controller_pb2.RunControllerAndVehicleModelRequest(
                 session_uuid=self._uuid,
                 state=common_pb2.StateAtTime(
@@ -256,16 +248,12 @@ class AslWriter:
                     pose=wire_pose(state.T_world_rig, "ego state"),
                     state=wire_dynamics(state),
                 ),
-                planned_trajectory_in_rig=common_pb2.Trajectory(),
+                planned_trajectory_in_rig=wire_trajectory(plan, "the active plan"),
                 future_time_us=to_us,
                 coerce_dynamic_state=forced,
                 pose_reporting_interval_us=self.header.control_us,
             )
         )
-        entry.controller_request.planned_trajectory_in_rig.MergeFromString(
-            wire_bytes([plan], "the active plan")[0]
-        )
-        self._file.write(entry)
 
     def controller_return(self, state: EgoState) -> None:
         """Write the state the vehicle model reached; estimated equals true, as no pose error is

@@ -9,8 +9,6 @@ import math
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.attention import visible_latents
-
 
 def block_causal_reference(
     q: Tensor,
@@ -28,7 +26,9 @@ def block_causal_reference(
     mask = torch.zeros(frames, frames, dtype=torch.bool, device=q.device)
     for start in range(0, frames, block_latents):
         end = min(start + block_latents, frames)
-        mask[start:end, visible_latents(start, end, window, sink)] = True
+        mask[start:end, :end] = True
+        if window is not None:
+            mask[start:end, sink : min(start, end - (window - sink))] = False
     mask = mask.repeat_interleave(tokens, 0).repeat_interleave(tokens, 1)
     scores = torch.einsum("bqhd,bkhd->bhqk", q, k) / math.sqrt(q.shape[-1])
     weights = scores.masked_fill(~mask, -torch.inf).softmax(dim=-1)

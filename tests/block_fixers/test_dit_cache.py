@@ -80,7 +80,6 @@ def test_block_may_be_opened_again_shorter_while_nothing_was_overwritten():
         (lambda n: n.new_cache(1, 4, 6, window=2, sink=-1), "window 2, sink -1"),
         (lambda n: n.new_cache(1, 5, 6), "latent size 5 x 6"),
         (lambda n: n.new_cache(0, 4, 6), "batch 0"),
-        (lambda n: n.new_cache(1, 4, 6, window=None), "a fixed buffer needs a length"),
     ],
 )
 def test_senseless_caches_are_refused(call, text):

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from alpasim_plugin.block_fixers.attention import block_causal_attention
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.block_fixers.attention_reference import block_causal_reference
-from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
 from tests.block_fixers.dit_reference import latent_mask, random_weights, velocity
 from tests.examples import examples
@@ -45,28 +44,6 @@ def test_network_is_the_written_out_one_at_any_size(sizes, frames, block, ratios
     with torch.no_grad():
         v = net(x, t, text, hdmap, mask, block)
     assert furthest(v, velocity(weights, x, t, text, hdmap, mask, block, ratios)) < 1e-4
-
-
-@settings(max_examples=examples(40), deadline=None)
-@given(
-    blocks=st.lists(st.integers(1, 4), min_size=1, max_size=5),
-    window=st.integers(1, 12),
-    sink=st.integers(0, 4),
-    batch=st.integers(1, 2),
-    size=st.sampled_from([(2, 2), (4, 6), (6, 2)]),
-)
-def test_rolling_cache_is_the_growing_one(blocks, window, sink, batch, size):
-    sink = min(sink, window)
-    net = network()
-    x, t, text, hdmap = clip(sum(blocks), batch=batch, height=size[0], width=size[1])
-    caches = [
-        net.new_cache(batch, *size, window, sink, keeps_graph=graph) for graph in (False, True)
-    ]
-    out = [stream(net, cache, x, t, text, hdmap, blocks).detach() for cache in caches]
-    assert furthest(*out) < 1e-5
-    for layer in range(SMALL.blocks):
-        for ours, other in zip(history(caches[0], layer), history(caches[1], layer), strict=True):
-            assert furthest(ours, other) < 1e-5
 
 
 @settings(max_examples=examples(40), deadline=None)
@@ -143,20 +120,3 @@ def test_prepared_text_is_the_text(tokens):
             furthest(net(x, t, text, hdmap), velocity(random_weights(SMALL), x, t, text, hdmap))
             < 1e-5
         )
-
-
-def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
-    net, (x, t, text, hdmap) = network(), clip(6)
-    for cut_after, reached in ((None, [True, True]), (1, [False, True]), (2, [False, False])):
-        leaf = x.clone().requires_grad_()
-        cache = net.new_cache(1, 4, 6, window=6, keeps_graph=True)
-        for block in range(3):
-            if block == cut_after:
-                cache = cache.fork()
-            cut = slice(2 * block, 2 * block + 2)
-            v = net.step(leaf[:, :, cut], t[:, cut], text, hdmap[:, :, cut], cache)
-        (grad,) = torch.autograd.grad(v.square().sum(), leaf)
-        assert [
-            bool(grad[:, :, cut].abs().max() > 0) for cut in (slice(0, 2), slice(2, 4))
-        ] == reached
-        assert grad[:, :, 4:].abs().max() > 0

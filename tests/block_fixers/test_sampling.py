@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.sampling import (
+    finalise,
     flow_step,
     mixed_source,
     opacity_mask,
     opacity_values,
     sample_block,
-    sources_needed,
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant, named, shifted, steps
@@ -123,38 +123,42 @@ def test_senseless_schedules_are_refused(call):
         call()
 
 
-@pytest.mark.parametrize(("history", "forwards"), [("finalise", 3), ("last-forward", 2)])
-def test_history_decides_what_the_cache_keeps(history, forwards):
+def test_steps_leave_the_block_open_and_the_cache_keeps_the_last_forward():
     net, (_, _, text, hdmap) = network(), clip(2)
     cache, calls = net.new_cache(1, 4, 6), []
 
     class Counter:
-        def step(self, x, t, text, hdmap, cache, write):
+        def step(self, x, t, text, hdmap, cache, write=True):
             calls.append((round(t), write))
             return net.step(x, t, text, hdmap, cache, write)
 
-    sources = [noise(1, 4, 2, 4, 6, seed=i) for i in range(sources_needed(steps(2), history))]
-    z = sample_block(Counter(), sources, text, hdmap, cache, steps(2), history)
+    sources = [noise(1, 4, 2, 4, 6, seed=i) for i in range(2)]
+    z = sample_block(Counter(), sources, text, hdmap, cache, steps(2))
     assert z.isfinite().all()
-    assert len(calls) == forwards
-    assert [write for _, write in calls] == [False] * (forwards - 1) + [True]
-    assert calls[-1][0] == (128 if history == "finalise" else 833)
+    assert calls == [(1000, False), (833, False)]
+    assert cache.position == 0
+    finalise(Counter(), z, sources[0], text, hdmap, cache)
+    assert calls[2:] == [(128, True)]
     assert cache.position == 2
 
 
-@pytest.mark.parametrize("history", ["finalise", "last-forward"])
-def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history):
+@pytest.mark.parametrize("finalises", [True, False])
+def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(finalises):
     net, (z_1, _, text, hdmap) = network(), clip(2)
-    eps = noise(*z_1.shape)
-    sources = [z_1, eps][: sources_needed(steps(1), history)]
     kept, guessed = net.new_cache(1, 4, 6, window=4), net.new_cache(1, 4, 6, window=4)
+
+    def keep(cache, z_0):
+        if finalises:
+            finalise(net, z_0, noise(*z_1.shape), text, hdmap, cache)
+        else:
+            cache.commit()
+
     for _ in range(4):
-        truth = sample_block(net, sources, text, hdmap, kept, steps(1), history)
-        sample_block(net, sources, text, hdmap + 1, guessed, steps(1), history, commit=False)
-        assert torch.equal(
-            sample_block(net, sources, text, hdmap, guessed, steps(1), history, commit=False), truth
-        )
-        guessed.commit()
+        truth = sample_block(net, [z_1], text, hdmap, kept, steps(1))
+        keep(kept, truth)
+        sample_block(net, [z_1], text, hdmap + 1, guessed, steps(1))
+        assert torch.equal(sample_block(net, [z_1], text, hdmap, guessed, steps(1)), truth)
+        keep(guessed, truth)
     assert guessed.position == kept.position == 8
     assert torch.equal(guessed.keys, kept.keys)
     with pytest.raises(InputError):
@@ -164,4 +168,4 @@ def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history)
 def test_wrong_number_of_noise_draws_is_refused():
     net, (z_1, _, text, hdmap) = network(), clip(2)
     with pytest.raises(InputError):
-        sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(1))
+        sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(2))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
+from alpasim_plugin.block_fixers.networks import DTYPES, at_precision
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
     WanLayout,
@@ -241,9 +242,9 @@ def test_half_and_double_precision_tensors_load_into_single(vae, stored):
     }[stored]
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_running_in_half_precision_stays_close(vae, dtype):
-    half = WanVAE.from_state_dict(vae.state_dict(), dtype=dtype)
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_running_in_half_precision_stays_close(vae, precision):
+    half, dtype = at_precision(vae, precision), DTYPES[precision]
     video = clip(9, 16, 16)
     z = half.encode(video)
     assert z.dtype == dtype

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.clips import on_grid, to_clip, to_images
+from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
@@ -23,7 +23,6 @@ from alpasim_plugin.block_fixers.sampling import (
     flow_step,
     mixed_source,
     opacity_mask,
-    sources_needed,
 )
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.interfaces import BlockRule
@@ -193,8 +192,8 @@ def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int)
     due = rule.first + -(-max(0, len(frames) - rule.first) // rule.then) * rule.then
     (views,) = group_views(frames, list(clip.maps) if settings.uses_map else (), due)
     video = to_clip(views, due)
-    latents = (on_grid(due) - 1) // 4 + 1
-    draws = sources_needed(from_names(settings.steps), settings.history)
+    latents = 1 + -(-(due - 1) // 4)
+    draws = len(settings.steps) + settings.finalises
     shape = (LATENT, video.rgb.shape[3] // 8, video.rgb.shape[4] // 8)
     noise = latent_noise(scene_id, seed, views.cameras, draws, range(latents), shape)
     fixed = refine_clip(networks, settings, video.rgb, video.alpha, video.maps, noise)

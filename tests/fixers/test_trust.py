@@ -14,7 +14,6 @@ from alpasim_plugin.fixers.trust import (
     LEVELS,
     MADE_UP,
     MOST_COLUMNS,
-    trust_cells,
     trust_facts,
     trust_sums,
 )
@@ -24,6 +23,13 @@ from evaluators.viewer.pictures import seen_before, trust_by_time
 def trust(output: np.ndarray, render: np.ndarray, recorded: np.ndarray) -> dict[str, float | str]:
     images = (torch.from_numpy(x)[None] for x in (output, render, recorded[..., None]))
     return trust_facts(trust_sums(*images)[0].numpy(), *recorded.shape)
+
+
+def trust_cells(text: str) -> np.ndarray:
+    """Return the shares of every cell ``(rows, columns, 2)``, in fifteenths."""
+    size, _, digits = text.partition(":")
+    columns, rows = (int(part) for part in size.split("x"))
+    return np.array([int(digit, 16) for digit in digits], np.uint8).reshape(rows, columns, 2)
 
 
 @pytest.mark.parametrize(

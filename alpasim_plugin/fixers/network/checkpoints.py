@@ -1,7 +1,4 @@
-"""Read weights: safetensors, or pickles that hold only tensors.
-
-Tensors keep their stored precision by default; ``dtype`` converts the floating ones.
-"""
+"""Read weights: safetensors, or pickles that hold only tensors."""
 
 from __future__ import annotations
 
@@ -31,23 +28,16 @@ LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
 
 
-def load_weights(
-    path: str | Path,
-    dtype: torch.dtype | None = None,
-    device: str = "cpu",
-    sha256: str | None = None,
-) -> StateDict:
+def load_weights(path: str | Path, sha256: str | None = None) -> StateDict:
     """Read a checkpoint file.
 
     Args:
         path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (only
             tensors and plain containers).
-        dtype: Precision for floating tensors; None keeps each as stored.
-        device: Where the tensors go.
         sha256: Expected digest, in hexadecimal; checked before anything is read.
 
     Returns:
-        Tensors by key, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
+        Tensors by key as stored, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
 
     Raises:
         InputError: No file, wrong digest, truncated or foreign file, or a pickle with other objects
@@ -65,16 +55,13 @@ def load_weights(
     # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like
     # the start of a pickle.
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
-        content = _load_pickle(path, device)
+        content = _load_pickle(path)
     else:
         what = f"not a complete safetensors file of {path.stat().st_size} bytes"
         hint = "download or copy the file again; it is truncated or of another format"
         with parsing(path, hint, what):
-            content = load_file(path, device=device)
-    tensors = unwrap(content, str(path))
-    if dtype is None:
-        return tensors
-    return {key: convert(key, value, dtype, str(path)) for key, value in tensors.items()}
+            content = load_file(path)
+    return unwrap(content, str(path))
 
 
 def unwrap(content: object, source: str) -> StateDict:
@@ -116,62 +103,43 @@ def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     return out
 
 
-def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a floating tensor in another precision, always as a copy; others unchanged.
+def weight(key: str, value: Tensor, source: str) -> Tensor:
+    """Return a float32 copy of one weight.
 
     Raises:
-        InputError: A finite value that overflows the new precision.
-    """
-    if not value.is_floating_point():
-        return value
-    out = value.detach().to(dtype, copy=True)
-    if value.device.type != "meta" and bool((~out.isfinite() & value.isfinite()).any()):
-        raise InputError(
-            f"{source}: {key} holds {float(value.abs().max()):.4g}, beyond {dtype}",
-            "use torch.bfloat16 or torch.float32",
-        )
-    return out
-
-
-def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a copy of one weight in the precision a network wants, after validation.
-
-    Raises:
-        InputError: An integer tensor, or values that are not finite before or after the conversion.
+        InputError: An integer tensor, or values that are not finite in float32.
     """
     if not value.is_floating_point():
         raise InputError(
             f"{source}: {key} holds {value.dtype}",
             "give floating-point weights; quantise after loading",
         )
-    if value.device.type != "meta" and not bool(value.isfinite().all()):
+    out = value.detach().to(torch.float32, copy=True)
+    finite = out.isfinite()
+    if not out.is_meta and not bool(finite.all()):
         raise InputError(
-            f"{source}: {key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}",
+            f"{source}: {key} holds {int((~finite).sum())} values that are not finite, of {out.numel()}",
             "use a checkpoint from before training diverged",
         )
-    return convert(key, value, dtype, source)
+    return out
 
 
 def load_checked(
     net: nn.Module,
     tensors: Mapping[str, Tensor],
-    dtype: torch.dtype,
     source: str,
     hint: str = "give the weights of this network, all of them",
-    float32: tuple[str, ...] = (),
 ) -> None:
-    """Give a network copies of tensors in one precision; kernels become channels-last.
+    """Give a network copies of tensors in float32; kernels become channels-last.
 
     Args:
         net: Its state dict gives the expected keys and shapes; it may be on the meta device.
         tensors: Half, single or double precision, also mixed.
-        dtype: Precision of the parameters; buffers are float32.
         source, hint: For messages.
-        float32: Parameters whose key contains one of these stay float32.
 
     Raises:
         InputError: Keys that are missing, unexpected or of another shape (all in one message), or
-            values that are integers, not finite, or beyond ``dtype``.
+            values that are integers, or not finite in float32.
     """
     expected = net.state_dict()
     wrong = []
@@ -189,12 +157,7 @@ def load_checked(
     if any(problems):
         counts = f"{len(tensors)} tensors, {len(expected)} expected"
         raise InputError(f"{source} ({counts}): {'; '.join(filter(None, problems))}", hint)
-    buffers = {key for key, _ in net.named_buffers()}
-    kept = {}
-    for key in expected:
-        is_float32 = key in buffers or any(part in key for part in float32)
-        value = weight(key, tensors[key], torch.float32 if is_float32 else dtype, source)
-        kept[key] = channels_last(value)
+    kept = {key: channels_last(weight(key, tensors[key], source)) for key in expected}
     net.load_state_dict(kept, assign=True)
 
 
@@ -217,7 +180,7 @@ def _is_bookkeeping(key: str) -> bool:
     return key.split(".")[-1].startswith("accum_") or key.endswith("_extra_state")
 
 
-def _load_pickle(path: Path, device: str) -> object:
+def _load_pickle(path: Path) -> object:
     try:
         # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold
         # transformer-engine states, which are dropped.
@@ -225,7 +188,7 @@ def _load_pickle(path: Path, device: str) -> object:
             open_regular(path, WEIGHT_BYTES) as file,
             torch.serialization.safe_globals([io.BytesIO]),
         ):
-            return torch.load(file, map_location=device, weights_only=True)
+            return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path}: a pickle that holds more than tensors; loading it could run code",

@@ -49,8 +49,6 @@ from alpasim_plugin.fixers.network.reference_blend import (
     blend,
     gather_references,
     larger,
-    likeness,
-    offsets,
     smaller,
 )
 
@@ -67,26 +65,20 @@ LAST = np.uint64(31)
 CHANNELS = 3
 
 
-def hole_mask(opacity: Tensor) -> Tensor:
-    """Return the mask m of Eq. 1, hardened: 1 above half opacity, falling to 0 where nothing is
-    drawn.
-
-    With m = opacity, noise would enter the half of a image that is nearly opaque, and a small
-    network would have to take it out again.
-    """
-    return (opacity / HOLE).clamp(max=1)
-
-
 def pixel_source(render: Tensor, opacity: Tensor, eps: Tensor) -> Tensor:
     """Return z_1 = m r + (1 - m) eps (Eq. 1) for images ``(..., C)`` and an opacity of one
     channel.
+
+    The mask m is hardened: 1 above half opacity, falling to 0 where nothing is drawn. With m =
+    opacity, noise would enter the half of an image that is nearly opaque, and a small network would
+    have to take it out again.
     """
-    m = hole_mask(opacity)
+    m = (opacity / HOLE).clamp(max=1)
     return m * render + (1 - m) * eps
 
 
 def sparse_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tensor:
-    """Return `pixel_source` with noise that is drawn only where it has weight, on the processor.
+    """Return `pixel_source` with noise that is drawn only where it has weight.
 
     Args:
         render: ``(B, H, W, 3)``.
@@ -99,44 +91,10 @@ def sparse_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tenso
         if not len(holes):
             continue
         source = source.clone() if source is render else source
-        eps = torch.from_numpy(pixel_noise(keys[b], holes.numpy()))
+        eps = torch.from_numpy(pixel_noise(keys[b], holes.cpu().numpy())).to(render.device)
         pixels = source[b].view(-1, render.shape[-1])
         pixels[holes] = pixel_source(pixels[holes], alpha[holes, None], eps)
     return source
-
-
-def dense_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tensor:
-    """Return what `sparse_source` does, to rounding, without leaving the device."""
-    height, width = render.shape[1:3]
-    index = torch.arange(height * width * CHANNELS, device=render.device)
-    noise = [_normal_on_device(index, key).view(height, width, CHANNELS) for key in keys]
-    return pixel_source(render, opacity, torch.stack(noise))
-
-
-def _normal_on_device(index: Tensor, key: int) -> Tensor:
-    """Return the values of `pixel_noise` at flat positions ``(N,)``, float32."""
-    u, v = (
-        _uniform_on_device(_signed(key) + (2 * index + i + 1) * _signed(int(ODD))) for i in (0, 1)
-    )
-    return (torch.sqrt(-2 * torch.log(u)) * torch.cos(2 * torch.pi * v)).float()
-
-
-def _uniform_on_device(x: Tensor) -> Tensor:
-    """Return what `_uniform` does; int64 stands for unsigned numbers, modulo 2^64."""
-    for shift, factor in MIX:
-        x = (x ^ _shifted(x, int(shift))) * _signed(int(factor))
-    x = x ^ _shifted(x, int(LAST))
-    return (_shifted(x, 11).double() + 1) * 2.0**-53
-
-
-def _shifted(x: Tensor, bits: int) -> Tensor:
-    """Shift int64 to the right, zeros coming in."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def _signed(value: int) -> int:
-    """Return the int64 of the same 64 bits."""
-    return (value + 2**63) % 2**64 - 2**63
 
 
 def noise_key(scene_id: str, seed: int, camera: str, draw: int, frame: int) -> int:
@@ -240,41 +198,26 @@ class Repaired(NamedTuple):
     heads: BlendHeads | None  # None without references
 
 
-class GatheredCells(NamedTuple):
-    """What the network reads, as cells of pixels."""
-
-    coarse: Tensor  # (B, H / 4, W / 4, 16 * IMAGES + hidden)
-    fine: Tensor  # (B, H / 2, W / 2, 4 * DETAIL_IMAGES)
-
-
 def gather_cells(
     render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
-) -> GatheredCells:
-    """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in
-    float32.
+) -> tuple[Tensor, Tensor]:
+    """Put what the network reads side by side, as cells of pixels; arguments as in
+    `PixelGenerator.forward`, result in float32.
 
-    ``coarse`` holds per cell the `cells` of render, 2 opacity - 1, map, last output, last render
-    and source minus render, then the recurrent channels; ``fine`` those of render, 2 opacity - 1
-    and last output.
+    Returns:
+        ``(B, H / 4, W / 4, 16 * IMAGES + hidden)``, per cell the `cells` of render, 2 opacity - 1,
+        map, last output, last render and source minus render, then the recurrent channels; and
+        ``(B, H / 2, W / 2, 4 * DETAIL_IMAGES)``, those of render, 2 opacity - 1 and last output.
     """
     cover = 2 * opacity - 1
     images = render, cover, sdmap, state.output, state.render, source - render
     coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
-    fine = torch.cat([cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1)
-    return GatheredCells(coarse, fine)
+    return coarse, torch.cat(
+        [cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1
+    )
 
 
-TORCH = Operations(
-    gather_cells,
-    gather_references,
-    likeness,
-    offsets,
-    blend,
-    smaller,
-    larger,
-    dense_source,
-    asks=False,
-)
+TORCH = Operations(gather_references, blend, smaller, larger)
 
 
 class PixelGenerator(nn.Module):
@@ -399,10 +342,10 @@ class PixelGenerator(nn.Module):
         past = state._replace(
             output=smaller(state.output, scale), render=smaller(state.render, scale)
         )
-        read = operations.gather_cells(
+        coarse, fine = gather_cells(
             shown, smaller(opacity, scale), smaller(sdmap, scale), past, noised
         )
-        stem, detail = self.stem(read.coarse.to(dtype)), self.read(read.fine.to(dtype))
+        stem, detail = self.stem(coarse.to(dtype)), self.read(fine.to(dtype))
         seen = None
         if self.blend is not None and references is not None:
             seen = operations.gather_references(references, shown, scale)
@@ -425,7 +368,7 @@ class PixelGenerator(nn.Module):
         change = pixels(self.write(fine), DETAIL).float()
         heads = None
         if self.blend is not None and seen is not None:
-            heads = self.blend(y, fine, seen, operations)
+            heads = self.blend(y, fine, seen)
         return Repaired(render + operations.larger(change, scale), hidden, heads)
 
     @classmethod
@@ -436,7 +379,7 @@ class PixelGenerator(nn.Module):
             InputError: Tensors that are missing, unknown, of another shape or not finite.
         """
         net = cls(_sizes_of(tensors, source))
-        load_checked(net, tensors, torch.float32, source)
+        load_checked(net, tensors, source)
         return net
 
     @property

@@ -20,9 +20,9 @@ network gives it no weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -35,9 +35,6 @@ from alpasim_plugin.fixers.network.pixel_layers import (
     cells,
     pixels,
 )
-
-if TYPE_CHECKING:
-    from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
@@ -80,26 +77,16 @@ class Operations:
     is the same to rounding, fused for processors.
 
     Attributes:
-        gather_cells: See `pixel_generator.gather_cells`.
         gather_references: See `gather_references`.
-        likeness: See `likeness`.
-        offsets: See `offsets`.
         blend: See `blend`.
         smaller: Average images ``(B, H, W, C)`` over squares of a number of pixels.
         larger: Enlarge images ``(B, H, W, C)`` bilinearly by a whole number.
-        source: See `pixel_generator.sparse_source`.
-        asks: Whether work is saved by looking at values in between; on a GPU that would wait.
     """
 
-    gather_cells: Callable[[Tensor, Tensor, Tensor, PixelState, Tensor], GatheredCells]
     gather_references: Callable[[Tensor, Tensor, int], ReferenceCells]
-    likeness: Callable[[Tensor, Tensor], Tensor]
-    offsets: Callable[[Tensor, Tensor], Tensor]
     blend: Callable[[Tensor, Tensor, BlendHeads, int], tuple[Tensor, Tensor]]
     smaller: Callable[[Tensor, int], Tensor]
     larger: Callable[[Tensor, int], Tensor]
-    source: Callable[[Tensor, Tensor, Sequence[int]], Tensor]
-    asks: bool
 
 
 class ReferenceBlend(nn.Module):
@@ -140,28 +127,25 @@ class ReferenceBlend(nn.Module):
         dtype = self.stem.weight.dtype
         return self.stem(seen.mean4.to(dtype)), self.read(seen.mean2.to(dtype))
 
-    def forward(
-        self, y: Tensor, fine: Tensor, seen: ReferenceCells, operations: Operations
-    ) -> BlendHeads:
+    def forward(self, y: Tensor, fine: Tensor, seen: ReferenceCells) -> BlendHeads:
         """Return how every reference enters the image.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
             seen: What the references show.
-            operations: For the device.
         """
         b = y.shape[0]
         k = seen.each4.shape[0] // b
         side = activation(_add_to_each(self.coarse(seen.each4.to(y.dtype)), y), inplace=True)
-        alike = operations.likeness(self.sought(y), self.shown(side))
+        alike = likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
         at4 = activation(self.align[1](at4), inplace=True)
         joined = _add_to_each(self.own(seen.each2.to(fine.dtype)).add_(self.up(at4)), fine)
         features = activation(self.head(activation(joined, inplace=True)), inplace=True)
         heads = self.write(features).unflatten(0, (b, k))
         weight, offset, correction = heads.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        moved = operations.offsets(offset.flatten(0, 1), self.shift(at4))
+        moved = offsets(offset.flatten(0, 1), self.shift(at4))
         return BlendHeads(weight, moved.view(offset.shape), correction)
 
 

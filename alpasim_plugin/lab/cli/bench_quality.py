@@ -13,7 +13,6 @@ from rich.console import Console
 from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, split_names, split_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.quality import (
     RAW,
     Given,
@@ -22,6 +21,7 @@ from alpasim_plugin.lab.bench.quality import (
     evenly,
     measure_quality,
 )
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.lab.video_metrics.summary import TRUTH

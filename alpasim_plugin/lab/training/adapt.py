@@ -24,9 +24,9 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.types import F64, Scenario
-from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.quality import Variant, quality_clip, run_variant
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.drive_pairs import DRIVE, Shot, write_drive_sequence
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pixel_rollout import Distance

@@ -20,6 +20,7 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.block_fixers.sampling import finalise, flow_step
 from alpasim_plugin.fixers.network.schedule import NoiseLevel, interpolant
+from alpasim_plugin.lab.training.graph_cache import GraphCache
 from alpasim_plugin.lab.training.recipes.recipe import Attention
 
 
@@ -50,7 +51,7 @@ def causal_rollout(
         ``(B, C, N, H, W)`` clean latents.
     """
     b, _, n, h, w = sources[0].shape
-    cache = net.new_cache(b, h, w, attention.window, attention.sink, keeps_graph=True)
+    cache = GraphCache.of(net, b, h, w, attention.window, attention.sink)
     first = 0 if gradient_latents is None else n - gradient_latents
     made = []
     for start in range(0, n, attention.block_latents):

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.networks import streaming_dit
@@ -18,8 +17,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
+from alpasim_plugin.fixers.bundle import parts_of, save_bundle
 from alpasim_plugin.fixers.network.checkpoints import load_weights
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
 from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
@@ -62,7 +62,7 @@ def finetune_decoder(
         InfrastructureError: The loss is not finite.
     """
     settings = bundle_settings(bundle)
-    tensors = load_weights(bundle, dtype=torch.float32)
+    tensors = {key: value.float() for key, value in load_weights(bundle).items()}
     parts = parts_of(tensors)
     vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
     net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)

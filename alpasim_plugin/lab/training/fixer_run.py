@@ -421,7 +421,7 @@ def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
     name, _, part = source.partition(".")
     if name not in files:
         return None
-    tensors = load_weights(files[name], dtype=torch.float32)
+    tensors = {key: value.float() for key, value in load_weights(files[name]).items()}
     parts = parts_of(tensors)
     if part == "dit" and "dit" not in parts:
         return tensors  # a transformer alone

@@ -121,7 +121,9 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     )
     if run.init is None or _is_checkpoint(run.init):
         return net
-    tensors = parts_of(load_weights(run.init, dtype=torch.float32)).get("generator")
+    tensors = parts_of({key: value.float() for key, value in load_weights(run.init).items()}).get(
+        "generator"
+    )
     if tensors is None:
         raise InputError(
             f"{run.init}: no part generator.*",

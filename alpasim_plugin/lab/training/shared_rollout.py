@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
-from alpasim_plugin.block_fixers.kv_cache import GraphCache
 from alpasim_plugin.block_fixers.sampling import finalise, flow_step, mixed_source
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import interpolant
+from alpasim_plugin.lab.training.graph_cache import GraphCache
 
 FlowHistory = Literal["own", "clean", "redenoised"]
 Predicted = Literal["own", "redenoised"]
@@ -346,6 +346,4 @@ class _Rollout:
 
     def _new_cache(self) -> GraphCache:
         b, _, _, h, w = self.s.z_0.shape
-        cache = self.net.new_cache(b, h, w, self.window, keeps_graph=True)
-        assert isinstance(cache, GraphCache)
-        return cache
+        return GraphCache.of(self.net, b, h, w, self.window)

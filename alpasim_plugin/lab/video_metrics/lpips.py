@@ -229,7 +229,7 @@ def _tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -
         raise InputError(
             f"{key} in {source}: {found}", f"give the published weights, where it is {shape}"
         )
-    return weight(key, value, torch.float32, source)
+    return weight(key, value, source)
 
 
 def _unit(x: Tensor) -> Tensor:

@@ -138,10 +138,7 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
             f"{source}: format {read_metadata(source).get('format')!r}, not {FORMAT!r}",
             do,
         )
-    tensors = {
-        key: weight(key, value, torch.float32, str(source))
-        for key, value in load_weights(source).items()
-    }
+    tensors = {key: weight(key, value, str(source)) for key, value in load_weights(source).items()}
     heads = [tensors.get(f"heads.{i}") for i in range(len(WIDTHS))]
     if any(head is None for head in heads):
         raise InputError(

@@ -16,9 +16,10 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
+from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench.quality import Work, finish, shown_frames
 from alpasim_plugin.lab.cli.bench_quality import parse_variants
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
 from alpasim_plugin.lab.video_metrics.summary import summarise
 from tests.block_fixers.fixer_cases import small_settings

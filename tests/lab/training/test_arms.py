@@ -17,9 +17,9 @@ from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation
 from alpasim_plugin.lab.training.fixer_run import FixerRun, train_fixer

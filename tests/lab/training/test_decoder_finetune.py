@@ -39,7 +39,7 @@ def vae_of(bundle: Path) -> TinyVAE:
 
 
 def net_of(bundle: Path) -> CosmosCausalDiT:
-    tensors = load_weights(bundle, dtype=torch.float32)
+    tensors = {key: value.float() for key, value in load_weights(bundle).items()}
     return CosmosCausalDiT.from_state_dict(
         {key[4:]: value for key, value in tensors.items() if key.startswith("dit.")}
     )

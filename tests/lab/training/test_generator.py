@@ -21,8 +21,8 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.lab.training.generator import SharedRollout

@@ -19,10 +19,10 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.cli.train import app
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from tests.fixers.clip_cases import moving_picture, pixels

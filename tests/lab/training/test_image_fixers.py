@@ -16,11 +16,12 @@ from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle
+from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
+from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
 from tests.lab.training.whole_clip_images import whole_clip_images

@@ -276,7 +276,7 @@ def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path):
     assert isinstance(deeper, PixelFixerSettings)
     net = initial_generator(replace(run_of(init=shallow), settings=deeper))
     before = PixelGenerator.from_state_dict(
-        parts_of(load_weights(shallow, dtype=torch.float32))["generator"]
+        parts_of({key: value.float() for key, value in load_weights(shallow).items()})["generator"]
     )
     picture = torch.rand(1, 32, 48, 3, generator=torch.Generator().manual_seed(0))
     inputs = picture, picture[..., :1], picture, net.start(picture)
