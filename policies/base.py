@@ -78,8 +78,8 @@ def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
     for camera in sorted(ahead, key=lambda c: "front" not in c.name):
         return camera
     raise InputError(
-        f"scene {scenario.scene_id!r}: no pinhole camera looks ahead among {[camera.name for camera in scenario.cameras]}",
-        "add a front camera without a lens to the scenario or choose another policy",
+        f"scene {scenario.scene_id!r}: no pinhole looks ahead among its cameras {', '.join(camera.name for camera in scenario.cameras)}",
+        "Set `lens: pinhole` of one that looks ahead in `cameras`, add one, or choose another policy.",
     )
 
 

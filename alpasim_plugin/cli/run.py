@@ -31,12 +31,14 @@ from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import split_names
+from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.executors.choice import parse_executor
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators import preset as find_preset
@@ -284,8 +286,8 @@ def _print_decision(decided: Decided, as_json: bool) -> None:
 
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
-    scenarios = plan.scenarios.values()
-    frames = sum((s.end_us - s.start_us) // s.rates.camera_us for s in scenarios)
+    with parts_print_to_stderr():
+        asked = [frames_asked(policy, plan.scenarios.values()) for policy in plan.policies]
     facts = {
         "out": str(root),
         "key": plan.command_key,
@@ -297,7 +299,7 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
         "seeds": list(plan.seeds),
         "varied": {name: s.varied for name, s in plan.scenarios.items() if s.varied},
         "never_reused": list(plan.undigested),
-        "camera_frames": int(frames) * len(plan.cells) // len(plan.scenarios),
+        "camera_frames": sum(asked) * len(plan.renderers) * len(plan.seeds),
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,
     }

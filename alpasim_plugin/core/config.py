@@ -28,6 +28,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.limits import YAML_BYTES, YAML_VALUES
 from alpasim_plugin.core.reading import read_text, real
+from alpasim_plugin.core.reading.files import wanted_of
 
 MOST_FILES = 64  # of one document, through extends
 MOST_LEVELS = 40
@@ -396,11 +397,7 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     if kind == "value_error":
         message, _, hint = str(context["error"]).partition(" | ")
         return f"{name}: {message}", hint or "correct the value"
-    message = problem["msg"]
-    return (
-        f"{name} = {shorten(repr(problem['input']), 80)}",
-        message.replace("Input should be", "give").replace("Input should", "the value should"),
-    )
+    return f"{name} = {shorten(repr(problem['input']), 80)}", f"Give {wanted_of(problem)}."
 
 
 def _nearest(name: str, choices: Sequence[str]) -> str:

@@ -140,9 +140,10 @@ class CameraRig:
         self._before: Mapping[str, F64] = {}  # the road users one control period ago
         for sensor in sensors:
             if sensor.camera not in known:
+                names = ", ".join(sorted(known)) or "none"
                 raise InputError(
-                    f"scene {scenario.scene_id!r}: the policy needs camera {sensor.camera!r}; the scenario has {sorted(known)}",
-                    "add that camera to the scenario or choose another policy",
+                    f"scene {scenario.scene_id!r}: the policy asks for camera {sensor.camera!r}; the scenario's cameras: {names}",
+                    "Name one of them in the policy's sensors, or add the camera to `cameras` of the scenario.",
                 )
             period = scenario.period_us(sensor)
             if period % clock.rates.control_us:
@@ -156,6 +157,11 @@ class CameraRig:
     def specs(self) -> dict[str, CameraSpec]:
         """Give the cameras in use by name."""
         return {camera.name: camera for camera, _ in self._due}
+
+    def count(self) -> int:
+        """Count the frames of the rollout."""
+        ticks = list(self._clock.ticks())
+        return sum(self._is_due(tick.t_us, period) for tick in ticks for _, period in self._due)
 
     def requests(
         self, tick: Tick, history: Trajectory, actors: Mapping[str, F64]

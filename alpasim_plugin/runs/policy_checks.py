@@ -2,21 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from alpasim_plugin.core.errors import PolicyError, SimrunError
-from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.spec import BUILTIN
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
-from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.core.types import Scenario, SensorSpec
+from alpasim_plugin.runs.cameras import CameraRig
 from alpasim_plugin.runs.execute import HowToRun
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
+from alpasim_plugin.runs.guards import checked_sensors
 from alpasim_plugin.runs.plan import RunPlan
+from policies.base import make_policy
 from policies.conformance import check_policy
 
 LIMIT_S = 120.0
+
+
+def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
+    """Return how many camera frames a policy asks for in one rollout of each scenario; one behind
+    an address is taken to ask for every camera.
+
+    The policy is built once for each set of cameras.
+
+    Raises:
+        InputError: A scenario lacks a camera of the policy, or a period does not fit.
+        PolicyError: The policy cannot be made, or its sensors are no sequence of `SensorSpec`.
+    """
+    built: dict[object, Sequence[SensorSpec]] = {}
+    frames = 0
+    for scenario in scenarios:
+        cameras = scenario.cameras
+        key = tuple((one.name, one.lens is None, one.T_rig_camera.tobytes()) for one in cameras)
+        if policy.address is not None:
+            built[key] = [SensorSpec(one.name) for one in cameras]
+        elif key not in built:
+            made = complete(make_policy(policy.name, scenario), Policy)
+            built[key] = checked_sensors(made)
+            made.close()
+        clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+        frames += CameraRig(scenario, built[key], clock).count()
+    return frames
 
 
 def check_policies(
@@ -25,8 +57,8 @@ def check_policies(
     """Return what `policies.conformance.check_policy` finds in each policy of the user's own: its
     digest, and by ``breaches`` and ``notes`` a name and a sentence each.
 
-    Shipped policies are not checked, nor those behind an address. The time that a plan takes is no
-    breach: a run need not keep it.
+    Of shipped policies the cameras alone are checked, and nothing of those behind an address. The
+    time that a plan takes is no breach: a run need not keep it.
 
     Args:
         plan: The run.
@@ -36,27 +68,32 @@ def check_policies(
         noticed: Called with one line for each breach.
 
     Raises:
+        InputError: A scenario lacks a camera of a policy.
         PolicyError: No policy of the run can be made.
     """
     shipped = {target for target, _ in BUILTIN["policy"].values()}
+    scenarios = list(plan.scenarios.values())
     found: dict[str, Any] = {}
     todo: list[PartSpec] = []
     for policy in plan.policies:
         before = known.get(policy.name)
         if policy.digest is not None and before and before["digest"] == policy.digest:
             found[policy.name] = before
-        elif policy.target not in shipped and policy.address is None:
+        elif policy.target in shipped:
+            frames_asked(policy, scenarios)
+        elif policy.address is None:
             todo.append(policy)
-    scenario = next(iter(plan.scenarios.values()))
     workers = min(how.threads.workers, len(todo))
     limit_s = how.limit_s if how.threads.workers == 1 else how.limit_s or LIMIT_S
-    check = partial(_check, scenario)
+    check = partial(_check, scenarios)
     for policy, result in run_jobs(check, todo, workers, how.threads.per_worker, limit_s):
         if isinstance(result, Lost):
             result = {
                 "breaches": [["ends", f"the check did not end: {result.reason}"]],
                 "notes": [],
             }
+        if isinstance(result, InputError):
+            raise result
         found[policy.name] = {"digest": policy.digest, **result}
     unmade = [text for one in found.values() for name, text in one["breaches"] if name == "made"]
     if len(unmade) == len(plan.policies):
@@ -67,11 +104,15 @@ def check_policies(
     return found
 
 
-def _check(scenario: Scenario, policy: PartSpec) -> dict[str, Any]:
+def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> dict[str, Any] | InputError:
     """Check one policy, in a worker."""
     try:
         with parts_print_to_stderr():
-            report = check_policy(policy.name, scenario)
+            with suppress(PolicyError):  # the check says more of it
+                frames_asked(policy, scenarios)
+            report = check_policy(policy.name, scenarios[0])
+    except InputError as error:
+        return error
     except SimrunError as error:
         return {"breaches": [["made", error.message]], "notes": []}
     breaches = [one for one in report.checks if not one.ok and one.name != "latency"]

@@ -7,6 +7,7 @@ were drawn from (`evaluators.statistics.paired`).
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -79,6 +80,8 @@ class MetricRule(_Strict):
             raise ValueError(
                 "a rule without margin, max_new, max or min | add one of them, or remove the metric"
             )
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g} | swap them")
         return self
 
     @property
@@ -115,6 +118,15 @@ class GateSpec(_Strict):
         default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric."
     )
     metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
+
+    @model_validator(mode="after")
+    def _decides_about_its_population(self) -> GateSpec:
+        binding = [rule for rule in self.metrics.values() if rule.is_paired and rule.must_decide]
+        if self.population == "scenes" and not binding:
+            raise ValueError(
+                "population: scenes without a margin that must be decided | limits and other rules are about the scenes of the run: add a margin, or use population: suite"
+            )
+        return self
 
 
 def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[GateSpec, str]:
@@ -391,11 +403,12 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
         metric = known.info(name)
         margin = metric.accepted if rule.margin is None else rule.margin
         least = least_scenes(metric, margin) if margin else None
-        if rule.must_decide and n_scenes < max(spec.min_scenes, least or 0):
+        needed = math.inf if least is None else max(spec.min_scenes, least)
+        if rule.must_decide and n_scenes < needed:
+            number = "no number of scenes passes" if least is None else f"it takes {needed} to pass"
             raise InputError(
-                f"{n_scenes} scenes: a gate about other scenes needs at least "
-                f"{max(spec.min_scenes, least or 0)} to pass {name}",
-                "run more scenes, accept a larger margin, or use population: suite",
+                f"{plural(n_scenes, 'scene')}, and a gate about other scenes: {number} {name} with margin {margin:g}",
+                "Run more scenes, accept a larger margin, or use population: suite.",
             )
         entry = compare(pair.side, pair.base, metric, pair.label, margin)
         cause = CAUSES[entry["verdict"]]

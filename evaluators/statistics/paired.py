@@ -420,7 +420,7 @@ def least_scenes(metric: MetricInfo, margin: float) -> int | None:
     """Return how many scenes without any difference `non-inferior` takes; None where none do."""
     rare = beyond_share(metric, margin)
     needed = scenes_without_event(margin, reach_of(metric, margin) or math.inf)
-    needed = max(needed, scenes_without_event(rare) if rare else 0)
+    needed = max(needed, scenes_without_event(rare) if rare else 0, LEAST_SCENES)
     return int(needed) if needed <= MOST_SCENES else None
 
 

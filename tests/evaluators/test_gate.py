@@ -284,6 +284,13 @@ def test_a_gate_about_other_scenes_is_refused_where_they_are_too_few_and_else_de
     assert code(add(0.5), spec=spec, scenes=400) == 1
     assert code(add(0.1), spec=spec, scenes=400) == 3
     assert code(lambda run: run[1:], spec=spec, scenes=400) == 2
+    for margin, number in ((0.9, "6"), (0.0, "no number")):
+        wide = gate(population="scenes", metrics={"progress": MetricRule(margin=margin)})
+        with pytest.raises(InputError) as caught:
+            code(same, spec=wide, scenes=5)
+        assert number in caught.value.message
+    wide = gate(population="scenes", metrics={"progress": MetricRule(margin=0.9)})
+    assert code(same, spec=wide, scenes=6) == 0
 
 
 # --- what is compared with what
@@ -398,7 +405,13 @@ def test_shipped_gates_load_by_name(name):
         ("version: 1\nmetrics:\n  progress: {max_new: 1}\n", ":3:", "which is no event"),
         ("version: 1\npreset: papr\nmetrics: {offroad: {margin: 0.1}}\n", ":2:", "known: paper"),
         ("version: 2\nmetrics: {offroad: {margin: 0.1}}\n", ":1:", "version"),
-        ("version: 1\nmetrics: {}\n", ":2:", "metrics"),
+        (
+            "version: 1\npopulation: scenes\nmetrics: {progress: {min: 0.5}}\n",
+            ":1:",
+            "without a margin",
+        ),
+        ("version: 1\nmetrics: {}\n", ":2:", "at least 1"),
+        ("version: 1\nmetrics:\n  progress: {max: 1, min: 5}\n", ":3:", "min 5 is above max 1"),
         ("version: 1\nmetrics: {offroad: {margin: 0.1}\n", ":2:", "not valid YAML"),
     ],
 )

@@ -26,6 +26,7 @@ from alpasim_plugin.core.parts.source import (
     file_of,
     is_target,
     load,
+    no_such_file,
     require_unedited,
     split_address,
 )
@@ -93,7 +94,7 @@ def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
 def _classless(kind: str, file: Path) -> InputError:
     """Return the error for a file without a class: it names the classes of the file, unrun."""
     if not os.path.isfile(file):
-        return InputError(f"{file}: no such file", f"Name FILE.py:Class of a {kind}.")
+        return no_such_file(kind, file)
     classes = classes_of(file)
     if not classes:
         return InputError(f"{file}: it has no class", f"Write the {kind} as a class in it.")

@@ -195,7 +195,7 @@ def load(target: str, kind: str) -> Any:
     name, _, attribute = target.rpartition(":")
     try:
         if name.endswith(".py") and not os.path.isfile(name):
-            raise FileNotFoundError(f"no such file: {name}")
+            raise no_such_file(kind, Path(name))
         module = importlib.import_module(make_importable(target))
         found = getattr(module, attribute, None)  # a module of a file runs here
     except InputError:
@@ -204,13 +204,27 @@ def load(target: str, kind: str) -> Any:
         hint = IN_A_FILE if name.endswith(".py") else DO_THIS
         raise InputError(f"{kind} {target!r}: {raised(error)}", hint) from error
     if found is None:
-        has = [key for key, value in vars(module).items() if inspect.isclass(value)]
+        classes = {key: value for key, value in vars(module).items() if inspect.isclass(value)}
+        own = [key for key, value in classes.items() if value.__module__ == module.__name__]
+        has = own if name.endswith(".py") else [*classes]
         near = difflib.get_close_matches(attribute, has, 3, 0.0)
         raise InputError(
             f"{kind} {target!r}: {name} has no {attribute!r}",
             f"Name one of its classes: {', '.join(near) or 'it has none'}.",
         )
     return found
+
+
+def no_such_file(kind: str, file: Path) -> InputError:
+    """Return the error for a part's file that is not there; its hint names those with a name like
+    it beside it.
+    """
+    beside = [path.name for path in file.parent.glob("*.py")]
+    near = difflib.get_close_matches(file.name, beside)
+    guess = f"Did you mean {' or '.join(near)}? " if near else ""
+    return InputError(
+        f"{kind} {str(file)!r}: no such file", f"{guess}Name a file that exists, as FILE.py:Class."
+    )
 
 
 def classes_of(file: Path) -> list[str]:

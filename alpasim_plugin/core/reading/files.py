@@ -10,7 +10,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BufferedReader
@@ -251,10 +251,40 @@ def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str = FETCH
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         member = ".".join(str(part) for part in first["loc"]) or "the document"
-        wanted = first["msg"].replace("Input should be", "wanted")
-        found = "missing" if first["type"] == "missing" else f"{kind_of(first['input'])}, {wanted}"
+        found = f"{kind_of(first['input'])}, wanted {wanted_of(first)}"
+        found = "missing" if first["type"] == "missing" else found
         raise InputError(f"{where}: {member}: {found}", do_this) from None
     return cast("T", value)
+
+
+WANTED = {  # type of a problem that pydantic finds -> what it wants instead
+    "string_type": "text",
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "an object of keys and values",
+    "model_type": "an object of keys and values",
+    "greater_than": "a number greater than {gt:g}",
+    "greater_than_equal": "a number greater than or equal to {ge:g}",
+    "less_than": "a number less than {lt:g}",
+    "less_than_equal": "a number less than or equal to {le:g}",
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "string_too_short": "a text of at least {min_length} letters",
+    "string_too_long": "a text of at most {max_length} letters",
+}
+
+
+def wanted_of(problem: Mapping[str, Any]) -> str:
+    """Say what a value should be instead, of a problem as pydantic lists it."""
+    words = WANTED.get(problem["type"])
+    if words is None:
+        return str(problem["msg"]).removeprefix("Input should be ")
+    return words.format(**problem.get("ctx", {}))
 
 
 @lru_cache(maxsize=64)
