@@ -91,6 +91,9 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
         by_last = {one.rsplit("/", 1)[-1]: one for one in names}
         last = name.rsplit("/", 1)[-1]
         near = [by_last[one] for one in difflib.get_close_matches(last, by_last, 3, 0.6)]
+    near = near or difflib.get_close_matches(
+        text, [path.name for path in Path().glob("*.y*ml")], cutoff=0.8
+    )
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     found = f"no such file or folder, and no shipped {kind} has that name"
     return InputError(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
@@ -147,7 +147,9 @@ class Verb(TyperCommand):
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         """Parse the words of the verb by its own command."""
-        return load_verb(str(self.name)).make_context(info_name, args, parent, **extra)
+        command = load_verb(str(self.name))
+        require_once(command, args)
+        return command.make_context(info_name, args, parent, **extra)
 
 
 class Verbs(TyperGroup):
@@ -193,6 +195,19 @@ def load_verb(verb: str) -> Any:
     return click_command(target)
 
 
+def require_once(command: Any, words: list[str]) -> None:
+    """Refuse an option that takes one value and stands twice in a command: the last would win.
+
+    Raises:
+        InputError: One does.
+    """
+    options = [one for one in command.params if isinstance(one, TyperOption)]
+    for option in options:
+        given = [word for word in words if word.partition("=")[0] in option.opts]
+        if len(given) > 1 and not option.multiple and not option.is_flag:
+            raise InputError(f"{given[0]}: given {len(given)} times", "Give it once.")
+
+
 app = typer.Typer(
     cls=Verbs,
     rich_markup_mode="markdown",
@@ -219,7 +234,8 @@ def usual(args: list[str]) -> list[str]:
     """
     words: list[str] = []
     for word in args:
-        if words and (words[-1].endswith(",") or word.startswith(",")):
+        is_seeds = words[-2:-1] == ["--seeds"] and not word.strip(",").isdecimal()
+        if words and not is_seeds and (words[-1].endswith(",") or word.startswith(",")):
             words[-1] += word
         else:
             words.append(word)
@@ -292,7 +308,13 @@ def _run(args: list[str]) -> int:
     except typer.Exit as leaving:
         return leaving.exit_code if args else InputError.exit_code
     except typer.TyperException as error:
-        message = error.format_message().replace("Value error, ", "")
+        message = error.format_message()
+        if hasattr(error.__cause__, "errors"):  # of pydantic, which Typer asks
+            from alpasim_plugin.core.reading.files import wanted_of
+
+            problem = error.__cause__.errors()[0]
+            wanted = f"{problem['input']!r}, wanted {wanted_of(problem)}"
+            message = message.replace(error.message, wanted)
         refused_by = getattr(error, "ctx", None)  # errors of options have one
         verb = refused_by.command_path if refused_by else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error

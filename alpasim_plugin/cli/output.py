@@ -236,8 +236,7 @@ def describe(manifest: dict[str, Any], reused: bool) -> str:
     if "rollout" in manifest:  # of a log that is scored
         cell = f"{manifest['rollout']}: {cell}"
     if manifest["status"] != "ok":
-        error = manifest["error"]
-        return f"{cell}: FAILED ({error['failure_class']}) {error['message']}"
+        return f"{cell}: FAILED ({manifest['error']['failure_class']})"
     from evaluators.metrics.outcomes import NO_OUTCOME, event_words  # a listing needs no metrics
 
     events = dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))

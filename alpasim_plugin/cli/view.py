@@ -21,8 +21,10 @@ from alpasim_plugin.cli.options import (
 from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
+from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_run, read_so_far
@@ -75,7 +77,6 @@ def view(
         _view_scenario(str(what), asked, overrides, out, as_json)
         return
     root, cell = run_and_cell(path)
-    wanted = wanted_of(root, cell, asked)
     if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
     so_far = read_so_far(root)
@@ -86,6 +87,7 @@ def view(
         warn(f"note: the run is not finished: {done} of {so_far.planned} rollouts")
     if not so_far.run.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
+    wanted = wanted_of(so_far.run.rollouts, cell, asked)
     page = out or root / PAGE
     made = write_page(so_far.run, page, wanted, int(max_mb * MB))
     facts = {
@@ -123,7 +125,7 @@ def _view_scenario(
     show(as_json, facts, *made["facts"], f"preview  {path}")
 
 
-def wanted_of(root: Path, cell: str, asked: Wanted) -> Wanted:
+def wanted_of(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wanted:
     """Return which rollouts to show: of a run what was asked for, of a rollout those of its scene,
     policy and seed behind the renderers that were.
 
@@ -137,8 +139,8 @@ def wanted_of(root: Path, cell: str, asked: Wanted) -> Wanted:
             f"{cell}: --scene, --policy or --seed beside a rollout, which has one of each",
             "Name its run folder.",
         )
-    manifest = read_manifest(root / "rollouts" / cell)
-    return Wanted((manifest["scene"],), (manifest["policy"],), (manifest["seed"],), asked.renderers)
+    found = named_rollout(rollouts, cell)
+    return Wanted((found.scene,), (found.policy,), (found.seed,), asked.renderers)
 
 
 REPORT_EPILOG = """

@@ -9,7 +9,7 @@ from typing import Annotated
 from alpasim_plugin.cli.options import Json, run_and_cell
 from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.flags import Positional
-from alpasim_plugin.runs.logged_rollout import named_row
+from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_run
@@ -46,11 +46,7 @@ def why(
     root, name = run_and_cell(cell)
     ensure_tables(root, warn)
     run = read_run(root)
-    if name:
-        row = named_row(root, name)
-        rollout = next(one for one in run.rollouts if one.path == row["path"])
-    else:
-        rollout = worst_failure(run)
+    rollout = named_rollout(run.rollouts, name) if name else worst_failure(run)
     cause = cause_of(run, rollout, divergences_of(run, rollout))
     page = write_cause(run, cause)
     facts = {

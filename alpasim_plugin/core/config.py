@@ -16,7 +16,7 @@ import math
 import os
 import re
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -380,7 +380,12 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     if kind == "extra_forbidden":
         models = _models_at(model, problem["loc"][:-1])
         keys = sorted({f.alias or k for m in models for k, f in m.model_fields.items()})
-        return f"unknown key {last!r} in {dotted(loc[:-1])}", _nearest(last, keys)
+        message = f"unknown key {last!r} in {dotted(loc[:-1])}"
+        elsewhere = _keys_below(model)
+        near = _like(last, [*keys, *elsewhere])
+        if near is not None and near not in keys:
+            return message, f"did you mean {elsewhere[near]!r}? valid here: {', '.join(keys)}"
+        return message, _nearest(last, keys)
     if kind == "missing":
         fields = [m.model_fields.get(last) for m in _models_at(model, problem["loc"][:-1])]
         wanted = next((field.description for field in fields if field), None) or "see the schema"
@@ -397,13 +402,34 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     if kind == "value_error":
         message, _, hint = str(context["error"]).partition(" | ")
         return f"{name}: {message}", hint or "correct the value"
-    return f"{name} = {shorten(repr(problem['input']), 80)}", f"Give {wanted_of(problem)}."
+    value = problem["input"]
+    found = "is empty" if value is None else f"= {shorten(repr(value), 80)}"
+    return f"{name} {found}", f"Give {wanted_of(problem)}."
 
 
 def _nearest(name: str, choices: Sequence[str]) -> str:
     """Return a hint that names the nearest of the valid choices, and all of them."""
-    near = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
-    return f"{f'did you mean {near[0]!r}? ' if near else ''}valid: {', '.join(choices)}"
+    near = _like(name, choices)
+    return f"{f'did you mean {near!r}? ' if near else ''}valid: {', '.join(choices)}"
+
+
+def _like(name: str, choices: Collection[str]) -> str | None:
+    """Return the choice that is nearest to a name: one that has all its words, or else the same
+    letters.
+    """
+    words = set(name.split("_"))
+    whole = [choice for choice in choices if words <= set(choice.split("_"))]
+    near = difflib.get_close_matches(name, whole or choices, n=1, cutoff=0.0 if whole else 0.65)
+    return near[0] if near else None
+
+
+def _keys_below(model: type[BaseModel]) -> dict[str, str]:
+    """Return the keys of a model's sections, with their paths."""
+    found: dict[str, str] = {}
+    for section, field in model.model_fields.items():
+        for below in filter(_is_model, _plain(field.annotation)):
+            found |= {key: f"{section}.{key}" for key in below.model_fields if key not in found}
+    return found
 
 
 def _models_at(model: Any, loc: Key) -> list[type[BaseModel]]:

@@ -276,18 +276,39 @@ def complete(part: T, interface: Any, what: str = "") -> T:
             loop finds it out.
     """
     required, optional = _members(interface)
-    missing = [name for name in required if not hasattr(part, name)]
-    if missing:
-        kind = interface.__name__.lower()
-        raise contract_error(kind)(
-            f"{what or type(part).__name__}: a {type(part).__name__} without {', '.join(missing)}",
-            f"give it {', '.join(f'`{name}`' for name in required)}; docs/extending.md shows a {kind}",
+    if inspect.isclass(part):
+        raise contract_error(interface.__name__.lower())(
+            f"{what}: the class {part.__name__}, not an object of it",
+            f"Name the class itself, or return {part.__name__}(...).",
         )
+    _require_none([n for n in required if not hasattr(part, n)], type(part), interface, what)
     for name, default in optional.items():
         if not hasattr(part, name):
             value = dict(default) if isinstance(default, Mapping) else default
             setattr(part, name, MethodType(value, part) if inspect.isfunction(value) else value)
     return part
+
+
+def require_methods(factory: type, interface: Any, what: str) -> None:
+    """Refuse a class without a method that its kind of part must have, before one is made.
+
+    Raises:
+        InputError: As `complete`.
+    """
+    required, _ = _members(interface)
+    methods = [name for name in required if name not in interface.__annotations__]
+    lacking = [name for name in methods if not hasattr(factory, name)]
+    _require_none(lacking, factory, interface, what)
+
+
+def _require_none(lacking: Sequence[str], made_by: type, interface: Any, what: str) -> None:
+    if lacking:
+        kind = interface.__name__.lower()
+        required, _ = _members(interface)
+        raise contract_error(kind)(
+            f"{what or made_by.__name__}: a {made_by.__name__} without {', '.join(lacking)}",
+            f"give it {', '.join(f'`{name}`' for name in required)}; docs/extending.md shows a {kind}",
+        )
 
 
 def contract_error(kind: str) -> type[SimrunError]:

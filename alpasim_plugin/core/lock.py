@@ -53,6 +53,8 @@ def one_writer(
         InfrastructureError: Another process holds it, or the folder cannot be written.
         InputError: Something else lies at the path than a lock file.
     """
+    if os.path.exists(path.parent) and not os.path.isdir(path.parent):
+        raise InputError(f"{path.parent}: a file, not a folder", "Name a folder.")
     lock = FileLock(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

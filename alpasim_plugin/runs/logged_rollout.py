@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
-from alpasim_plugin.log.run_folder.reader import table_path
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
+from alpasim_plugin.log.run_folder.reader import read_run
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import RUN_INFO, cell_name
 from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of
 
 
@@ -63,13 +64,13 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
         InputError: No such rollout, it did not finish, its scenario or its parts have changed, or
             it was driven with a part that is neither installed nor named.
     """
-    row = named_row(root, name)
-    if row["status"] != "ok":
+    row = named_rollout(read_run(root).rollouts, name)
+    if not row.ok:
         raise InputError(
-            f"{name}: the rollout did not finish: {row['failure']}", "Name a finished rollout."
+            f"{name}: the rollout did not finish: {row.failure}", "Name a finished rollout."
         )
     info = read_run_json(root)
-    state = inspect_rollout(root, row["path"], full=True)
+    state = inspect_rollout(root, row.path, full=True)
     if state.damage or state.manifest is None:
         raise InputError(
             f"{name}: {'; '.join(f'{one.file}: {one.problem}' for one in state.damage) or 'unfinished'}",
@@ -81,23 +82,23 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
             f"{name}: it is the continuation of another rollout",
             f"name that rollout: {manifest['fork']['of']}",
         )
-    stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
+    stated: Mapping[str, Any] = (info["scenes"].get(row.scene) or {}).get("ref") or {}
     if stated.get("path") is None:
         raise InputError(
-            f"{root / RUN_INFO}: no path of the scenario {row['scene']!r}",
+            f"{root / RUN_INFO}: no path of the scenario {row.scene!r}",
             "Drive the rollout again with simrun run.",
         )
     ref = ref_of(dict(stated))
     options = replace(options_of(info), baseline=None, video="none")
-    own_parts = (row["renderer"], row["policy"], ref.source, options.controller)
+    own_parts = (row.renderer, row.policy, ref.source, options.controller)
     require_installed([*own_parts, *options.evaluators], root / RUN_INFO, named)
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
     # fixer.
-    has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None
-    own = replace(options, fixer=overrides_of(row["renderer"], options.fixer) if has_fixer else ())
-    plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
+    has_fixer = resolve_renderer(row.renderer, options.fixer).fixer is not None
+    own = replace(options, fixer=overrides_of(row.renderer, options.fixer) if has_fixer else ())
+    plan = make_plan([ref], [row.renderer], [row.policy], [row.seed], own)
     (cell,) = plan.cells
-    loaded = plan.scenarios.get(row["scene"])
+    loaded = plan.scenarios.get(row.scene)
     if loaded is None or cell.rollout_key != manifest["rollout_key"]:
         what = (
             f"scenario {ref.path} now has the scene id {cell.scene!r}"
@@ -111,23 +112,18 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
     return LoggedRollout(root, cell, options, loaded, manifest)
 
 
-def named_row(root: Path, name: str) -> dict[str, Any]:
-    """Return the row of ``rollouts.parquet`` of a rollout, by its name or its folder.
+def named_rollout(rollouts: Sequence[Rollout], name: str) -> Rollout:
+    """Return a rollout of a run by its name or its folder.
 
     Raises:
         InputError: The run has no such rollout.
     """
-    path = table_path(root, ROLLOUTS)
-    rows = ROLLOUTS_TABLE.read(
-        path, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
-    ).to_pylist()
-    by_name = {cell_name(*(row[key] for key in KEYS)): row for row in rows}
+    by_name = {cell_name(*rollout.cell): rollout for rollout in rollouts}
     wanted = name.strip("/")
-    row = by_name.get(wanted) or next(
-        (r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None
-    )
-    if row is None:
+    by_folder = {rollout.path.removeprefix("rollouts/"): rollout for rollout in rollouts}
+    found = by_name.get(wanted) or by_folder.get(wanted.removeprefix("rollouts/"))
+    if found is None:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
-        do_this = f"did you mean {' or '.join(near)}?" if near else "name a run that has rollouts"
-        raise InputError(f"{name}: the run has no such rollout among its {len(rows)}", do_this)
-    return dict(row)
+        do_this = f"Did you mean {' or '.join(near)}?" if near else "Name a run that has rollouts."
+        raise InputError(f"{name}: the run has no such rollout among its {len(rollouts)}", do_this)
+    return found

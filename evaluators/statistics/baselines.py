@@ -167,7 +167,7 @@ def read_baseline(path: Path) -> Baseline:
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
         raise InputError(
             f"{path}: not a baseline of version {SCHEMA_VERSION}",
-            "write it again with this version",
+            "Write one with simrun gate RUN --write-baseline FILE, or name the earlier run's folder.",
         )
     do = "restore the file or write it again"
     as_shape(StoredBaseline, content, path, do)

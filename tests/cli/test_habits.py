@@ -11,9 +11,15 @@ from alpasim_plugin.cli.main import run_command, usual
 PARTS = """
 import numpy as np
 from policies.simple import PurePursuit
-from simrun import Frame
+from simrun import Frame, SensorSpec
 
 class One(PurePursuit): pass
+def made(): return One
+class Rear(PurePursuit):
+    def __init__(self, scenario):
+        self.sensors = (SensorSpec("rear"),)
+class Text(PurePursuit):
+    sensors = "front"
 class NeedsGain(PurePursuit):
     def __init__(self, scenario, gain): ...
 
@@ -42,6 +48,7 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "relative.py").write_text("from .helper import x\nclass One: pass\n")
     (tmp_path / "syntax.py").write_text("class One\n    pass\n")
     (tmp_path / "tabs.yaml").write_text("version: 1\nroad:\n\tsegments: []\n")
+    (tmp_path / "empty.yaml").write_text("")
     (tmp_path / "notes.txt").write_text("hello")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -85,7 +92,24 @@ def test_what_asks_for_help_ends_well(line):
         ("--policy syntax.py:One smoke/curve", "syntax.py"),
         ("--policy parts.py:NeedsGain --out run smoke/curve", "gain"),
         ("--renderer parts.py smoke/curve", "parts.py:Channels"),
+        ("--policy part.py:One smoke/curve", "parts.py"),
+        ("--policy parts.py:Nope smoke/curve", "NeedsGain"),
+        ("--policy parts.py:made smoke/curve", "One"),
+        ("--policy parts.py:Rear --dry-run smoke/curve", "rear"),
+        ("--policy parts.py:Rear --out run smoke/curve", "front"),
+        ("--policy parts.py:Text --dry-run smoke/curve", "SensorSpec"),
+        ("--policy clean smoke/curve", "--renderer clean"),
+        ("--renderer parts.py:One smoke/curve", "render"),
+        ("--renderer 3dgs+onefixer smoke/curve", "onefixer+3dgs"),
+        ("--renderer clean --renderer 3dgs smoke/curve", "--renderer"),
         ("--set roda.x=1 smoke/curve", "--set roda.x=1"),
+        ("--set duration_s=3 smoke/curve", "timing.duration_us"),
+        ("--set speed_mps=3 smoke/curve", "ego.speed_mps"),
+        ("--seeds 5, absent.yaml", "absent.yaml"),
+        ("--workers two smoke/curve", "'two', wanted an integer"),
+        ("--out notes.txt --renderer clean smoke/curve", "notes.txt"),
+        ("tabs.yml", "tabs.yaml"),
+        ("empty.yaml", "empty.yaml:1"),
         ("--seeds 0..3 smoke/curve", "0..3"),
         ("--workers 0 smoke/curve", "--workers"),
         ("tabs.yaml", "tabs.yaml:3"),
@@ -95,11 +119,11 @@ def test_what_asks_for_help_ends_well(line):
         ("export --mcap a.mcap", "runs/"),
         ("serve --policy lane-camera --scenes absent", "absent"),
         ("serve --policy lane-camera --scenes tabs.yaml", "tabs.yaml:3"),
-        ("check renderer parts.py:Channels", "parts.py:12"),
-        ("check renderer parts.py:Floats", "parts.py:15"),
-        ("check renderer parts.py:Small", "parts.py:18"),
-        ("check renderer parts.py:Nothing", "parts.py:21"),
-        ("check renderer parts.py:Raises", "parts.py:24"),
+        ("check renderer parts.py:Channels", "parts.py:18"),
+        ("check renderer parts.py:Floats", "parts.py:21"),
+        ("check renderer parts.py:Small", "parts.py:24"),
+        ("check renderer parts.py:Nothing", "parts.py:27"),
+        ("check renderer parts.py:Raises", "parts.py:30"),
     ],
 )
 def test_a_mistake_is_answered_by_what_is_wrong(line, named, here, capsys):

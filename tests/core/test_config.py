@@ -186,7 +186,7 @@ def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path):
         ("version: 2\nlength_m: 3\n", ":1:1", "version", "valid: 1"),
         ("version: 1\nlength_m: 3\nsize_m: [1, 2, 3]\n", ":3:", "size_m", ""),
         ("- 1\n- 2\n", ":1:1", "the file = [1, 2]", "object"),
-        ("", "", "the file = None", "object"),
+        ("", "", "the file is empty", "object"),
     ],
 )
 def test_wrong_content_is_named_with_position_and_hint(tmp_path, text, line, found, hint):

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 
 from alpasim_plugin.core.config import Document, apply_overrides, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.interfaces import Declaration
+from alpasim_plugin.core.interfaces import Declaration, require_methods
 from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.core.parts.source import (
     absolute_target,
@@ -83,6 +83,12 @@ def find(kind: KindName, name: str) -> Entry:
 def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
     if name.endswith(".py"):
         return _classless(kind, Path(name))
+    for other in ("renderer", "fixer", "policy", "controller"):
+        if name in entries(other):
+            option = "renderer" if other == "fixer" else other
+            return InputError(
+                f"name {name!r}: a {other}, not a {kind}", f"Write --{option} {name}."
+            )
     near = difflib.get_close_matches(name, known, n=1)
     guess = f"did you mean {near[0]!r}? " if near else ""
     return InputError(
@@ -231,7 +237,11 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         return RendererSpec(name, resolve("renderer", front))
     fixers = entries("fixer")
     if not is_target(front) and split_steps(front)[0] not in fixers:
-        raise _unknown("fixer" if plus else "renderer or fixer", front, [*renderers, *fixers])
+        if plus and front in renderers and split_steps(base)[0] in fixers:
+            raise InputError(
+                f"renderer {name!r}: the fixer stands before the renderer", f"Write {base}+{front}."
+            )
+        raise _unknown("renderer or fixer", front, [*renderers, *fixers])
     fixer = resolve("fixer", front, (*overrides_of(name, overrides), *own))
     if own:
         fixer = replace(fixer, name=f"{fixer.name}[{','.join(own)}]")
@@ -367,6 +377,8 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
     if factory is not None:
         for file in modules:
             require_unedited(file)
+    if inspect.isclass(factory) and spec.kind != "policy":  # whose contract is under test
+        require_methods(factory, KINDS[spec.kind].interface, f"{spec.kind} {spec.name!r}")
     declared = declaration_of(factory, spec.settings)
     folder = module.parent if module else Path()
     paths = {key: folder / path for key, path in declared.files.items()}

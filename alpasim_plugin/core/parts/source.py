@@ -206,7 +206,7 @@ def load(target: str, kind: str) -> Any:
     if found is None:
         classes = {key: value for key, value in vars(module).items() if inspect.isclass(value)}
         own = [key for key, value in classes.items() if value.__module__ == module.__name__]
-        has = own if name.endswith(".py") else [*classes]
+        has = own or [*classes]
         near = difflib.get_close_matches(attribute, has, 3, 0.0)
         raise InputError(
             f"{kind} {target!r}: {name} has no {attribute!r}",
@@ -219,9 +219,8 @@ def no_such_file(kind: str, file: Path) -> InputError:
     """Return the error for a part's file that is not there; its hint names those with a name like
     it beside it.
     """
-    beside = [path.name for path in file.parent.glob("*.py")]
-    near = difflib.get_close_matches(file.name, beside)
-    guess = f"Did you mean {' or '.join(near)}? " if near else ""
+    near = difflib.get_close_matches(file.stem, [path.stem for path in file.parent.glob("*.py")])
+    guess = f"Did you mean {' or '.join(f'{name}.py' for name in near)}? " if near else ""
     return InputError(
         f"{kind} {str(file)!r}: no such file", f"{guess}Name a file that exists, as FILE.py:Class."
     )

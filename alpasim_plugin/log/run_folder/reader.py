@@ -48,7 +48,7 @@ from alpasim_plugin.log.run_folder.schema import (
 from alpasim_plugin.log.run_folder.shapes import RunInfo, SceneFile, Summary
 from alpasim_plugin.log.run_folder.writer import rollout_table
 
-TRACEBACK_LINES = 4
+TRACEBACK_LINES = 3
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
 TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
 
@@ -263,6 +263,7 @@ def last_output(path: Path) -> list[str]:
     if not os.path.isfile(path):
         return []
     lines = read_bytes(path, SOURCE_BYTES).decode("utf-8", "replace").rstrip().splitlines()
+    lines = [line for line in lines if line.strip(" ~^")]
     return [*(line.rstrip() for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
 
 
