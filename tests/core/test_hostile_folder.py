@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.subprocesses import OURS, SAFE_PATH, own_path_only
 from tests.examples import first_of
@@ -209,3 +211,15 @@ def test_a_worker_on_a_cluster_has_no_working_directory_on_its_path_unless_the_u
     monkeypatch.delenv("PYTHONPATH")
     own_path_only()
     assert not {"", str(tmp_path)} & set(sys.path)
+
+
+def test_two_files_beside_modules_of_one_name_are_refused(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "part.py").write_text("from same_name_twice import Mine\n")
+        (tmp_path / name / "same_name_twice.py").write_text(
+            f"{BASE}class Mine(Base):\n    note = '{name}'\n"
+        )
+    assert resolve("policy", f"{tmp_path}/a/part.py:Mine").note == "a"
+    with pytest.raises(InputError, match="same_name_twice was imported from"):
+        resolve("policy", f"{tmp_path}/b/part.py:Mine")

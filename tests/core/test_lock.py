@@ -46,3 +46,13 @@ def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path, repo):
         assert held.since_ns == path.stat().st_mtime_ns
         assert is_locked(path)
     assert not is_locked(path)
+
+
+def test_a_writer_that_waits_says_so_once(tmp_path, repo):
+    first = holder(tmp_path / ".lock", 1.0, repo)
+    lines = []
+    with one_writer(tmp_path / ".lock", "folder x", wait=True, waiting=lines.append):
+        assert first.wait(10) == 0
+    first.communicate()
+    assert len(lines) == 1
+    assert "folder x" in lines[0]

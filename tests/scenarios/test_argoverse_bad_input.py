@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from scenarios.argoverse import read_argoverse
+from scenarios.argoverse import read_argoverse, read_calibration
 from tests.scenarios.make_argoverse import (
     STEP_NS,
     T0_NS,
@@ -192,3 +192,8 @@ def test_cuboids_that_are_no_tracks(tmp_path, rows, found):
     error = refused(write_argoverse(tmp_path / "x", annotations=rows))
     assert found in error.message
     assert "annotations.feather" in error.message
+
+
+def test_log_without_calibration(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        read_calibration(tmp_path)

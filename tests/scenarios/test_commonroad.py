@@ -438,3 +438,26 @@ def test_lights_that_are_off_or_for_one_direction_are_noted_and_without_any_noth
 @pytest.mark.parametrize("phases", [(("blue", 3),), (("red", 0),), (("red", "soon"),)])
 def test_a_light_with_a_broken_cycle_is_refused(tmp_path, phases):
     refused(tmp_path, lanes=LIT, version="2020a", more=light(7, *phases))
+
+
+def test_predicted_and_uncertain_obstacles_are_left_out_with_a_note(tmp_path):
+    area = '<dynamicObstacle id="50"><type>car</type><shape><rectangle><length>4</length><width>2</width></rectangle></shape>'
+    area += state(0, 100, 4, tag="initialState") + "<occupancySet/></dynamicObstacle>"
+    vague = obstacle(51, drive(100, 4)).replace(
+        "<orientation><exact>0.0</exact>", "<orientation><intervalStart>0</intervalStart>"
+    )
+    log = read(tmp_path, traffic=TRAFFIC + area + vague)
+    assert [a.actor_id for a in log.actors] == ["12", "13"]
+    assert (
+        "1 obstacles are predicted as occupied areas, not as states and were left out" in log.notes
+    )
+    assert (
+        "1 obstacles have states without an exact position and orientation and were left out"
+        in log.notes
+    )
+
+
+def test_unknown_ego(tmp_path):
+    error = refused(tmp_path, ego="99")
+    assert "no moving obstacle '99'" in error.message
+    assert "choose the ego among 11, 12, 13" in error.hint

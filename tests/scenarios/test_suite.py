@@ -8,7 +8,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
-from scenarios.suite import ScenarioRef, load_suite
+from scenarios.suite import ScenarioRef, expand, load_suite
 
 SCENE = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\ntiming: {duration_us: 2000000}\n"
 
@@ -75,3 +75,9 @@ def test_an_empty_folder_and_a_missing_name_are_refused(tmp_path):
         load_suite(tmp_path)
     with pytest.raises(InputError, match="did you mean suites/smoke"):
         load_suite("suites/smok")
+
+
+def test_command_line_overrides_come_last(folder):
+    refs = expand(str(folder / "suite.yaml"), ["ego.cruise_mps=9"])
+    assert refs[1].overrides == ("ego.cruise_mps=8", "ego.cruise_mps=9")
+    assert refs[0].overrides == ("ego.cruise_mps=9",)

@@ -270,3 +270,10 @@ def test_golden_scenes_are_read(shared_data):
     with pytest.raises(InputError, match="without left_rail"):
         read_usdz_scene(next(folder.glob("cases/lane-without-rail-columns/scenes/*.usdz")))
     assert not read_usdz_scene(next(folder.glob("cases/no-map/scenes/*.usdz"))).lane_map.lanes
+
+
+def test_stripped_rails_leave_the_centres(tmp_path):
+    lane = read_usdz_scene(write(tmp_path / "a.usdz"), rails=False).lane_map.lanes["L0"]
+    assert lane.left is None
+    assert lane.right is None
+    assert len(lane.centre) > 2

@@ -215,3 +215,14 @@ def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(
     assert built[1].start_us - built[0].start_us == 700_000
     with pytest.raises(InputError, match="timeline: alpasim"):
         load_scenario("smoke/straight", overrides=["timing.start_time_offset_us=700000"])
+
+
+def test_a_lane_without_edges_is_widened():
+    centre = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
+    left, right = rails(Lane("a", centre, None, None))
+    np.testing.assert_allclose(left[:, 1], 1.85)
+    np.testing.assert_allclose(right[:, 1], -1.85)
+
+
+def test_names_with_hyphens_stay_apart():
+    assert table_ids(["a-1", "a~1"]) == {"a-1": "lane0", "a~1": "lane1"}
