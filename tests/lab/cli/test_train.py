@@ -11,13 +11,10 @@ from typing import Any
 
 import pytest
 
-from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.lab.cli.training_options import scene_files
 from policies.learned_net import load_net
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
@@ -108,20 +105,6 @@ def test_weights_come_with_digest_updates_and_time(data, tmp_path, capsys):
     assert f"wrote {weights}" in err.replace("\n", "")
 
 
-def test_a_file_without_an_autoencoder_is_refused(bundle, tmp_path):
-    assert load_tiny_vae(bundle).sizes == TinyVAE.random().sizes
-    path = tmp_path / "other.safetensors"
-    settings = small_settings()
-    save_bundle(
-        path,
-        {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": {}},
-        settings,
-        trained=True,
-    )
-    with pytest.raises(InputError):
-        load_tiny_vae(path)
-
-
 def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path, capsys):
     assert (
         run_command(
@@ -145,20 +128,6 @@ def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path, caps
     for recipe in ("V9", "decoder"):
         command = ["train", "fixer", str(tmp_path), "--recipe", recipe, "--out", str(tmp_path)]
         assert run_command(command) == 2
-
-
-def test_scenes_of_any_name_are_in_order_of_their_numbers(tmp_path, capsys):
-    (tmp_path / "train").mkdir()
-    for name in ("street_001", "bend_000", "foo", "bend_001"):
-        (tmp_path / "train" / f"{name}.yaml").write_text("version: 1\nroda: {}\n")
-    assert [path.stem for path in scene_files(tmp_path, "train")] == [
-        "bend_000",
-        "bend_001",
-        "street_001",
-        "foo",
-    ]
-    assert run_command(["train", "policy", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "roda" in capsys.readouterr().err
 
 
 def test_a_policys_card_says_what_made_it_and_how_well_it_does(tmp_path, capsys):

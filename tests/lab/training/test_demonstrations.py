@@ -9,22 +9,18 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import yaw_of
 from alpasim_plugin.lab.training.demonstrations import (
     DEMONSTRATIONS_FILE,
     DemonstrationRecipe,
     Demonstrations,
     read_demonstrations,
-    rotated_about_camera,
-    wide_camera,
     write_demonstrations,
 )
 from alpasim_plugin.lab.training.perturbed_rollouts import (
     perturbed_rollouts,
     turning_lines,
 )
-from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
-from alpasim_plugin.lab.training.trainer import Schedule, Trainer
+from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask
 from policies.learned_input import COMMANDS
 from policies.learned_net import LearnedNet
 from scenarios.load import load_scenario
@@ -88,16 +84,6 @@ def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):
         _ = read_demonstrations(tmp_path, "train")[0].arrays
 
 
-def test_turning_leaves_the_camera_where_it_is(scenario):
-    camera = wide_camera(scenario.cameras[0])
-    T = np.array([[0.6, -0.8, 0, 5], [0.8, 0.6, 0, 7], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    after = rotated_about_camera(T, camera, 0.1)
-    np.testing.assert_allclose(
-        (after @ camera.T_rig_camera)[:3, 3], (T @ camera.T_rig_camera)[:3, 3], atol=1e-12
-    )
-    assert yaw_of(after) - yaw_of(T) == pytest.approx(0.1)
-
-
 def test_every_turn_of_a_junction_has_a_rollout():
     scenario = load_scenario("urban/junction_straight", overrides=BARE)
     lines = turning_lines(scenario)
@@ -121,28 +107,6 @@ def test_drives_leave_the_path_and_meet_others(scenario):
     slow = [m.speed_mps < 0.7 * d.style.desired_mps for d in drives for m in d.states]
     assert 0.05 < np.mean(slow) < 0.6
     assert np.mean([m.collision_free for d in drives for m in d.states]) > 0.9
-
-
-@pytest.mark.slow
-def test_batches_depend_on_their_number_alone_and_can_be_learned(root, tmp_path):
-    torch.set_num_threads(1)
-    task = PolicyTask(
-        LearnedNet(0),
-        read_demonstrations(root, "train"),
-        PolicyRecipe(batch=6, brightness_jitter=0.0),
-    )
-    first = task.batch(3)
-    again = task.batch(3)
-    other = task.batch(4)
-    assert torch.equal(first.image, again.image)
-    assert not torch.equal(first.image, other.image)
-    before = measure(task)
-    Trainer(
-        task.net, tmp_path, Schedule(60, peak_lr=2e-3, warmup=5), task.batch, task.loss, task.facts
-    ).run()
-    after = measure(task)
-    assert after["lateral_16m_m"] < 0.6 * before["lateral_16m_m"]
-    assert after["speed_mps"] < 0.8 * before["speed_mps"]
 
 
 def test_sigma_sends_no_gradient_into_the_plan(root):

@@ -28,7 +28,6 @@ from alpasim_plugin.lab.training.dmd import (
 from alpasim_plugin.lab.training.flow_matching import FlowMatching, bell_weight, noise_levels
 from alpasim_plugin.lab.training.recipes.recipe import Attention
 from alpasim_plugin.lab.training.shared_rollout import Sample
-from alpasim_plugin.lab.training.tail_drop import TailDrop, visible_share
 
 N = 4
 TEXT = torch.zeros(1, 1, 8)
@@ -140,13 +139,6 @@ def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradien
     assert weight.grad is not None
 
 
-def test_levels_of_the_scores_are_the_tables_and_bounded():
-    levels = score_levels(torch.tensor([0.0, 0.0015, 0.5004, 0.9999]))
-    torch.testing.assert_close(
-        levels, torch.tensor([0.02, 0.02, 5 * 0.5 / 3, 0.98]), atol=1e-6, rtol=0
-    )
-
-
 @pytest.mark.parametrize(("history", "crosses"), [("finalise", False), ("last-forward", True)])
 def test_gradients_cross_blocks_where_the_history_is_the_last_forward(net, history, crosses):
     z_1 = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True)
@@ -224,28 +216,6 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     assert net.blocks[0].self_attn.q_proj.weight.grad is not None
     net.zero_grad(set_to_none=True)
     assert head(score.features).shape == (2,)
-
-
-def test_the_tail_drop_shows_forty_five_percent_on_average():
-    assert visible_share(TailDrop(), 93, 20_000) == pytest.approx(0.45, abs=0.01)
-    ones = torch.ones(64, 16, 6, 2, 2)
-    sample = Sample(
-        ones,
-        ones,
-        torch.cat([ones, ones], dim=1),
-        ones[:, :1],
-        ones,
-        ones,
-        ones[:, 0, :, 0, 0],
-        ones[:, 0, :, 0, 0],
-        0,
-    )
-    hidden = TailDrop()(sample, 0, 0)
-    shown = hidden.m[:, 0, :, 0, 0]
-    assert (shown[:, 1:] <= shown[:, :-1]).all(), "hidden from some latent on"
-    assert {0.0, 6.0} < set(shown.sum(dim=1).tolist())
-    assert torch.equal(hidden.condition[:, 16, :, 0, 0], shown)
-    assert (hidden.condition[:, :16] == 1).all(), "the map stays"
 
 
 def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one():

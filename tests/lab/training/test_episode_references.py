@@ -17,7 +17,6 @@ from alpasim_plugin.lab.training.episode_references import (
     ReferenceDraw,
     pair_references,
     road_users,
-    video_references,
 )
 from alpasim_plugin.lab.training.map_errors import (
     MapError,
@@ -152,23 +151,6 @@ def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_
         replace(EXACT, wrong=0),
     ):
         assert not np.array_equal(shown(sequence, other)[:, 0], exact)
-
-
-def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path):
-    x, y = np.meshgrid(np.arange(96), np.arange(64))
-    smooth = (127 + 100 * np.sin(x / 7) * np.cos(y / 5)).astype(np.uint8)
-    still = pair(3, 64, 96)._replace(rgb_gt=np.stack([smooth] * 3, axis=-1))
-    write_sequence(tmp_path / "v", (still._replace(t_us=i) for i in range(24)), 24, {})
-    clip = PairSequence(tmp_path / "v").clip
-    index = np.arange(10, 13)
-    draws = [replace(EXACT, seed=seed, count=1) for seed in range(24)]
-    found = [video_references(clip, draw, index, slice(0, 64), slice(0, 96)) for draw in draws]
-    same = [
-        np.abs(images[:, 0, 8:-8, 8:-8, :3].astype(int) - still.rgb_gt[8:-8, 8:-8]).mean() < 2
-        for images in found
-    ]
-    assert any(same)
-    assert not all(same)  # most flows are bent
 
 
 def test_errors_of_the_map_do_what_their_names_say():

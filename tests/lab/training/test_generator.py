@@ -25,9 +25,8 @@ from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
-from alpasim_plugin.lab.training.generator import SharedRollout
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
-from alpasim_plugin.lab.training.pair_store import PairDataset, write_sequence
+from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
 from alpasim_plugin.lab.training.recipes.recipe import Recipe
 from alpasim_plugin.lab.training.recipes.registry import (
@@ -39,7 +38,7 @@ from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
-from tests.lab.training.pair_files import make, pair
+from tests.lab.training.pair_files import make
 
 FORM = ClipForm(latents=4, stride=7)
 
@@ -114,40 +113,6 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(d
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")} == times
 
 
-def test_other_pairs_under_the_same_name_are_encoded_anew(data, tmp_path):
-    (tmp_path / "vae.safetensors").write_bytes((data / "vae.safetensors").read_bytes())
-    old = make(tmp_path, name="a", frames=21)
-    before = clips_of(tmp_path, tmp_path / "z")
-    frames = (pair(i)._replace(rgb_input=pair(i + 1).rgb_input) for i in range(21))
-    write_sequence(old.folder, frames, 21, {key: old.info[key] for key in ("scene_id", "split")})
-    after = clips_of(tmp_path, tmp_path / "z")
-    assert after.digest != before.digest
-    assert torch.equal(after[0].z_0, before[0].z_0)
-    assert not torch.equal(after[0].z_r, before[0].z_r)
-
-
-def test_sequences_that_make_no_clips_or_no_batch_are_refused(data, tmp_path):
-    make(tmp_path, name="short", frames=9)
-    with pytest.raises(InputError):
-        LatentClips(
-            PairDataset(tmp_path, "train").sequences,
-            TinyVAE.load(data / "vae.safetensors"),
-            FORM,
-            tmp_path / "z",
-        )
-    with pytest.raises(InputError):
-        LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
-    make(tmp_path, "mixed/train", "a", frames=13)
-    make(tmp_path, "mixed/train", "b", frames=13, width=64)
-    with pytest.raises(InputError):
-        LatentClips(
-            PairDataset(tmp_path / "mixed", "train").sequences,
-            TinyVAE.load(data / "vae.safetensors"),
-            FORM,
-            tmp_path / "z",
-        )
-
-
 def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(
     data, tmp_path
 ):
@@ -197,15 +162,6 @@ def test_every_row_trains_by_one_function(data, tmp_path, name):
     assert load_weights(path)["dit.additional_patch_embedding.proj.1.weight"].shape[1] == (
         128 if name == "V6" else 64
     )
-
-
-def test_v7_gives_five_eighths_of_its_updates_to_flow_matching():
-    objective = recipe_of("V7").stages[0].objective
-    kinds = [objective.at(update, 400) for update in range(400)]
-    assert [sum(k.flow == "own" for k in kinds), sum(k.flow is None for k in kinds)] == [250, 150]
-    assert [kinds[249].horizon, kinds[250].horizon] == [0, 4]
-    with pytest.raises(InputError):
-        SharedRollout((Objectives(), Objectives()), (0.5, 0.6))
 
 
 @pytest.mark.parametrize(

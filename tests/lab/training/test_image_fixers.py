@@ -19,14 +19,12 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
-from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
 from tests.lab.training.whole_clip_images import whole_clip_images
 
-Settings = RenderStepSettings | NoiseWindowSettings
 STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")
 
 
@@ -125,20 +123,6 @@ def test_cameras_are_alike_alone_together_and_at_different_rates(session, name):
     } == pytest.approx(dict.fromkeys(out, 0), abs=1)
 
 
-def test_noise_follows_seed_and_frame_unless_it_is_fixed(session):
-    still = [replace(moving_picture(1, (16, 24))[0], t_us=i) for i in range(3)]
-    fresh = pixels(run(session("gsfix3d"), still))
-    assert levels(fresh[0], fresh[1]) > 1, "frames that are equal get noise of their own"
-    assert np.array_equal(pixels(run(session("gsfix3d"), still)), fresh)
-    assert not np.array_equal(pixels(run(session("gsfix3d", seed=1), still)), fresh)
-    fixed = run(session("gsfix3d", "noise=fixed"), still)
-    assert levels(fixed[0].rgb, fixed[1].rgb) == 0
-    for name in ("difix", "harmonizer"):
-        assert np.array_equal(
-            pixels(run(session(name, seed=0), still)), pixels(run(session(name, seed=1), still))
-        ), "no noise at all"
-
-
 def test_the_temporal_model_looks_at_four_outputs_and_no_further(
     session,
 ):
@@ -200,16 +184,6 @@ def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded():
     with pytest.raises(InputError):
         resolve_renderer("3dgs-enhancer@4+clean")
     assert resolve_renderer("gsfix3d@4", ["untrained=random"]).fixer is not None
-
-
-@pytest.mark.parametrize("name", ["difix", "omnidreams@4", "onefixer-2b"])
-def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name):
-    with pytest.raises(
-        InputError,
-    ):
-        resolve_renderer(name)
-    with pytest.raises(InputError):
-        resolve_renderer(name, [f"weights.dit={__file__}"])
 
 
 def test_labels_blocks_and_refused_settings(session):

@@ -15,17 +15,13 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.network.schedule import names
 from alpasim_plugin.lab.image_fixers.pipeline import (
     CONDITION_KEY,
     LATENT_KEY,
-    euler,
     fixed_step,
     share_embedding,
 )
 from alpasim_plugin.lab.image_fixers.settings import RenderLevel, RenderStepSettings
-from alpasim_plugin.lab.training.cut_outs import cut_out, soft_mask
-from alpasim_plugin.lab.training.multi_resolution_noise import multi_resolution_noise
 from alpasim_plugin.lab.training.noise_window import (
     edm_error,
     noise_window_errors,
@@ -218,20 +214,6 @@ def test_the_enhancers_loss_is_edms_on_the_clean_latents(net):
     )
 
 
-def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path():
-    z_0, eps = normal(1, 16, 2, 4, 4, key="clean"), normal(1, 16, 2, 4, 4, key="noise")
-    asked = []
-
-    def velocity(z: Tensor, t: float, *rest: object, **options: object) -> Tensor:
-        asked.append(t)
-        torch.testing.assert_close(z, (1 - t / 1000) * z_0 + t / 1000 * eps, atol=1e-5, rtol=0)
-        return eps - z_0
-
-    made = euler(velocity, eps, z_0, names(8), TEXT)  # type: ignore[arg-type]
-    torch.testing.assert_close(made, z_0, atol=1e-5, rtol=0)
-    assert asked == [1000, 875, 750, 625, 500, 375, 250, 125]
-
-
 def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs():
     weights = initial_weights(SIZES, 1)
     shared = share_embedding(weights)
@@ -246,28 +228,3 @@ def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs():
         "the masks' columns stay"
     )
     assert shared[CONDITION_KEY].shape == weights[CONDITION_KEY].shape
-
-
-def test_multi_resolution_noise_has_unit_variance_and_larger_scales_at_later_times():
-    t = torch.tensor([0.0, 0.5, 1.0]).repeat_interleave(8)
-    noise = multi_resolution_noise(stream("tests", 0, "noise"), (24, 16, 2, 18, 32), t)
-    assert noise.shape == (24, 16, 2, 18, 32)
-    torch.testing.assert_close(noise.flatten(1).std(1), torch.ones(24), atol=1e-3, rtol=0)
-    neighbours = (noise[..., 1:] * noise[..., :-1]).mean((1, 2, 3, 4)).view(3, 8).mean(1)
-    assert abs(float(neighbours[0])) < 0.02, "white at t = 0"
-    assert 0.02 < float(neighbours[1]) < float(neighbours[2])
-    again = multi_resolution_noise(stream("tests", 0, "noise"), (24, 16, 2, 18, 32), t)
-    assert torch.equal(noise, again)
-
-
-def test_cut_outs_are_black_soft_and_cover_a_tenth_at_most():
-    rng = stream("tests", 0, "masks")
-    shares = [float(soft_mask(rng, 144, 256).mean()) for _ in range(40)]
-    assert max(shares) <= 0.101
-    assert max(shares) > 0.07
-    render = torch.ones(400, 3, 1, 16, 16)
-    cut = cut_out(stream("tests", 0, "cuts"), render)
-    touched = (cut < 0.99).flatten(1).any(1).float().mean()
-    assert 0.3 < float(touched) <= 0.51, "each of two with probability 0.3, and some lie outside"
-    assert cut.min() >= -1
-    assert torch.equal(cut_out(stream("tests", 0, "cuts"), render, tries=0), render)

@@ -12,11 +12,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import read_views
-from alpasim_plugin.gaussians.fit.start import Match
-from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.lab.training.photographs import read_photographs, triangulated
+from alpasim_plugin.lab.training.photographs import read_photographs
 
 LENS = {
     "fl_x": 300.0,
@@ -135,27 +132,3 @@ def test_what_cannot_be_a_set_of_photographs_is_refused(tmp_path, change, found)
     with pytest.raises(InputError) as caught:
         read_photographs(tmp_path, 256)
     assert found in caught.value.message
-
-
-def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not():
-    K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
-    cameras = [
-        PinholeCamera.from_pose(
-            128,
-            96,
-            K,
-            np.block([[np.eye(3), np.array([[x], [0], [0]])], [np.zeros((1, 3)), np.ones((1, 1))]]),
-        )
-        for x in (-0.3, 0.3)
-    ]
-    views = [PosedView(camera, np.full((96, 128, 3), 100, np.uint8)) for camera in cameras]
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-0.6, -0.6, 3), (0.6, 0.6, 5), (40, 3))
-    seen = [(q := (points - c.centre_world) @ K.T)[:, :2] / q[:, 2:] for c in cameras]
-    matches = [Match(0, 1, a, b) for a, b in zip(*seen, strict=True)]
-    wrong = [Match(0, 1, a, b + np.array([0.0, 9.0])) for a, b in zip(*seen, strict=True)]
-    cloud = triangulated(views, [*matches, *wrong], [0, 1], 1000, rng)
-    assert len(cloud) == 40
-    assert max(np.linalg.norm(points - mean, axis=1).min() for mean in cloud.means) < 1e-6
-    with pytest.raises(InputError):
-        triangulated(views, matches, [0], 1000, rng)

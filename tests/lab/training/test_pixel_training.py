@@ -219,14 +219,6 @@ def test_a_redenoised_history_is_the_truth_noised_and_denoised():
         _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
 
 
-def test_flow_matching_alone_sends_no_gradient_through_the_rollout():
-    net, s = generator(), sample()
-    flow_alone = pixel_variant("V2").stages[0]
-    found = pixel_losses(net, s, net.start(s.render[:, 0]), flow_alone, None)
-    assert not found.predictions.requires_grad
-    assert torch.equal(found.total, found.flow)
-
-
 def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)

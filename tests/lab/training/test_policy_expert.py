@@ -23,8 +23,6 @@ from alpasim_plugin.world.path import smooth_path
 from policies.learned_net import KNOTS_M, TIMES_S, knot_weights, path_grid
 
 STRAIGHT = smooth_path(np.stack([np.linspace(0.0, 200.0, 60), np.zeros(60)], axis=1))
-ANGLE = np.linspace(0.0, 2.0, 120)
-LEFT_CIRCLE = smooth_path(40.0 * np.stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)], axis=1))
 STYLE = DrivingStyle(10.0)
 
 
@@ -50,18 +48,6 @@ def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m):
     assert (np.diff(np.abs(points[:, 1])) > -0.2).all()
 
 
-def test_car_on_a_bend_stays_on_it():
-    s = 20.0
-    xyz, yaw = LEFT_CIRCLE.at(s)
-    points, heading = expert_path(
-        LEFT_CIRCLE, s, se2(float(xyz[0]), float(xyz[1]), float(yaw)), 8.0
-    )
-    k = KNOTS_M.index(22.0)
-    wanted = 40.0 * np.array([np.sin(22.0 / 40.0), 1.0 - np.cos(22.0 / 40.0)])
-    np.testing.assert_allclose(points[k], wanted, atol=0.35)
-    assert heading[k] == pytest.approx(22.0 / 40.0, abs=0.04)
-
-
 def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it():
     np.testing.assert_allclose(speeds(10.0), 10.0, atol=1e-6)
     after = speeds(0.0)
@@ -80,11 +66,6 @@ def test_car_stops_before_what_stands_and_stays_there():
         assert v < 0.1
         assert 1.0 < wall - s < 4.5
     assert speeds(8.0, Leader(12.0, 0.0, 0))[TIMES_S.index(2.5)] < 2.0
-
-
-def test_bend_is_entered_slowly():
-    line = ReferenceLine.along(LEFT_CIRCLE, 20.0)
-    assert speeds(12.0, line=line, s_m=5.0)[-1] == pytest.approx(np.sqrt(2.0 * 40.0), abs=0.5)
 
 
 def test_only_bodies_that_reach_into_the_way_are_leaders():

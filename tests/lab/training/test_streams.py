@@ -10,13 +10,11 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.training.episode_references import SLOTS
 from alpasim_plugin.lab.training.streams import (
     KINDS,
     StreamBatch,
     StreamShares,
     TrainingStreams,
-    _lit_references,
     there_and_back,
 )
 from tests.lab.training.pair_files import make
@@ -130,21 +128,6 @@ def test_held_out_video_is_never_shown(root):
     assert shown == {root / "video" / "train" / "drive"}
 
 
-def test_a_count_keeps_the_list_while_more_are_made(root, tmp_path):
-    for i in (0, 10, 2):
-        make(tmp_path, name=f"{'z' if i < 5 else 'a'}_{i:03d}", height=32, width=48)
-    shares = StreamShares(1, 0, 0, 0)
-    two = TrainingStreams(tmp_path, crop=(32, 48), shares=shares, count=2)
-    assert [s.name for s in two.pairs] == ["z_000", "z_002"]  # in order of number, not of family
-    before = two.facts()
-    make(tmp_path, name="b_011", height=32, width=48)
-    assert TrainingStreams(tmp_path, crop=(32, 48), shares=shares, count=2).facts() == before
-    assert (
-        TrainingStreams(tmp_path, crop=(32, 48), shares=shares).facts()["pairs_digest"]
-        != before["pairs_digest"]
-    )
-
-
 @pytest.mark.parametrize(
     ("settings", "found"),
     [
@@ -163,44 +146,3 @@ def test_video_needs_a_folder_and_shares_must_add_up(root):
         TrainingStreams(root / "pairs", None, crop=(32, 48))
     with pytest.raises(InputError):
         StreamShares(0.8, 0.1, 0.1, 0.1)
-
-
-def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_better(
-    root,
-):
-    made = streams(root, shares=StreamShares(1, 0, 0, 0))
-    batch = made.update(3)
-    assert batch.references.shape == (3, 2, SLOTS, 32, 48, 4)
-    assert not batch.references.any()  # these sequences have no recording
-    episodes = [made.episode_of(slot, i)[0] for slot in range(3) for i in range(0, 240, 4)]
-    assert {episode.grey for episode in episodes} == {True, False}
-    assert 0.1 < np.mean([episode.better > 0 for episode in episodes]) < 0.4
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (2, SLOTS, 4, 6, 4), dtype=np.uint8)
-    images[..., 3] = 255
-    plain = replace(
-        episodes[0],
-        flip=False,
-        levels=np.repeat(np.linspace(-1, 1, 256, dtype=np.float32)[:, None], 3, axis=1),
-    )
-    exact = replace(plain, references=replace(plain.references, gains=np.ones((SLOTS, 3))))
-    shown = _lit_references(images, exact)
-    assert np.abs(shown[..., :3] - (images[..., :3] / 127.5 - 1)).max() < 1e-5
-    assert np.array_equal(_lit_references(images, replace(exact, flip=True)), shown[:, :, :, ::-1])
-
-
-def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path):
-    for i in range(8):
-        make(
-            tmp_path / "pairs",
-            name=f"street_{i:03d}",
-            frames=6,
-            family="drive" if i == 0 else "street",
-        )
-    made = streams(tmp_path, shares=StreamShares(1, 0, 0, 0))
-    shown = [
-        made.episode_of(slot, i)[0].sequence.info["family"]
-        for slot in range(3)
-        for i in range(0, 400, 4)
-    ]
-    assert 0.25 < np.mean([family == "drive" for family in shown]) < 0.55

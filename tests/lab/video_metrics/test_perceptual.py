@@ -81,14 +81,6 @@ def test_gradient_is_that_of_finite_differences():
         )
 
 
-def test_equal_and_flat_pictures_have_a_finite_gradient(net):
-    for value in (-1.0, 0.0, 1.0):
-        flat = torch.full((1, 3, 32, 32), value, requires_grad=True)
-        net.distance(flat, flat.detach()).sum().backward()
-        assert flat.grad is not None
-        assert torch.equal(flat.grad, torch.zeros_like(flat))
-
-
 def test_shipped_distance_grows_with_blur_and_noise(net):
     a = pictures(4, 64, 96)
     noise = torch.from_numpy(stream("nets", 0, "noise").standard_normal(a.shape)).float()
@@ -117,15 +109,6 @@ def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_d
     p0 = read("ex_p0")
     p1 = read("ex_p1")
     assert float(net.distance(ref, p1)) < float(net.distance(ref, p0))
-
-
-def test_saved_weights_load_as_they_were(tmp_path):
-    torch.manual_seed(1)
-    net = PerceptualDistance((4, 5, 6, 7))
-    net.save(tmp_path / "n.safetensors", {"steps": "1"})
-    again = load_perceptual(tmp_path / "n.safetensors")
-    for key, value in net.state_dict().items():
-        assert torch.equal(again.state_dict()[key], value.detach().half().float())
 
 
 @pytest.mark.parametrize(
