@@ -9,7 +9,6 @@ import pytest
 
 from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.parts import names
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -101,13 +100,6 @@ def test_the_large_fixer_does_not_go_without_weights():
         make_fixer("onefixer-2b", scene_id="scene")
 
 
-def test_widths_of_an_untrained_tiny_autoencoder():
-    vae = load_networks(small_settings("vae.widths=[8,16,12,10,6]")).vae
-    assert vae.sizes == TinySizes(8, 16, 12, 10, 6)
-    assert load_networks(small_settings()).vae.sizes == TinySizes(32, 48, 48, 32, 16)
-    assert "vae.widths" in refusal("vae.widths=[8,16]")
-
-
 def test_an_untrained_wan_autoencoder_is_no_identity():
     with pytest.raises(InputError):
         load_networks(small_settings("vae.kind=wan", "decoder.kind=latent"))
@@ -117,12 +109,6 @@ def test_a_device_that_does_not_work_is_named(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(InfrastructureError):
         load_networks(small_settings(), "cuda")
-
-
-def test_how_the_loop_uses_a_fixer_does_not_load_its_networks_again():
-    one, other = small_settings("mode=chunk"), small_settings("tolerance_m=0.5")
-    assert load_networks(one) is load_networks(other)
-    assert load_networks(one) is not load_networks(small_settings("window=4"))
 
 
 def test_identity_passes_frames_on_and_checks_blocks():

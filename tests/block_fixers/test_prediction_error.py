@@ -27,13 +27,6 @@ def at_depth(z: float, x: float = 0.0) -> F64:
     return se3([x, 0.0, z], [1.0, 0.0, 0.0, 0.0])
 
 
-def test_equal_requests_do_not_deviate_and_are_the_same_view():
-    one = facing_z(3.0, {"car": at_depth(20.0)})
-    assert deviation(one, one) == deviation(one, facing_z(3.0, {"car": at_depth(20.0)}))
-    assert deviation(one, one).within(0.0, 0.0)
-    assert same_view(one, facing_z(3.0, {"car": at_depth(20.0)}))
-
-
 def test_the_last_bit_makes_another_view_within_any_tolerance():
     near = facing_z(np.nextafter(3.0, 4.0))
     assert not same_view(facing_z(3.0), near)

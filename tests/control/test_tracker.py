@@ -157,13 +157,6 @@ def test_short_plan_is_held_at_its_last_pose_so_the_car_brakes_and_stays():
     assert abs(states[-1].T_world_rig[1, 3]) < 1e-6
 
 
-def test_standing_start_reaches_the_planned_acceleration_and_place():
-    t = np.arange(0, 10, 0.1)
-    states = drive(plan_of(t, t * t, 0, 0), at(), 5.0)
-    assert states[-1].speed_mps == pytest.approx(10.0, abs=0.05)
-    assert states[-1].T_world_rig[0, 3] == pytest.approx(25.0, abs=0.1)
-
-
 def test_plan_that_drives_backwards_is_reversed_along():
     t = np.arange(0, 12, 0.1)
     a = 2 * t / 20

@@ -11,8 +11,6 @@ import pytest
 
 from alpasim_plugin.core.types import LoggedPlan
 from evaluators import PRESETS, reduce_rollout, score
-from evaluators.scores.protocols import MEASURES, RULES
-from evaluators.scores.table import PARTS, SCORES
 from tests.evaluators.eval_build import TWO_LANES, car, lane, road_map, rollout, scene, track
 
 N = 80
@@ -268,11 +266,3 @@ def test_plans_that_are_too_short_or_too_coarse_have_no_extended_comfort():
     assert (
         "two plans 0.5 s apart" in values(replace(short, plans=tuple(every)), "navsim")["navsim_ec"]
     )
-
-
-def test_every_part_and_score_is_declared():
-    assert set(MEASURES) == set(RULES) == set(SCORES) == set(PARTS)
-    log = plans(rollout(track(CRUISE, 0.0)), 16.0)
-    for name, rules in RULES.items():
-        assert set(rules) == set(SCORES[name])
-        assert {f"{name}_{part}" for part in PARTS[name]} <= set(values(log, name))

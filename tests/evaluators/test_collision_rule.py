@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.core.geometry import rectangle_corners
 from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, score
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, find_contacts
@@ -180,13 +179,6 @@ def test_interpolated_headings_take_the_shorter_turn_across_180_degrees():
 def test_footprint_size_is_the_papers_and_not_the_logged_one():
     big = rollout(track(0.0, 0.0), [car("a", track(4.9, 0.0))], box=Box(6.0, 2.5, 2.0))
     assert flags(big)["any"] == [0]
-
-
-def test_corners_run_from_front_left_clockwise():
-    at = rectangle_corners(np.array([[10.0, 5.0]]), np.array([np.pi / 2]), np.array([[4.0, 2.0]]))[
-        0
-    ]
-    np.testing.assert_allclose(at, [[9.0, 7.0], [11.0, 7.0], [11.0, 3.0], [9.0, 3.0]], atol=1e-15)
 
 
 angles = st.sampled_from(

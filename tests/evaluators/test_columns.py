@@ -169,17 +169,6 @@ def test_a_table_without_its_keys_is_refused_by_name(tmp_path):
         RolloutTable.of_files([tmp_path / "rollouts.parquet"])
 
 
-def test_a_run_without_rollouts_has_no_numbers():
-    table = RolloutTable.of_table(table_of(rows_like_a_run(("a",), ("p",), 1, (0,), 3)).slice(0, 0))
-    assert numbers(table) == {
-        "metrics": {},
-        "paired": {},
-        "paired_with_base": {},
-        "paired_arms": {},
-    }
-    assert table.failures() == {}
-
-
 def test_cells_of_rows_are_those_of_columns():
     rows = [row for row in rows_like_a_run(("clean",), ("p",), 9, (3, 2**62, 5), 14)]
     there = RolloutTable.of_table(table_of(rows)).sides("p")["clean"]

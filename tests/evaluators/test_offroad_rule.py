@@ -218,16 +218,6 @@ def test_utm_sized_coordinates_give_the_same_flags():
     assert offroad_of(far_log, far).value.tolist() == offroad_of(near_log, TWO_LANES).value.tolist()
 
 
-def test_unions_are_kept_for_the_next_rollout_and_not_mixed_between_maps():
-    log = rollout(track(np.linspace(0, 20, 30), 1.75))
-    first = offroad_of(log, TWO_LANES).value
-    other = road_map(
-        lane("right", 0.0), lane("left", 9.0), edges=(*TWO_LANES.road_edges, edge_line(1.75))
-    )
-    assert offroad_of(log, other).value.tolist() == [1.0] * 30
-    np.testing.assert_array_equal(offroad_of(log, TWO_LANES).value, first)
-
-
 half_metre = st.integers(-8, 8).map(lambda k: k / 2)
 
 

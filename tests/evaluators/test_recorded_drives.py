@@ -18,16 +18,14 @@ from alpasim_plugin.core.geometry import (
     se3,
     trajectory_from_poses,
 )
-from alpasim_plugin.core.types import LaneMap, RolloutLog, Scene
+from alpasim_plugin.core.types import RolloutLog, Scene
 from evaluators import PRESETS, rollout_values, score
 from evaluators.metrics.contact import find_contacts
 from evaluators.metrics.footprint import ActorTable, ego_footprints
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
 from scenarios.recorded import RecordedLog
-from tests.evaluators.eval_build import by_name
 from tests.examples import first_of
-from tests.scenarios.real_drive import ruling
 
 PAPER = PRESETS["paper"]
 ARGOVERSE = ("7fab2350", "adcf7d18", "3bffdcff")
@@ -80,30 +78,6 @@ def test_the_human_drive_hits_nobody_stays_on_the_road_and_on_its_path(shared_da
     assert values["route_distance_m"].value < 1e-9
     assert values["progress"].value > 0.99
     assert values["progress_rel"].value == pytest.approx(1.0)
-
-
-# Steps (of 0.1 s) whose footprint the lanes do not hold; none of them touches a road edge.
-UNHELD = {
-    "7fab2350": range(
-        150, 160
-    ),  # leaving a junction, over a wedge between the outlines of its turn lanes
-    "adcf7d18": (),
-    "3bffdcff": (),
-}
-
-
-@pytest.mark.parametrize("name", LOGS)
-@pytest.mark.slow
-def test_lane_containment_agrees_with_a_plain_rule_written_elsewhere(shared_data, name):
-    log = read(shared_data, name)
-    rollout, scene = replayed(log, grid(log))
-    _, _, neither, off = ruling(log, grid(log))
-    no_edges = replace(scene, lane_map=LaneMap(scene.lane_map.lanes))
-    unheld = np.flatnonzero(~by_name(score(rollout, no_edges))["offroad"].valid)
-    assert off == []
-    assert unheld.tolist() == neither
-    if name in UNHELD:
-        assert unheld.tolist() == list(UNHELD[name])
 
 
 @pytest.mark.parametrize(

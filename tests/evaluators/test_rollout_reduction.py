@@ -114,11 +114,6 @@ def test_a_flag_that_fired_is_one_whatever_else_is_unknown():
     assert either.value == 1.0
 
 
-def test_unknown_steps_in_the_warm_up_do_not_matter():
-    one = series("offroad", T, 0.0, np.array([False, True, True, True, True, True]), "no edges")
-    assert value("offroad", offroad=one).value == 0.0
-
-
 def test_gaps_of_steps_without_actors_are_skipped():
     gap = series(
         "min_distance_to_obstacle_m",
@@ -193,11 +188,3 @@ def test_black_images_remove_the_rollout_only_where_the_preset_says_so():
 def test_series_without_eval_relevant_are_refused():
     with pytest.raises(EvaluatorError, match="no eval_relevant"):
         rollout_values([series("offroad", T, 0.0)])
-
-
-def test_flat_rows_carry_value_and_validity():
-    row = reduce_rollout(table(offroad=series("offroad", T, 0.0, False, "no map"))).as_row()
-    assert row["offroad"] is None
-    assert row["offroad_valid"] is False
-    assert row["collision_any"] == 0.0
-    assert row["collision_any_valid"] is True

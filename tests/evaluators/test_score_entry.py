@@ -79,12 +79,6 @@ def test_a_box_without_size_is_refused(box):
         score(replace(log, actors={"a": car("a", track(0.0, 0.0, n=4), box)}), where)
 
 
-def test_unknown_preset_lists_the_known_ones():
-    log, where = bad()
-    with pytest.raises(InputError, match="known: paper"):
-        score(log, where, "papper")
-
-
 def test_every_series_states_unit_direction_and_reduction_as_declared():
     log, where = bad()
     found = score(log, where)
@@ -94,23 +88,6 @@ def test_every_series_states_unit_direction_and_reduction_as_declared():
         assert one.t_us.shape == one.value.shape == one.valid.shape
         assert np.isfinite(one.value[one.valid]).all()
         assert np.isnan(one.value[~one.valid]).all()
-
-
-def test_every_declared_metric_has_one_line_of_help():
-    for name, facts in METRICS.items():
-        assert facts.help, name
-        assert "\n" not in facts.help
-        assert (
-            facts.is_flag
-            or facts.direction == "none"
-            or facts.unit in ("m", "", "dB", "ms", "s", "m/s")
-        )
-
-
-def test_scoring_twice_gives_the_same_bytes():
-    log, where = bad()
-    for a, b in zip(score(log, where), score(log, where), strict=True):
-        assert a.value.tobytes() == b.value.tobytes()
 
 
 def test_an_evaluator_that_raises_is_named_and_its_cause_kept():

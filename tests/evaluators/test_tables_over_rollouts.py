@@ -4,14 +4,11 @@ scipy.
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pyarrow as pa
 import pytest
 from scipy import stats
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators import aggregate, censoring, paired
 from evaluators.metrics import METRICS
@@ -154,28 +151,6 @@ def test_infinite_values_do_not_reach_a_mean():
     assert entry([[1.0], [float("inf")], [float("nan")]])["mean"] == 1.0
 
 
-def test_nested_metrics_as_in_manifests_are_read_too():
-    rows = [
-        {
-            "renderer": "a",
-            "policy": "p",
-            "scene": s,
-            "seed": 0,
-            "status": "ok",
-            "metrics": {"offroad": {"value": v, "valid": v is not None, "reason": ""}},
-        }
-        for s, v in (("x", 1.0), ("y", 0.0), ("z", None))
-    ]
-    assert aggregate(rows)["a"]["offroad"]["mean"] == 0.5
-
-
-def test_tables_are_json():
-    rows = rows_of([[0.0, 1.0], [0.0, None]], "offroad") + rows_of(
-        [[1.0, 1.0], [0.0, 0.0]], "offroad", "clean"
-    )
-    json.dumps([aggregate(rows), paired(rows, "clean"), censoring(rows)], allow_nan=False)
-
-
 # --- pairs
 
 
@@ -282,11 +257,6 @@ def test_higher_is_better_for_progress():
     )
 
 
-def test_an_unknown_baseline_lists_the_known_ones():
-    with pytest.raises(InputError, match="choose one of 3dgs"):
-        paired(rows_of([[1.0]]), "clean")
-
-
 # --- ledger
 
 
@@ -339,19 +309,6 @@ def test_bounds_with_sampling_error_hold_the_rate_where_crashes_hide_events():
         low, high = censoring(rows)["3dgs"]["bounds_rollouts_ci95"]["offroad"]
         held += low <= 0.2 <= high
     assert held >= 93
-
-
-def test_a_dropped_rollout_is_listed_with_its_reason():
-    rows = rows_of([[None]], "offroad")
-    rows[0]["censored"] = {
-        "steps_total": 4,
-        "steps_warmup": 4,
-        "steps_after_event": 0,
-        "steps_after_drift": 0,
-        "steps_scored": 0,
-        "dropped": "never",
-    }
-    assert censoring(rows)["3dgs"]["dropped"] == {"never": 1}
 
 
 # --- intervals

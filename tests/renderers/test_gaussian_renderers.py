@@ -10,7 +10,6 @@ from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
     BackgroundFile,
     Behaviour,
-    Degradation,
     Frame,
     RenderRequest,
     Scenario,
@@ -18,7 +17,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.gaussian import clear_cache, scene_key, scene_of
+from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
 from tests.gaussians.scene_maps import parked, straight
 
 
@@ -95,12 +94,6 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario):
     np.testing.assert_array_equal(first.alpha, second.alpha)
 
 
-def test_renderers_of_one_scenario_share_the_scene(scenario):
-    assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation("cycle")))
-    assert scene_key(scenario) != scene_key(replace(scenario, seed=1))
-    assert scene_key(scenario) != scene_key(replace(scenario, actors=()))
-
-
 def test_actor_hides_the_road_where_it_stands(scenario):
     renderer = make_renderer("clean", scenario)
     r = request(scenario)
@@ -108,15 +101,6 @@ def test_actor_hides_the_road_where_it_stands(scenario):
     changed = np.any(with_car.rgb != without.rgb, axis=2)
     assert 100 < changed.sum() < 0.3 * changed.size
     assert with_car.depth[changed].mean() < without.depth[changed].mean()
-
-
-def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario):
-    r = request(scenario)
-    moved = replace(
-        r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]])
-    )
-    renderer = make_renderer("clean", scenario)
-    np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)
 
 
 def test_file_background_replaces_the_street_and_keeps_actors_and_sky(scenario, tmp_path):

@@ -93,14 +93,6 @@ def test_frame_has_the_shapes_types_and_ranges_of_the_contract(
     assert 2.0 < frame.depth[-1, 32] < 9.0
 
 
-def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(
-    fitted: ReconstructionRenderer,
-) -> None:
-    on_path, beside = error_db(fitted, 0.0), error_db(fitted, 3.0)
-    assert on_path > 19
-    assert on_path > beside + 1
-
-
 def test_a_larger_share_of_the_schedule_fits_better(fitted: ReconstructionRenderer) -> None:
     hasty = make_renderer("3dgs", street(Degradation("reconstruction", share=0.02)))
     assert isinstance(hasty, ReconstructionRenderer)

@@ -101,13 +101,6 @@ def test_every_length_is_cut_into_the_fixers_blocks(tmp_path, n, sizes):
     assert [f.t_us for f in fixer.seen] == [i * 100_000 for i in range(n)]
 
 
-def test_variable_frame_times_are_kept(tmp_path):
-    times = [100, 140, 147, 1600, 1601, 1700]
-    source = video(tmp_path / "in.mp4", pictures(6), times=times, base=Fraction(1, 1000))
-    refine_video(RefineFiles(source, tmp_path / "out.mp4"), Inverting)
-    assert read(tmp_path / "out.mp4")[0] == [Fraction(t, 1000) for t in times]
-
-
 def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path):
     given = pictures(7)
     hole = [np.full_like(given[0], 255) for _ in given]

@@ -23,7 +23,7 @@ from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.log import read_asl, read_facts, write_facts, write_mp4
 from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
-from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
+from evaluators.report.rollouts import SERIES, events_of
 from evaluators.viewer.cells import (
     Wanted,
     cell_data,
@@ -99,14 +99,6 @@ def test_every_frame_comes_with_its_own_time(small_run):
     thinned = only_cell(small_run, Fineness(stride=3))["drives"][1]["cameras"][0]
     assert [number_of(jpeg) for jpeg in thinned["jpeg"]] == [0, 3, 6, 9]
     assert thinned["t"] == [0, 300, 600, 900]
-
-
-def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known():
-    assert clock_zero_us({"start_us": 500_000}, 0) == 500_000
-    assert (
-        clock_zero_us({"start_us": 0}, 1_689_697_803_493_732) == 1_689_697_803_493_732
-    )  # a scored log of AlpaSim
-    assert clock_zero_us({}, 70) == 70
 
 
 def test_two_logs_of_one_cell_are_two_cells(small_run):

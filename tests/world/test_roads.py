@@ -149,25 +149,6 @@ def test_stop_lines_and_crosswalks_lie_across_their_arms():
     assert shapely.Polygon(ring[:, :2]).area == pytest.approx(3.0 * 8.0)
 
 
-def test_t_junction_closes_the_missing_side():
-    road = build_road(
-        [Curve(40), Intersection("left", ("left", "right")), Curve(40)], Profile(1, 1)
-    )
-    assert not any("straight" in i for i in road.lane_map.lanes)
-    assert_sound(road.lane_map)
-    borders = shapely.union_all([shapely.LineString(e[:, :2]) for e in road.lane_map.road_edges])
-    beyond = shapely.LineString([(45.0, 0.0), (80.0, 0.0)])  # straight on at the T
-    assert borders.intersects(beyond)
-
-
-def test_merging_lane_ends_exactly_on_its_neighbour():
-    road = build_road([Curve(30), LaneTaper("merge", 60), Curve(30)], Profile(3, 0))
-    slant, after = road.lane_map.lanes["s1_merge"], road.lane_map.lanes["s2_f1"]
-    assert slant.successors == ("s2_f1",)
-    assert road.lane_map.lanes["s1_f1"].successors == ("s2_f1",)
-    assert (slant.right[-1] == after.right[0]).all()
-
-
 @pytest.mark.parametrize(
     ("elements", "profile", "text"),
     [

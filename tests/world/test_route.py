@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
+from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2
 from alpasim_plugin.core.types import Route, Trajectory
 from alpasim_plugin.world.route import (
     LaneIndex,
@@ -16,7 +16,7 @@ from alpasim_plugin.world.route import (
     route_from_log,
     route_in_rig,
 )
-from tests.world.small_maps import FAR, arc, make, straight
+from tests.world.small_maps import arc, make, straight
 
 
 def drive(x, y=None, z=0.0):
@@ -44,14 +44,6 @@ def test_route_is_the_recorded_path_and_goes_on_straight_behind_it():
         assert abs(project(route.xyz, point)[1]) < 1e-9
     assert arc_lengths(route.xyz)[-1] == pytest.approx(arc_lengths(log.xyz)[-1] + 120.0, abs=0.1)
     np.testing.assert_allclose(route.xyz[-5:, 1], 0.0, atol=1e-9)  # back on the centre
-
-
-def test_extension_leaves_the_log_without_a_kink():
-    x = np.arange(5.0, 60.0, 0.5)
-    route = route_from_log(ROAD, drive(x, np.full_like(x, 0.9)))
-    heading = np.arctan2(*np.diff(route.xyz[:, :2], axis=0).T[::-1])
-    assert np.abs(np.diff(heading)).max() < 0.03
-    assert np.abs(heading).max() < 0.08
 
 
 def test_lateral_lane_change_is_named_in_order():
@@ -117,32 +109,12 @@ def test_unusable_log_is_refused(log):
         route_from_log(ROAD, log)
 
 
-def test_far_maps_give_the_same_route():
-    x = np.arange(5.0, 60.0, 0.5)
-    log = drive(x, 0.3 * np.sin(x / 10))
-    moved = Trajectory(log.t_us, log.xyz + FAR, log.quat)
-    near, far = (
-        route_from_log(ROAD, log),
-        route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved),
-    )
-    assert near.lane_ids == far.lane_ids
-    np.testing.assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
-
-
 def test_way_points_start_at_the_projection_and_are_evenly_spaced():
     route = Route(np.array([[0.0, 0, 0], [200.0, 0, 0]]))
     seen = route_in_rig(route, se2(10.0, 2.0, 0.0))
     assert seen.shape == (20, 3)
     np.testing.assert_allclose(seen[:, 0], np.arange(20) * 80 / 19, atol=1e-9)
     np.testing.assert_allclose(seen[:, 1], -2.0, atol=1e-12)
-
-
-def test_way_points_lie_level_in_a_pitched_rig():
-    pitch = np.array([np.cos(0.05), 0.0, -np.sin(0.05), 0.0])
-    seen = route_in_rig(
-        Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch)
-    )
-    assert (seen[:, 2] == 0).all()
 
 
 def test_route_over_itself_is_followed_in_the_ego_s_direction():
