@@ -103,6 +103,7 @@ class Renderer(Protocol):
         # by one
         None
     )
+    has_history: bool = True  # whether a frame may depend on the requests before its own
     stage_ms: Mapping[str, float] = (
         # parts of the last call's wall time that are stages of their own, such as {"fix": 12.0}
         EMPTY

@@ -41,6 +41,8 @@ class CleanRenderer(Renderer):
         InputError: Nothing was built: the scenario is an imported drive.
     """
 
+    has_history = False
+
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         if scenario.model is not None:
             raise InputError(

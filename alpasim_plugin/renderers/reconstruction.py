@@ -83,6 +83,8 @@ class ReconstructionRenderer(Renderer):
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
     """
 
+    has_history = False
+
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
         self.device = require_device(device)
@@ -199,6 +201,8 @@ class ImportedRenderer(Renderer):
     Raises:
         InputError: The scenario names no model, or its folder holds no finished reconstruction.
     """
+
+    has_history = False
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads

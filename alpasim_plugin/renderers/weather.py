@@ -100,6 +100,7 @@ class FogRenderer(Renderer):
         self.base, self.visibility_m = base, visibility_m
         self.lookahead = base.lookahead
         self.block = base.block
+        self.has_history = base.has_history
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # that of the base

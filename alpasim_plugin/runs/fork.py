@@ -7,7 +7,8 @@ poses are float32, and it has no policy state). If the replay differs from the l
 the component and the step.
 
 The new parts get the same inputs before the instant, so that they have the same history: a renderer
-renders every request, a policy gets every query. Their outputs before the instant are discarded.
+renders every request, unless it has none, and a policy gets every query. Their outputs before the
+instant are discarded.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class SwitchedRenderer(Renderer):
         used = self.first if early else self.then
         frames = used.render_batch(requests)
         self.stage_ms = dict(used.stage_ms)
-        if early and self.then is not self.first:
+        if early and self.then is not self.first and self.then.has_history:
             self.then.render_batch(requests)
         return frames
 

@@ -51,6 +51,7 @@ class LensRenderer(Renderer):
     def __init__(self, inner: Renderer, sides: Mapping[str, Sequence[Lens]]) -> None:
         self._inner, self._sides = complete(inner, Renderer), sides
         self.lookahead, self.block = inner.lookahead, inner.block
+        self.has_history = inner.has_history
         self._shares: dict[tuple[str, str], Any] = {}
 
     @property

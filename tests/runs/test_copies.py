@@ -1,18 +1,22 @@
-"""A policy without a camera drives once for all renderers: the other cells are copies."""
+"""What is driven and rendered once: rollouts without a camera, and the past of a fork."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.core.interfaces import Renderer, complete
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
-from alpasim_plugin.runs.cell import run_cell
+from alpasim_plugin.runs.cameras import recorded_requests
+from alpasim_plugin.runs.cell import make_renderer, run_cell
+from alpasim_plugin.runs.fork import SwitchedRenderer
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.run import execute_run
 from policies.simple import ConstantVelocity
@@ -22,7 +26,18 @@ from tests.runs.test_runs import Announced
 
 DARKER = "tests.runs.grey_renderer:Darker"
 SEES = f"{__name__}:SeesAfterAll"
+SMALL = SimpleNamespace(name="front", width=8, height=4)
 SHORT = ("timing.duration_us=1200000", "degradation.kind=none")
+
+
+class Counts(Grey):
+    """Counts its frames."""
+
+    frames = 0
+
+    def render(self, request: RenderRequest) -> Frame:
+        self.frames += 1
+        return super().render(request)
 
 
 class SeesAfterAll(ConstantVelocity):
@@ -120,3 +135,24 @@ def test_a_rollout_that_failed_is_not_copied(tmp_path: Path) -> None:
 def test_the_first_renderer_drives_and_another_one_alone_drives_itself(tmp_path: Path) -> None:
     drive(plan_of(renderers=(DARKER,)), tmp_path)
     assert set(origins(tmp_path).values()) == {None}
+
+
+def test_a_fork_shows_the_past_only_to_a_renderer_with_a_history() -> None:
+    early, late = (SimpleNamespace(t_us=t_us, camera=SMALL) for t_us in (0, 200_000))
+    for has_history in (True, False):
+        first, then = (complete(make(), Renderer) for make in (Counts, Counts))
+        then.has_history = has_history
+        switched = SwitchedRenderer(first, then, 100_000)
+        switched.render_batch([early])
+        assert (first.frames, then.frames) == (1, has_history)
+        switched.render_batch([late])
+        assert (first.frames, then.frames) == (1, has_history + 1)
+
+
+def test_clean_has_no_history(straight_road: Scenario) -> None:
+    requests = [recorded_requests(straight_road, straight_road.start_us + t) for t in (0, 500_000)]
+    (alone,) = make_renderer("clean", straight_road).render_batch(requests[1][:1])
+    renderer = make_renderer("clean", straight_road)
+    renderer.render_batch(requests[0][:1])
+    assert not renderer.has_history
+    np.testing.assert_array_equal(renderer.render_batch(requests[1][:1])[0].rgb, alone.rgb)
