@@ -29,7 +29,8 @@ from evaluators.statistics.intervals import TAIL, exact_rate, t_interval
 from evaluators.statistics.paired import compare, reach_of
 from evaluators.statistics.verdicts import ALPHA, sign_flip, sign_test
 
-PAGE = Path(__file__).resolve().parents[1] / "statistics.md"
+DOCS = Path(__file__).resolve().parents[1]
+PAGES = (DOCS / "statistics.md", DOCS / "experiments" / "verdict-error.md")
 METRES, RATE, PROGRESS = (METRICS[n] for n in ("lateral_distance_m", "offroad", "progress"))
 Draw = Callable[[np.random.Generator, int], F64]  # generator, scenes -> differences
 
@@ -253,9 +254,10 @@ def main() -> None:
     for part in (differs, verdicts, intervals, betting):
         table = "\n".join(part(repeats))
         begin, end = f"<!-- begin {part.__name__} -->", f"<!-- end {part.__name__} -->"
-        page = PAGE.read_text(encoding="utf-8")
-        page = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", page, flags=re.DOTALL)
-        PAGE.write_text(page, encoding="utf-8")
+        for page in PAGES:
+            text = page.read_text(encoding="utf-8")
+            text = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
+            page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python docs/scripts/gate_power.py [RUNS]
 
-prints the table of docs/statistics.md. Two variants have the chances of events and the noise given
+prints the table of docs/experiments/verdict-error.md. Two variants have the chances of events and the noise given
 below in every rollout; the functions that decide are those of the gate.
 """
 
