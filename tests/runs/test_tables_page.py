@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 
 from alpasim_plugin.log.run_folder.rows import series_by_cell
@@ -41,16 +40,10 @@ def run(folder, monkeypatch):
     return read_run(folder / "runs" / "mine")
 
 
-def blocks(repo: Path, language: str) -> list[str]:
-    return re.findall(
-        rf"^```{language}\n(.*?)^```",
-        (repo / "docs" / "runs.md").read_text(encoding="utf-8"),
-        re.S | re.M,
-    )
-
-
 def rows(repo: Path, number: int) -> list[dict[str, Any]]:
-    found = duckdb.execute(blocks(repo, "sql")[number])
+    page = (repo / "docs" / "runs.md").read_text(encoding="utf-8")
+    queries = re.findall(r"^```sql\n(.*?)^```", page, re.S | re.M)
+    found = duckdb.execute(queries[number])
     names = [column[0] for column in found.description]
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
@@ -91,20 +84,3 @@ def test_the_farthest_instant_is_that_of_the_series(repo, run):
         ]
         at = abs(value).argmax()
         assert (row["most_m"], row["at_s"]) == pytest.approx((abs(value[at]), 1e-6 * t_us[at]))
-
-
-def test_the_page_in_pandas_gives_the_same(repo, run):
-    (block,) = blocks(repo, "python")
-    names = {}
-    exec(block, names)
-    means, worse = names["means"], names["worse_by_m"]
-    assert isinstance(means, pd.DataFrame)
-    assert means.loc[("clean", "lane-camera"), "offroad"] == pytest.approx(
-        run.summary["metrics"]["clean"]["offroad"]["mean"]
-    )
-    assert worse.mean() == pytest.approx(
-        run.summary["paired"]["3dgs"]["lateral_distance_m"]["diff"]
-    )
-    assert {scene: pytest.approx(value) for scene, value in worse.items()} == {
-        row["scene"]: row["worse_by_m"] for row in rows(repo, 1)
-    }
