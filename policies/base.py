@@ -23,6 +23,8 @@ PLAN_STEP_US = 100_000
 
 MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
+COMFORT_BRAKE_MPS2 = 2.0  # before a curve
+ACCEL_MPS2, BRAKE_MPS2 = 1.5, 4.0  # towards a limit of speed
 MIN_LOOKAHEAD_M = 3.0
 CUT_M = 0.15
 LOOKAHEAD_S = 0.7
@@ -139,15 +141,15 @@ def route_points(route_rig: F64) -> F64:
     return np.stack([start, start + np.array([1.0, 0.0])])
 
 
-def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
-    """Return the cubic spline through points ``(M, 2)``, at every ``spacing_m`` of chord length.
+def smooth_line(points: F64) -> F64:
+    """Return the cubic spline through points ``(M, 2)``, at every `Path.SPACING_M` of chord length.
 
     A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the
     road.
     """
     s = arc_lengths(points)
     keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-6])
-    at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
+    at = np.arange(0.0, max(float(s[-1]), Path.SPACING_M) + 1e-9, Path.SPACING_M)
     if keep.sum() < 3:
         return resample(points, at, s)
     spline = scipy.interpolate.CubicSpline(s[keep], points[keep])
@@ -196,23 +198,19 @@ def shifted(line: F64, left_m: float) -> F64:
     return line + left_m * normal
 
 
-def curve_speeds(
-    path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2
-) -> F64:
+def curve_speeds(path: Path, cruise_mps: float) -> F64:
     """Return the speed limit ``(N,)`` along the path: comfort in curves, reached with a comfortable
     brake.
     """
-    curve = np.sqrt(lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-4))
+    curve = np.sqrt(MAX_LATERAL_MPS2 / np.maximum(np.abs(path.curvature), 1e-4))
     limit = np.minimum(curve, cruise_mps)
     # Backward pass: v_i^2 <= v_j^2 + 2 a (s_j - s_i) for every j > i.
-    reach = 2 * brake_mps2 * Path.SPACING_M * np.arange(len(limit))
+    reach = 2 * COMFORT_BRAKE_MPS2 * Path.SPACING_M * np.arange(len(limit))
     squared = np.minimum.accumulate((limit**2 + reach)[::-1])[::-1] - reach
     return np.sqrt(np.maximum(squared, 0.0))
 
 
-def speed_profile(
-    speed_mps: float, limits: F64, t_s: F64, accel_mps2: float = 1.5, brake_mps2: float = 4.0
-) -> F64:
+def speed_profile(speed_mps: float, limits: F64, t_s: F64) -> F64:
     """Return the progress ``(T,)`` at times ``(T,)`` of a car that nears the limits ``(N,)`` along
     its path within its comfort.
     """
@@ -221,7 +219,7 @@ def speed_profile(
     for k in range(1, len(t_s)):
         dt = float(t_s[k] - t_s[k - 1])
         limit = ahead[min(int(progress[k - 1] / Path.SPACING_M), len(ahead) - 1)]
-        after = min(max(limit, speed - brake_mps2 * dt), speed + accel_mps2 * dt)
+        after = min(max(limit, speed - BRAKE_MPS2 * dt), speed + ACCEL_MPS2 * dt)
         progress[k] = progress[k - 1] + 0.5 * (speed + after) * dt
         speed = after
     return progress

@@ -20,14 +20,6 @@ from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.metrics.presets import Preset
 
 
-def pairs_of(flags: Bool) -> tuple[I64, I64]:
-    """Return the rows and columns of the set flags ``(N, M)``, in order; several times as fast as
-    `numpy.nonzero` where few are set.
-    """
-    row, column = np.divmod(np.flatnonzero(flags), flags.shape[1])
-    return np.asarray(row), np.asarray(column)
-
-
 def spans(first: I64, last: I64) -> tuple[I64, I64]:
     """Return for spans ``(N,)`` of an array, each from ``first`` to before ``last``, the span and
     the place of all their members.
@@ -252,8 +244,6 @@ class ActorsAt:
 
     def centres(self) -> F64:
         """Return box centres ``(A, Q, 2)``; meaningless where not present."""
-        if not self.fraction.any():
-            return np.asarray(self.table._xy[self.row])
         f = self.fraction[..., None]
         follows = np.where(self.fraction > 0, self.row + 1, self.row)
         return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[follows] * f)

@@ -23,7 +23,7 @@ import shapely
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
 from alpasim_plugin.core.types import F64, Bool, MetricSeries, RolloutLog, Scene
-from evaluators.metrics.footprint import Footprints, ego_footprints, origin_of, pairs_of
+from evaluators.metrics.footprint import Footprints, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.road import Road, road_of
 from evaluators.metrics.score import series, with_preset
@@ -54,7 +54,7 @@ def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
     """
     near = road.lanes_near(xyz)
     shapes = ego.shapes()
-    step, lane = pairs_of(near)
+    step, lane = np.nonzero(near)
     areas = road.areas(lane)
     held = shapely.contains(areas, shapes[step])
     in_one = np.zeros(len(near), dtype=np.bool_)

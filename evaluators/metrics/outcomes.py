@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.geometry import arc_lengths, speeds
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import DIRECTION_M, followed, on_route, recorded_path, to_path
@@ -200,7 +200,7 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     )
     has_side = np.isfinite(aside_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
-    stalled, braked = _slow(rollout, preset, line, path.t_us, s)
+    stalled, braked = _slow(rollout, preset, path, line, s)
     return [
         series("stalled", t_us, stalled, has_side, why),
         series("braked_without_cause", t_us, braked, has_side, why),
@@ -209,16 +209,16 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
 
 
 def _slow(
-    rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F64
+    rollout: RolloutLog, preset: Preset, path: Trajectory, line: F64, s: F64
 ) -> tuple[Bool, Bool]:
     """Return at which steps ``(T,)`` the ego has stood too long, and has braked without a cause."""
     t_us = rollout.ego.t_us
     seconds = (t_us - t_us[0]) * 1e-6
-    v = speeds(seconds, rollout.ego.xyz[:, :2])
+    v = speeds(rollout.ego)
     engaged = t_us >= handover_us(rollout)
     fastest = np.maximum.accumulate(np.where(engaged, v, 0.0))
-    along, then = arc_lengths(line), (recorded_us - recorded_us[0]) * 1e-6
-    usual, pause_s = recorded_speed(along, then, speeds(then, line), s)
+    along, then = arc_lengths(line), (path.t_us - path.t_us[0]) * 1e-6
+    usual, pause_s = recorded_speed(along, then, speeds(path), s)
     expected = np.minimum(fastest, usual)
     stands = engaged & (v < STAND_MPS)
     slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
@@ -230,13 +230,6 @@ def _slow(
     excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
     stood_s, slow_s = _lasting(stands & ~excused, seconds), _lasting(slow & ~excused, seconds)
     return stood_s >= STAND_S + pause_s, slow_s >= SLOW_S
-
-
-def speeds(seconds: F64, xy: F64) -> F64:
-    """Return the speed ``(T,)`` along positions ``(T, 2)``, m/s; 0 for a single one."""
-    if len(xy) < 2:
-        return np.zeros(len(xy))
-    return np.asarray(np.hypot(*np.gradient(xy, seconds, axis=0).T))
 
 
 def recorded_speed(along: F64, seconds: F64, v: F64, s: F64) -> tuple[F64, F64]:

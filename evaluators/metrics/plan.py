@@ -196,14 +196,14 @@ def min_ade(
                 ]
                 values[i, j] = min(errors, default=np.nan)
     reason = "the log, the target or every sample ends before the horizon"
-    names = [
-        MIN_ADE.format(float(horizon_s), preset.min_ade_target)
-        for horizon_s in preset.min_ade_horizons_s
-    ]
     return [
-        series(name, now_us, values[:, j], np.isfinite(values[:, j]), reason)
-        for j, name in enumerate(names)
+        series(name, now_us, column, np.isfinite(column), reason)
+        for name, column in zip(_min_ade_names(preset), values.T, strict=True)
     ]
+
+
+def _min_ade_names(preset: Preset) -> list[str]:
+    return [MIN_ADE.format(float(s), preset.min_ade_target) for s in preset.min_ade_horizons_s]
 
 
 def _min_ade_by_index(
@@ -244,13 +244,9 @@ def _min_ade_by_index(
         ]
         for j, read in enumerate([read for read in reads if read < len(span)]):
             rows[j].append((plan.now_us, float(best[read])))
-    names = [
-        MIN_ADE.format(float(horizon_s), preset.min_ade_target)
-        for horizon_s in preset.min_ade_horizons_s
-    ]
     return [
         series(name, np.array([t for t, _ in row], dtype=np.int64), np.array([v for _, v in row]))
-        for name, row in zip(names, rows, strict=True)
+        for name, row in zip(_min_ade_names(preset), rows, strict=True)
         if row
     ]
 

@@ -16,7 +16,7 @@ import shapely
 
 from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
-from evaluators.metrics.footprint import Geometries, pairs_of, spans
+from evaluators.metrics.footprint import Geometries, spans
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.surface import Region, Surface, segment_distance
 
@@ -69,7 +69,7 @@ class Polylines:
         meet = np.ones((len(run), self.n_lines), dtype=np.bool_)
         for d in (0, 1):
             meet &= (most[:, d] >= low[:, [d]]) & (least[:, d] <= high[:, [d]])
-        which, line = pairs_of(meet)
+        which, line = np.nonzero(meet)
         pair, segment = spans(self._first[line], self._last[line])
         which = which[pair]
         least, most = np.minimum(self.start, self.end).T, np.maximum(self.start, self.end).T

@@ -29,9 +29,6 @@ DIRECTION_M = 1.0
 # what a recording does within this distance of its first or last position is standing there
 STAND_M = 0.5
 FOUND_M = 2.0  # a path that was left is found again where it is this near
-_ROWS = (
-    32  # points handled at once, so that what is computed of them stays in the processor's cache
-)
 
 
 def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
@@ -186,29 +183,10 @@ def progress_so_far(path: F64, points: F64) -> F64:
     1 where that part of the path has no length: the recording has not moved, so there is nothing to
     be behind of.
     """
-    n = len(path)
-    s = arc_lengths(path)
-    if n == 1:
-        return np.ones(1)
-    (x, y), (along_x, along_y) = path[:-1].T, np.diff(path, axis=0).T
-    length2 = along_x**2 + along_y**2
-    over = np.where(length2 > 0, length2, np.inf)  # a segment without length is its start
-    out = np.ones(n)
-    for low in range(1, n, _ROWS):
-        rows = np.arange(low, min(low + _ROWS, n))
-        window = slice(
-            0, int(rows[-1])
-        )  # segments that start at or after vertex k do not exist yet for point k
-        to_x, to_y = points[rows, :1] - x[window], points[rows, 1:] - y[window]  # (R, S)
-        f = np.clip((to_x * along_x[window] + to_y * along_y[window]) / over[window], 0.0, 1.0)
-        to_x -= f * along_x[window]
-        to_y -= f * along_y[window]
-        distance2 = to_x**2 + to_y**2
-        distance2[np.arange(rows[-1])[None] >= rows[:, None]] = np.inf
-        best = np.argmin(distance2, axis=1)
-        reached = s[best] + f[np.arange(len(rows)), best] * np.sqrt(length2[best])
-        total = s[rows]
-        out[rows] = np.divide(reached, total, out=np.ones(len(rows)), where=total > 0)
+    driven_m = arc_lengths(path)
+    out = np.ones(len(path))
+    for k in np.flatnonzero(driven_m > 0):
+        out[k] = to_path(path[: k + 1], points[[k]])[1][0] / driven_m[k]
     return out
 
 

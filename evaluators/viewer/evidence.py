@@ -9,10 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, inverse, rectangle_corners
+from alpasim_plugin.core.geometry import interpolate, inverse, rectangle_corners, speeds
 from alpasim_plugin.core.types import F64, Actor, Box, LoggedPlan, RolloutLog, Trajectory
 from evaluators.metrics.footprint import Geometries
-from evaluators.metrics.outcomes import speeds
 
 BEFORE_US = 6_000_000  # of the failure
 STEP_US = 100_000
@@ -66,7 +65,7 @@ def _towards(
     """Say since when plans lead into a road user, and when the first one brakes."""
     leads = [_leads_into(log, plan.trajectory, actor) for plan in plans]
     facts = _since(plans, leads, failed_us, f"leads into {actor.actor_id}")
-    driven = speeds((log.ego.t_us - log.ego.t_us[0]) * 1e-6, log.ego.xyz[:, :2])
+    driven = speeds(log.ego)
     for plan in plans:
         speed = float(np.interp(plan.now_us, log.ego.t_us, driven))
         asked = float(np.hypot(*(_ahead(plan, 1_000_000) - _ahead(plan, 900_000)))) / 0.1

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluators import rollout_values, score
-from evaluators.metrics.route import beside, moving, progress_so_far, to_path
+from evaluators.metrics.route import beside, moving, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
 from tests.evaluators.reference_rules import point_to_segment
@@ -140,13 +140,6 @@ def test_array_projection_and_twin_agree(points, offset):
 def is_ambiguous(path, point):
     near = sorted(point_to_segment(point, a, b)[0] for a, b in pairwise(path))
     return len(near) > 1 and near[1] - near[0] < 1e-9
-
-
-def test_progress_so_far_is_the_same_in_blocks(monkeypatch):
-    points = np.cumsum(np.ones((50, 2)), axis=0)
-    whole = progress_so_far(points, points * 0.9)
-    monkeypatch.setattr("evaluators.metrics.route._ROWS", 3)
-    np.testing.assert_array_equal(progress_so_far(points, points * 0.9), whole)
 
 
 def test_lateral_bias_is_the_signed_mean_left_positive_and_follows_the_paths_direction():
