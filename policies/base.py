@@ -55,14 +55,14 @@ def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:
     horizon.
     """
     n = round(horizon_s * 1_000_000 / PLAN_STEP_US)
-    return t_us + PLAN_STEP_US * np.arange(n + 1, dtype=np.int64)
+    return t_us + PLAN_STEP_US * np.arange(n + 1)
 
 
 def seconds(times_us: I64) -> F64:
     """Return the seconds ``(T,)`` from the first of the times; the difference is taken in
     integers.
     """
-    return (times_us - times_us[0]).astype(np.float64) * 1e-6
+    return (times_us - times_us[0]) * 1e-6
 
 
 def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
@@ -153,7 +153,7 @@ def smooth_line(points: F64) -> F64:
     if keep.sum() < 3:
         return resample(points, at, s)
     spline = scipy.interpolate.CubicSpline(s[keep], points[keep])
-    return np.asarray(spline(np.minimum(at, s[-1])))
+    return spline(np.minimum(at, s[-1]))
 
 
 def extended(points: F64, length_m: float) -> F64:
@@ -192,7 +192,7 @@ def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
     step = np.gradient(line, axis=0)
     normal = (
-        np.stack([-step[:, 1], step[:, 0]], axis=1)
+        np.column_stack([-step[:, 1], step[:, 0]])
         / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     )
     return line + left_m * normal

@@ -113,7 +113,7 @@ class LaneCamera(Policy):
         if left is not None:  # with a lateral navigation error that is constant over the drive
             line = smooth_line(left)
             step = np.gradient(line, axis=0)
-            normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(
+            normal = np.column_stack([-step[:, 1], step[:, 0]]) / np.maximum(
                 np.linalg.norm(step, axis=1, keepdims=True), 1e-9
             )
             route = line + self.navigation_error_m * normal

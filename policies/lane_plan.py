@@ -90,7 +90,7 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     if route is None:
         x = np.arange(0.0, 40.0)
         y = _straight_beyond(lane, x, max(lane.seen_to_m, 10.0))
-        return np.stack([x, y], axis=1), 0.0, np.inf
+        return np.column_stack([x, y]), 0.0, np.inf
     s = arc_lengths(route)
     points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
     step = np.gradient(points, axis=0)
@@ -118,7 +118,7 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
         correction = np.where(
             beyond, correction[last] * np.exp(-(np.arange(len(x)) - last) / 8.0), correction
         )
-    normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    normal = np.column_stack([-np.sin(heading), np.cos(heading)])
     # The correction is measured along the rig's y axis; along the path's normal it is shorter by
     # the cosine.
     fused = points + normal * (correction * np.cos(heading))[:, None]
@@ -176,7 +176,7 @@ def correlated_noise(before: F64 | None, dt_s: float, random: np.random.Generato
     """
     fresh = random.normal(0.0, 1.0, (N_SAMPLES, 2))
     if before is None:
-        return np.asarray(fresh)
+        return fresh
     keep = float(np.exp(-dt_s / NOISE_S))
     return keep * before + np.sqrt(1 - keep**2) * fresh
 
@@ -211,9 +211,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     shift_m, faster = (noise[1:] - noise[0]).T[:, :, None]
     shift_m = sigma_m * shift_m  # (N_SAMPLES - 1, 1)
     lines = np.empty((len(shift_m), len(s), 3))
-    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.stack(
-        [-np.sin(yaw), np.cos(yaw)], axis=1
-    )
+    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
     lines[..., 2] = yaw + np.arctan(shift_m * ramp_slope)
     return [
         np.column_stack([xy, yaw]),

@@ -164,13 +164,13 @@ class Learned(Policy):
         xy = np.concatenate(
             [
                 np.zeros((1, 2)),
-                np.cumsum(np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0),
+                np.cumsum(np.column_stack([np.cos(middle), np.sin(middle)]), axis=0),
             ]
         )
         over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight beyond the last knot
         at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
-        return np.stack(
-            [at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1
+        return np.column_stack(
+            [at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])]
         ), at[2]
 
 

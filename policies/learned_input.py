@@ -84,14 +84,11 @@ def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
         centre = np.array(
             [[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]
         )  # pixel centres lie at halves
-        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         to_camera = np.linalg.inv(centre) @ scale @ centre @ to_camera
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpPerspective(
-            rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE
-        ),
-        dtype=np.uint8,
+    return cv2.warpPerspective(
+        rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
 
 

@@ -126,7 +126,7 @@ def knot_weights() -> F64:
     `path_grid`: linear, 0 at the car.
     """
     knots = np.array((0.0, *KNOTS_M))
-    return np.stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]], axis=1)
+    return np.column_stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]])
 
 
 def save_net(net: LearnedNet, path: Path, metadata: dict[str, str]) -> None:

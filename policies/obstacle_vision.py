@@ -67,7 +67,7 @@ def learn_road(
         + np.arange(-ROAD_HALF_M, ROAD_HALF_M, 2 * CELL_M) / CELL_M
     )
     index = np.minimum(np.maximum(np.rint(columns).astype(np.intp), 0), lab.shape[1] - 1)
-    patch = lab[rows[:, None], index].reshape(-1, 3).astype(np.float64)
+    patch = lab[rows[:, None], index].reshape(-1, 3)
     patch = patch[grid.inside[rows[:, None], index].reshape(-1)]
     if len(patch) < 50:
         return colour

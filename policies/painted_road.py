@@ -86,14 +86,14 @@ class PaintedRoad:
             return x_m, y_m
         sign, radius = float(np.sign(k)), np.hypot(x_m, y_m - 1 / k)
         angle = np.arctan2(x_m * sign, (1 / k - y_m) * sign)
-        return np.asarray(angle / k * sign), np.asarray(sign * (abs(1 / k) - radius))
+        return angle / k * sign, sign * (abs(1 / k) - radius)
 
     def image(self, camera: CameraSpec, T_world_rig: F64, seed: int = 0) -> U8:
         """Draw the road ``(H, W, 3)`` as the camera sees it from a rig pose."""
         painted = self.painted(camera, T_world_rig @ camera.T_rig_camera)
         small = cv2.resize(painted, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         noise = np.random.Generator(np.random.Philox(key=seed)).normal(0.0, NOISE, small.shape)
-        return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
+        return np.clip(small + noise, 0, 255).astype(np.uint8)
 
     def painted(self, camera: CameraSpec, T: F64) -> F32:
         """Draw the road at `SUPERSAMPLE` times the camera's size, or at `MOST_PX` columns, seen
@@ -131,4 +131,4 @@ class PaintedRoad:
                 paint[paint] = np.mod(s_m[paint], PERIOD_M) < DASH_M
             index[paint] = len(paints)
             paints.append(line.colour)
-        return np.asarray(np.array(paints, dtype=np.float32)[index])
+        return np.array(paints, dtype=np.float32)[index]

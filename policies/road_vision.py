@@ -91,7 +91,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     near = max(NEAR_M, x_camera + 1.0)
     candidates = np.geomspace(near, FAR_M, 2000)
     rows_v = _project(
-        camera, T_camera_rig, np.stack([candidates, 0 * candidates, 0 * candidates], axis=1)
+        camera, T_camera_rig, np.column_stack([candidates, 0 * candidates, 0 * candidates])
     )[:, 1]
     v = rows_v[[0, -1]]
     if height < 0.3 or not np.isfinite(v).all() or v[0] - v[1] < 8 or v[1] > camera.height - 8:
@@ -103,11 +103,11 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     n = int(min(MAX_ROWS, max(first - last, 8) + 1))
     # Equal steps in the image row are steps of x^2 on the ground: each grid row has its own image
     # row.
-    x = np.asarray(np.interp(-np.linspace(first, last, n), -rows_v, candidates), dtype=np.float64)
+    x = np.interp(-np.linspace(first, last, n), -rows_v, candidates)
     y = HALF_WIDTH_M - CELL_M * np.arange(round(2 * HALF_WIDTH_M / CELL_M) + 1, dtype=np.float64)
-    points = np.stack([np.repeat(x, len(y)), np.tile(y, len(x)), np.zeros(len(x) * len(y))], axis=1)
+    points = np.column_stack([np.repeat(x, len(y)), np.tile(y, len(x)), np.zeros(len(x) * len(y))])
     uv = _project(camera, T_camera_rig, points).reshape(len(x), len(y), 2)
-    inside = np.asarray(np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1))
+    inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
     distance = x - x_camera
     f, y_camera = float(camera.K[0, 0]), float(camera.T_rig_camera[1, 3])
     column = np.arange(camera.width) + 0.5 - camera.width / 2
@@ -116,7 +116,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
         np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
     )
     map_u, map_v = uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
-    pixel_m = np.asarray(np.hypot(distance, height) / f, dtype=np.float64)
+    pixel_m = np.hypot(distance, height) / f
     return GroundGrid(
         x,
         y,
@@ -124,7 +124,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
         map_v,
         inside,
         pixel_m,
-        np.asarray(np.gradient(x)),
+        np.gradient(x),
         (x_camera, height),
         y_camera,
         f,
@@ -168,7 +168,7 @@ class RidgeFilter:
     """
 
     def __init__(self, grid: GroundGrid) -> None:
-        sizes = np.stack(_windows(grid), axis=1).astype(
+        sizes = np.column_stack(_windows(grid)).astype(
             np.intp
         )  # (R, 3) cells: half the stroke, start and length of a flank
         starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
@@ -266,7 +266,7 @@ def find_paint(
     before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
     bend = np.maximum(2 * here - before - after, 1e-6)
     shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
-    y = np.asarray(grid.y_m[cols] - shift * CELL_M)
+    y = grid.y_m[cols] - shift * CELL_M
     strength = here / threshold[rows]
     # A bar of a crosswalk has at least two others beside it, closer than a lane width.
     apart = np.abs(y[:, None] - y[None, :])
@@ -296,9 +296,7 @@ def _cells_around(
         np.minimum.at(low, rows, y)
         wide = (count >= 4) & (high - low > CROSSWALK_M)
         mask[rows[wide[rows]], columns[wide[rows]]] = 1
-        mask = np.asarray(
-            cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
-        )
+        mask = cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
     return mask > 0
 
 

@@ -40,7 +40,7 @@ class ConstantVelocity(Policy):
         times = plan_times(observation.t_us)
         x = observation.ego.speed_mps * seconds(times)
         return Plan(
-            observation.t_us, times, np.stack([x, np.zeros_like(x)], axis=1), np.zeros_like(x)
+            observation.t_us, times, np.column_stack([x, np.zeros_like(x)]), np.zeros_like(x)
         )
 
 

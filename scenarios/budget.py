@@ -204,7 +204,7 @@ def _check_actors(actors: tuple[Actor, ...], where: str) -> None:
 
 def _check_track(track: Trajectory, where: str) -> None:
     b.COORDINATE_M.check(_reach(track.xyz), where, "farthest position")
-    b.EPOCH_US.check(float(np.abs(track.t_us[[0, -1]].astype(np.float64)).max()), where)
+    b.EPOCH_US.check(float(np.abs(track.t_us[[0, -1]]).max()), where)
     b.LOG_S.check(float(track.t_us[-1] - track.t_us[0]) * 1e-6, where, "length of its track")
     if not np.isfinite(track.quat).all():
         raise InputError(f"{where}: a rotation that is not finite", "repair or drop its track")

@@ -169,7 +169,7 @@ def _check_drive(
         InputError: It does not, with the position of the road or of the actor.
     """
     last_us = min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
-    t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US, dtype=np.int64)
+    t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US)
     ego = _footprints(interpolate(ego_log, t_us), vehicle.box, vehicle.rear_axle_to_centre_m)
     lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
     road = shapely.union_all([shapely.buffer(lane_polygon(lane), SEAM_M) for lane in lanes])

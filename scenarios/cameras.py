@@ -131,7 +131,7 @@ def _rotation(yaw: float, pitch_down: float) -> F64:
     sp = np.sin(pitch_down)
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    return np.asarray(about_z @ about_y)
+    return about_z @ about_y
 
 
 def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:

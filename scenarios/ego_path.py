@@ -200,7 +200,7 @@ def _follow(road: Road, lane_id: str) -> list[str]:
 
 def grid(start_us: int, end_us: int, step_us: int = STEP_US) -> I64:
     """Return times from start to end in steps; the last one is the end itself."""
-    t = np.arange(start_us, end_us, step_us, dtype=np.int64)
+    t = np.arange(start_us, end_us, step_us)
     return np.append(t, np.int64(end_us))
 
 
@@ -208,14 +208,14 @@ def speed_profile(t_us: I64, rows: Sequence[tuple[float, float]]) -> F64:
     """Return speeds ``(T,)`` of rows (time in seconds after ``t_us[0]``, m/s), linear in between,
     constant outside.
     """
-    t_s = (t_us - t_us[0]).astype(np.float64) * 1e-6
+    t_s = (t_us - t_us[0]) * 1e-6
     times, values = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
     return np.interp(t_s, times, values)
 
 
 def integrate(t_us: I64, speed_mps: F64, s0_m: float) -> F64:
     """Return arc lengths ``(T,)`` of a speed that is linear between samples."""
-    dt = np.diff(t_us).astype(np.float64) * 1e-6
+    dt = np.diff(t_us) * 1e-6
     return np.concatenate([[s0_m], s0_m + np.cumsum(dt * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
 
 
@@ -227,7 +227,7 @@ def track_on_path(
 
     A lateral offset that changes turns the body by the slope of its motion.
     """
-    offset = np.broadcast_to(np.asarray(offset_m, dtype=np.float64), s_m.shape)
+    offset = np.broadcast_to(offset_m, s_m.shape)
     keep = (s_m >= 0) & (s_m <= path.length_m)
     if not keep.all():
         keep = np.arange(len(s_m)) < (int(np.argmin(keep)) or 0)
@@ -268,7 +268,7 @@ def walk_track(
     Speed rises and falls within 0.4 s at the ends; the mean crossing is at ``speed_mps``.
     """
     distance = float(np.hypot(*(end - start)[:2]))
-    t_s = (t_us - begin_us).astype(np.float64) * 1e-6
+    t_s = (t_us - begin_us) * 1e-6
     ramp_s = min(0.4, distance / speed_mps / 2)
     total_s = distance / speed_mps + ramp_s
     t = np.clip(t_s, 0.0, total_s)

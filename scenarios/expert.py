@@ -60,9 +60,7 @@ class ScriptedTracks:
 
     def __init__(self, scripts: Sequence[Actor], end_us: int, step_us: int) -> None:
         self.step_us = step_us
-        self.times = np.arange(
-            0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us, dtype=np.int64
-        )
+        self.times = np.arange(0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us)
         still = [
             s
             for s in scripts

@@ -130,7 +130,7 @@ def rails(lane: Lane) -> tuple[F64, F64]:
 
 
 def _at(wanted: F64, shares: F64, line: F64) -> F64:
-    return np.stack([np.interp(wanted, shares, line[:, d]) for d in range(3)], axis=1)
+    return np.column_stack([np.interp(wanted, shares, line[:, d]) for d in range(3)])
 
 
 def _shares(line: F64) -> F64:
@@ -138,7 +138,7 @@ def _shares(line: F64) -> F64:
     plane.
     """
     s = arc_lengths(line[:, :2])
-    return np.asarray(s / s[-1]) if s[-1] > 0 else np.linspace(0.0, 1.0, len(line))
+    return s / s[-1] if s[-1] > 0 else np.linspace(0.0, 1.0, len(line))
 
 
 def _beside(centre: F64, left_m: float) -> F64:
@@ -148,7 +148,7 @@ def _beside(centre: F64, left_m: float) -> F64:
     along = np.gradient(centre[:, :2], axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     out = centre.copy()
-    out[:, :2] += left_m * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    out[:, :2] += left_m * np.column_stack([-along[:, 1], along[:, 0]])
     return out
 
 
@@ -187,6 +187,6 @@ def border_lines(area: Any, heights: F64, step_m: float = STEP_M) -> tuple[F64, 
     lines: list[F64] = []
     for part in shapely.get_parts(area):
         for ring in (part.exterior, *part.interiors):
-            xy = densify(np.asarray(shapely.get_coordinates(ring), dtype=np.float64), step_m)
+            xy = densify(shapely.get_coordinates(ring), step_m)
             lines.append(np.column_stack([xy, heights[tree.query(xy)[1], 2]]))
     return tuple(lines)

@@ -320,7 +320,7 @@ def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Act
             f"{actor.id}: the ego's front drives from {first_m:.0f} to {last_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}",
             "choose s_m inside",
         )
-    arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us.astype(np.float64)))
+    arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us))
     right, left = (
         _road_edge(placer.road, placer.ego_path.path, at, side) for side in ("right", "left")
     )

@@ -136,7 +136,7 @@ class PinholeCamera:
         M = before @ inverse(self.T_camera_world @ T_world_node)
         turn = cv2.Rodrigues(M[:3, :3])[0].ravel()
         shift = M[:3, 3] - 0.5 * np.cross(turn, M[:3, 3])
-        return np.asarray(-2.0 * np.concatenate([turn, shift]))  # half a shutter lies between
+        return -2.0 * np.concatenate([turn, shift])  # half a shutter lies between
 
     @property
     def fx(self) -> float:
@@ -161,20 +161,18 @@ class PinholeCamera:
     @property
     def centre_world(self) -> F64:
         """Return the camera centre ``(3,)``, metres, world."""
-        return np.asarray(-self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3])
+        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     def above_horizon(self) -> Bool:
         """Return which pixels ``(H, W)`` look up, towards +z of the world."""
         v, u = np.mgrid[0 : self.height, 0 : self.width] + 0.5
         up = self.T_camera_world[:3, 2]
-        return np.asarray(
-            (u - self.cx) / self.fx * up[0] + (v - self.cy) / self.fy * up[1] + up[2] > 0
-        )
+        return (u - self.cx) / self.fx * up[0] + (v - self.cy) / self.fy * up[1] + up[2] > 0
 
     def unprojected(self, rows: I64, columns: I64, depth: F64) -> F64:
         """Return the points ``(N, 3)`` in the camera's axes that pixels show at depths ``(N,)``."""
         x, y = (columns + 0.5 - self.cx) / self.fx, (rows + 0.5 - self.cy) / self.fy
-        return np.stack([x * depth, y * depth, depth], axis=1)
+        return np.column_stack([x * depth, y * depth, depth])
 
     def slope_limits(self) -> tuple[float, float, float, float]:
         """Return the bounds (x low, x high, y low, y high) of x/z and y/z inside the covariance's

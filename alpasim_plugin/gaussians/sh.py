@@ -89,10 +89,10 @@ def _sample_directions() -> tuple[F64, tuple[F64, ...]]:
     z = 1 - 2 * i / 64
     phi = np.pi * (1 + np.sqrt(5)) * i
     r = np.sqrt(1 - z * z)
-    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+    directions = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
     basis = sh_basis(directions)
     return directions, tuple(
-        np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]), np.float64) for d in range(4)
+        np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2])) for d in range(4)
     )
 
 

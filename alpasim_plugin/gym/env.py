@@ -69,7 +69,7 @@ class Controls:
             float(max(pedal, 0.0) * self._vehicle.max_accel_mps2),
             float(max(-pedal, 0.0) * self._vehicle.max_brake_mps2),
         )
-        times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64)
+        times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US)
         step_s = PREDICTED_STEP_US * 1e-6
         state = replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)
         states = [state]
@@ -107,7 +107,7 @@ class Trajectories:
         high = np.tile([FORWARD_M, LATERAL_M, np.pi], (n, 1))
         self.space = Box(low, high, dtype=np.float64)
         self.controller = make_controller("bicycle", vehicle)
-        self._after_us = step_us * np.arange(n + 1, dtype=np.int64)
+        self._after_us = step_us * np.arange(n + 1)
 
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Return the action as a plan, which begins at the ego."""
@@ -251,9 +251,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         while observation.t_us < scenario.start_us + scenario.warmup_us:
             # The recording is forced: nothing to decide.
             # A plan that keeps heading and speed for two seconds.
-            times = observation.t_us + np.arange(
-                0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64
-            )
+            times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US)
             ahead = observation.ego.speed_mps * (times - times[0]) * 1e-6
             still = np.zeros(len(times))
             observation = driving.send(

@@ -70,7 +70,7 @@ def _along(path: F64) -> F64:
     """Return points ``(K, 3)`` every `STEP_M` along a path ``(N, 3)``."""
     s = arc_lengths(path[:, :2])
     at = np.linspace(0.0, s[-1], max(2, int(s[-1] / STEP_M) + 1))
-    return np.stack([np.interp(at, s, path[:, axis]) for axis in range(3)], axis=1)
+    return np.column_stack([np.interp(at, s, path[:, axis]) for axis in range(3)])
 
 
 def _count_near(points: F64, at: F64) -> int:

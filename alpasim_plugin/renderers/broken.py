@@ -87,7 +87,7 @@ def mirrored(rgb: U8) -> U8:
 
 def blurred(rgb: U8) -> U8:
     """Blur the image with a standard deviation of `BLUR_SHARE` of its width."""
-    return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
+    return cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1])
 
 
 def _corrupted(

@@ -155,7 +155,7 @@ def photograph_image(one: Photograph, camera: PinholeCamera) -> U8:
     Raises:
         InputError: The file is missing or damaged.
     """
-    rgb = np.asarray(read_image(Path(one.path))[..., ::-1], np.uint8)
+    rgb = read_image(Path(one.path))[..., ::-1]
     size = camera.width, camera.height
     small = (
         rgb

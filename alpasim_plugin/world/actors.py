@@ -151,7 +151,7 @@ class Actors:
             ).T
             boxes = [driver.actor.box for driver, _ in driving]
             xyz, yaws = lines.at(line, s_m, offset_m)
-            directions = np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
+            directions = np.column_stack([np.cos(yaws), np.sin(yaws)])
             moving = bodies_from(xyz[:, :2], yaws, boxes, speed_mps[:, None] * directions)
             everybody = concatenate([others, moving])
             leaders = find_leaders(
@@ -350,4 +350,4 @@ def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
     s = np.arange(FADE_STEP_M, way.length_m, FADE_STEP_M)
     points, _ = way.at(s, float(offset[0]) * (1.0 - smoothstep(s / FADE_M)))
     points[:, 2] = end[2]
-    return np.asarray(points)
+    return points

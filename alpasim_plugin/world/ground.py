@@ -37,7 +37,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
         InputError: There is no point, a coordinate is not finite, or the grid would have more than
             `MAX_NODES` nodes.
     """
-    xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    xyz = points.reshape(-1, 3)
     if len(xyz) == 0 or not np.isfinite(xyz).all() or cell_m <= 0:
         bad = (
             "no points"
@@ -54,7 +54,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
             & (xyz[:, :2] <= drive[:, :2].max(axis=0) + SIGHT_M),
             axis=1,
         )
-        xyz = xyz[near] if near.any() else np.asarray(drive, dtype=np.float64)
+        xyz = xyz[near] if near.any() else drive
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
     nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
     if nx * ny > MAX_NODES:
@@ -67,8 +67,8 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
     rest = xyz - xyz[0]
-    sums = np.stack(
-        [np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)], axis=1
+    sums = np.column_stack(
+        [np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)]
     )
     means = sums / count[:, None] + xyz[0]
     xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
@@ -81,21 +81,18 @@ def _interpolate(samples: F64, nodes: F64) -> F64:
     nearest = samples[scipy.spatial.KDTree(samples[:, :2]).query(nodes)[1], 2]
     local = samples[:, :2] - samples[0, :2]
     if len(samples) < 3 or np.linalg.matrix_rank(local, tol=1e-6) < 2:
-        return np.asarray(nearest)  # a line of points spans no triangle
+        return nearest  # a line of points spans no triangle
     z = scipy.interpolate.LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
     return np.where(np.isnan(z), nearest, z)
 
 
 def height_at(field: HeightField, xy: F64) -> F64:
     """Return the ground height ``(N,)`` in metres at ``(N, 2+)`` points."""
-    at = np.asarray(xy, dtype=np.float64)
     ny, nx = field.z.shape
-    u = np.minimum(np.maximum((at[:, 0] - field.x0_m) / field.cell_m, 0), nx - 1)
-    v = np.minimum(np.maximum((at[:, 1] - field.y0_m) / field.cell_m, 0), ny - 1)
-    i, j = (
-        np.minimum(u.astype(np.int64), max(nx - 2, 0)),
-        np.minimum(v.astype(np.int64), max(ny - 2, 0)),
-    )
+    u = np.clip((xy[:, 0] - field.x0_m) / field.cell_m, 0, nx - 1)
+    v = np.clip((xy[:, 1] - field.y0_m) / field.cell_m, 0, ny - 1)
+    i = np.minimum(u.astype(np.int64), max(nx - 2, 0))
+    j = np.minimum(v.astype(np.int64), max(ny - 2, 0))
     i1, j1 = np.minimum(i + 1, nx - 1), np.minimum(j + 1, ny - 1)
     fu, fv = u - i, v - j
     low = field.z[j, i] * (1 - fu) + field.z[j, i1] * fu
@@ -118,12 +115,12 @@ def ground_poses(field: HeightField, xy: F64, yaw: F64) -> F64:
     """
     c, s = np.cos(yaw), np.sin(yaw)
     h = SLOPE_SPAN_M
-    ahead, left = np.stack([c * h, s * h], axis=1), np.stack([-s * h, c * h], axis=1)
+    ahead, left = np.column_stack([c * h, s * h]), np.column_stack([-s * h, c * h])
     at = np.concatenate([xy, xy + ahead, xy - ahead, xy + left, xy - left])
     z = height_at(field, at).reshape(5, -1)
     along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
-    ex = np.stack([c, s, along], axis=1) / np.sqrt(1 + along * along)[:, None]
-    ez = np.cross(ex, np.stack([-s, c, across], axis=1))
+    ex = np.column_stack([c, s, along]) / np.sqrt(1 + along * along)[:, None]
+    ez = np.cross(ex, np.column_stack([-s, c, across]))
     ez /= np.linalg.norm(ez, axis=1, keepdims=True)
     poses = np.zeros((len(yaw), 4, 4))
     poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = ex, np.cross(ez, ex), ez

@@ -128,7 +128,7 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
     """Return where bodies lie on lines: each row ``(P,)`` of ``bodies`` on its ``line (P,)``,
     between two of its stations ``(P,)``.
     """
-    half = np.stack([bodies.half_length_m[row], bodies.half_width_m[row]], axis=1)
+    half = np.column_stack([bodies.half_length_m[row], bodies.half_width_m[row]])
     turn = np.array([np.cos(bodies.yaw[row]), np.sin(bodies.yaw[row])])
     x, y = np.moveaxis(_OUTLINE * half[:, None], -1, 0)  # (P, 6)
     outline = bodies.xy[row][:, None] + np.stack(
@@ -220,11 +220,11 @@ def bodies_from(xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64) -> Bodie
     """
     half = np.array([[b.length_m / 2, b.width_m / 2] for b in boxes]).reshape(-1, 2)
     return Bodies(
-        np.asarray(xy).reshape(-1, 2),
-        np.asarray(yaw).reshape(-1),
+        xy.reshape(-1, 2),
+        yaw.reshape(-1),
         half[:, 0],
         half[:, 1],
-        np.asarray(velocity).reshape(-1, 2),
+        velocity.reshape(-1, 2),
     )
 
 

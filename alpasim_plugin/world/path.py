@@ -22,7 +22,7 @@ def smoothstep(x: npt.ArrayLike) -> F64:
     """Return the quintic blend 0..1 whose first and second derivatives vanish at both ends; clamped
     outside [0, 1].
     """
-    t = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
+    t = np.clip(x, 0.0, 1.0)
     return t * t * t * (10.0 + t * (6.0 * t - 15.0))
 
 
@@ -71,7 +71,7 @@ def sample_clothoid(
     dx = np.sum(half * _WEIGHTS * np.cos(yaw_at_nodes), axis=1)
     dy = np.sum(half * _WEIGHTS * np.sin(yaw_at_nodes), axis=1)
     x, y = np.concatenate([[0.0], np.cumsum(dx)]) + x0, np.concatenate([[0.0], np.cumsum(dy)]) + y0
-    return np.stack([x, y, heading(s), start_curvature_per_m + rate * s], axis=1)
+    return np.column_stack([x, y, heading(s), start_curvature_per_m + rate * s])
 
 
 def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> F64:
@@ -146,7 +146,7 @@ def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
     """Return ``(N, 3)`` points beside a curve ``(N, 3+)`` of x, y, heading, at signed distances
     (left positive) along its normals.
     """
-    d = np.broadcast_to(np.asarray(offset_m, dtype=np.float64), (len(curve),))
+    d = np.broadcast_to(offset_m, (len(curve),))
     x = curve[:, 0] - d * np.sin(curve[:, 2])
     y = curve[:, 1] + d * np.cos(curve[:, 2])
     return np.column_stack([x, y, np.full(len(curve), z_m)])
@@ -166,16 +166,14 @@ class Path:
         """Length in the xy plane."""
         return float(self.s[-1])
 
-    def at(self, s_m: npt.ArrayLike, offset_m: npt.ArrayLike = 0.0) -> tuple[F64, F64]:
+    def at(self, s_m: float | F64, offset_m: float | F64 = 0.0) -> tuple[F64, F64]:
         """Return points ``(..., 3)`` and headings ``(...)`` at arc lengths, moved left by
         ``offset_m``; clamped to the ends.
         """
-        s = np.asarray(s_m, dtype=np.float64)
-        yaw = np.interp(s, self.s, self.yaw)
-        d = np.asarray(offset_m, dtype=np.float64)
-        x = np.interp(s, self.s, self.xyz[:, 0]) - d * np.sin(yaw)
-        y = np.interp(s, self.s, self.xyz[:, 1]) + d * np.cos(yaw)
-        return np.stack([x, y, np.interp(s, self.s, self.xyz[:, 2])], axis=-1), yaw
+        yaw = np.asarray(np.interp(s_m, self.s, self.yaw))
+        x = np.interp(s_m, self.s, self.xyz[:, 0]) - offset_m * np.sin(yaw)
+        y = np.interp(s_m, self.s, self.xyz[:, 1]) + offset_m * np.cos(yaw)
+        return np.stack([x, y, np.interp(s_m, self.s, self.xyz[:, 2])], axis=-1), yaw
 
     def project(self, xy: F64) -> tuple[F64, F64]:
         """Return arc length and signed distance (left positive) of points ``(M, 2)``.

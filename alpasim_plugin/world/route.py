@@ -69,7 +69,7 @@ class LaneIndex:
 
     def containing(self, point: F64) -> tuple[str, ...]:
         """Return the lanes whose polygon holds the point in plan view, its border included."""
-        return self.containing_many(np.asarray(point, dtype=np.float64)[None, :2])[0]
+        return self.containing_many(point[None, :2])[0]
 
     def containing_many(self, xy: F64) -> list[tuple[str, ...]]:
         """Return `containing` for each of ``(N, 2+)`` points at once."""
@@ -84,14 +84,14 @@ class LaneIndex:
         """Return the lanes that have a centre vertex within ``radius_m``."""
         if not self._kd:
             return ()
-        hits = self._kd[len(point)].query_ball_point(np.asarray(point, dtype=np.float64), radius_m)
+        hits = self._kd[len(point)].query_ball_point(point, radius_m)
         return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, dtype=np.int64)]))
 
     def heading_rad(self, lane_id: str, point: F64) -> float:
         """Return the driving direction of a lane at the place nearest to the point, in plan
         view.
         """
-        step, _, offset = _on_segments(self.lane_map.lanes[lane_id].centre, np.asarray(point)[:2])
+        step, _, offset = _on_segments(self.lane_map.lanes[lane_id].centre, point[:2])
         i = int(np.argmin(np.sum(offset * offset, axis=1)))
         return float(np.arctan2(step[i, 1], step[i, 0]))
 
@@ -126,7 +126,7 @@ class LaneIndex:
                 point.
         """
         line = self.lane_map.lanes[lane_id].centre
-        begin = 0.0 if start is None else project(line, np.asarray(start, dtype=np.float64))[0]
+        begin = 0.0 if start is None else project(line, start)[0]
         ids = [lane_id]
         rest = line[arc_lengths(line) > begin + 1e-9]
         parts = [np.concatenate([resample(line, [begin]), rest])]
@@ -198,7 +198,7 @@ def route_from_log(
             kept.append(i)
     if kept[-1] != len(xyz) - 1 and np.linalg.norm(xyz[-1, :2] - xyz[kept[-1], :2]) > 0.05:
         kept.append(len(xyz) - 1)
-    driven = np.asarray(xyz[kept], dtype=np.float64)
+    driven = xyz[kept]
     index = LaneIndex(lane_map)
     if len(driven) < 2:
         driven = np.concatenate([driven, driven])

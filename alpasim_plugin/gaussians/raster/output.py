@@ -45,13 +45,11 @@ class RasterOutput:
         """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the
         background shows through.
         """
-        return np.asarray(
-            cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE)), np.float32
-        )
+        return cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE))
 
     def to_uint8(self) -> npt.NDArray[np.uint8]:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""
-        return np.asarray(self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+        return (self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
 
 def background_image(background: Background, camera: PinholeCamera) -> F32:

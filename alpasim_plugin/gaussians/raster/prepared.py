@@ -108,13 +108,14 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     )  # numpy is slow along an axis of three
     # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are
     # never drawn.
-    means, reach = kept.means.astype(np.float64), geometry[:, GEO_REACH].astype(np.float64)
+    means = kept.means.astype(np.float64)
+    reach = geometry[:, GEO_REACH]
     return PreparedCloud(
         len(cloud),
         n,
         size,
         _in_lanes(means, np.nan),
-        np.asarray(_in_lanes(geometry, 0.0), np.float32),
+        _in_lanes(geometry, 0.0),
         sh,
         np.concatenate([index, np.zeros(-n % _LANES, np.int64)]).astype(np.int64),
         _bounding_spheres(means, reach, BUNDLE),
@@ -131,7 +132,7 @@ def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[Any
     return np.ascontiguousarray(padded.reshape(-1, _LANES, width).transpose(0, 2, 1)).reshape(-1)
 
 
-def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
+def _bounding_spheres(means: F64, reach: F32, bundle: int) -> F64:
     """Return centre and radius of the means and the largest scale of each ``bundle`` Gaussians in a
     row, flat.
     """

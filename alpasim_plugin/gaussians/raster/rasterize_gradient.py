@@ -109,7 +109,7 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     # bounding spheres worth a test.
     plain = np.zeros(groups * 3 * _LANES, np.float32)
     everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
-    index = np.arange(groups * _LANES, dtype=np.int64)
+    index = np.arange(groups * _LANES)
     workers = view.threads if n > WORTH_THREADS else 1
     part = (lane_means, geometry, plain, 1, index, everywhere, np.int64(0), view.pose)
     count = project_parts(workers, [part], view.numbers, records, ids)

@@ -102,7 +102,7 @@ def project_gaussians(
     m, n = np.moveaxis(
         jacobian @ T[:3, :3] @ cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :], 1, 0
     )
-    raw = np.stack([np.sum(m * m, axis=1), np.sum(m * n, axis=1), np.sum(n * n, axis=1)], axis=1)
+    raw = np.column_stack([np.sum(m * m, axis=1), np.sum(m * n, axis=1), np.sum(n * n, axis=1)])
     eps = cloud.antialias_px2 or EPS2D_PX2
     cov = raw + np.array([eps, 0.0, eps])
     raw_det = np.sum(np.cross(m, n) ** 2, axis=1)
@@ -110,7 +110,7 @@ def project_gaussians(
     if cloud.antialias_px2:
         opacity = opacity * np.sqrt(raw_det / det)
     extent = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
-    uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    uv = np.column_stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
     order = np.argsort(z.astype(np.float32), kind="stable")
     direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)

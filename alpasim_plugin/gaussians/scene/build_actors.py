@@ -117,7 +117,7 @@ def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     if cell_m > 0.3:
         return disc
     angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
-    rim = np.stack([np.cos(angle), np.zeros(10), np.sin(angle)], axis=1) * 0.74 * radius
+    rim = np.column_stack([np.cos(angle), np.zeros(10), np.sin(angle)]) * 0.74 * radius
     tyre = _blobs(
         (centre[:, None] + rim[None]).reshape(-1, 3), (0.19 * radius, 0.05, 0.19 * radius), TYRE_RGB
     )
@@ -130,7 +130,7 @@ def _blobs(
     means: npt.ArrayLike, scales: tuple[float, float, float], rgb: npt.ArrayLike
 ) -> GaussianCloud:
     """Return Gaussians of one size, colour and orientation along the box's axes."""
-    return cloud_of(np.asarray(means, dtype=np.float64), IDENTITY, scales, rgb)
+    return cloud_of(means, IDENTITY, scales, rgb)
 
 
 def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -167,7 +167,7 @@ def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> Gaus
 
 def _drawn(colours: F64, draw: float) -> F64:
     """Return the colour that a number 0..1 chooses."""
-    return np.asarray(colours[int(draw * len(colours))])
+    return colours[int(draw * len(colours))]
 
 
 def _person(
@@ -220,7 +220,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     bottom = -height / 2
     wheel_x = np.array([1.0, -1.0]) * (length / 2 - radius)
     angle = np.linspace(0, 2 * np.pi, 20 if cell_m < 0.3 else 8, endpoint=False)
-    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1) * radius
+    ring = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)]) * radius
     centres = np.array([[x, 0.0, bottom + radius] for x in wheel_x])
     at = (centres[:, None] + ring[None]).reshape(-1, 3)
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5

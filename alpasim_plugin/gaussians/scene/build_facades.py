@@ -1,8 +1,8 @@
 """Build houses along the road: extruded boxes whose walls carry windows, doors and shop fronts.
 
-A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels use coarser
-patterns with the same mean look. Windows are cells, not holes: what an image shows of a facade at
-street distances is colour and rhythm.
+A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels are averages
+of it. Windows are cells, not holes: what an image shows of a facade at street distances is colour
+and rhythm.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ from alpasim_plugin.core.types import F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, contours, to_pixels
-from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quats_along
+from alpasim_plugin.gaussians.scene.surfels import (
+    SPREAD,
+    cell_counts,
+    cloud_of,
+    grid_cells,
+    quats_along,
+)
 
 SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not
 WITHIN_M = 75.0
@@ -26,17 +32,20 @@ FLOOR_M, BAY_M = 3.1, 3.0
 WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
-CELLS = (
-    (12, 0.25),
-    (6, 0.32),
-    (3, 0.9),
-    (1, 2.6),
-)  # cells per bay, and the cell size at which the level is chosen
+# Cells per bay and floor, and the cell size at which the level is chosen. Each level is the average
+# of the first.
+CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))
 
 WALLS = np.array(
     [
-        *([0.55, 0.30, 0.24], [0.63, 0.42, 0.33], [0.74, 0.68, 0.57], [0.80, 0.77, 0.72]),
-        *([0.58, 0.58, 0.58], [0.66, 0.60, 0.50], [0.47, 0.50, 0.54], [0.70, 0.52, 0.36]),
+        [0.55, 0.30, 0.24],
+        [0.63, 0.42, 0.33],
+        [0.74, 0.68, 0.57],
+        [0.80, 0.77, 0.72],
+        [0.58, 0.58, 0.58],
+        [0.66, 0.60, 0.50],
+        [0.47, 0.50, 0.54],
+        [0.70, 0.52, 0.36],
     ]
 )
 GLASS = np.array([[0.16, 0.20, 0.26], [0.24, 0.31, 0.38], [0.36, 0.45, 0.52], [0.58, 0.55, 0.42]])
@@ -91,14 +100,12 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
     owner = np.tile(np.arange(m), 4)
     is_front = np.arange(4 * m) < m
     base = np.minimum(site.world(starts)[:, 2], site.world(ends)[:, 2])
-    top = (base[:m] + houses.height_m)[
-        owner
-    ]  # on a slope the walls differ in height, the roof is level
+    # On a slope the walls differ in height, the roof is level.
+    top = (base[:m] + houses.height_m)[owner]
     seed = int(rng.integers(1 << 30))
     walls = _Walls(starts, ends, base, top - base, owner, is_front)
     levels = []
-    for cells, cell_m in CELLS:
-        cloud, wall = _walls(site, walls, style, cells, seed)
+    for (cells, cell_m), (cloud, wall) in zip(CELLS, _walls(site, walls, style, seed), strict=True):
         roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells > 3 else 3.0)
         levels.append(
             (cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house]))
@@ -160,85 +167,69 @@ def _claim(free: U8, ring: F64, site: Site) -> bool:
 
 
 def _walls(
-    site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells: int, seed: int
-) -> tuple[GaussianCloud, I64]:
-    """Cover walls with ``cells x cells`` Gaussians per bay and floor; returns the cloud and each
-    Gaussian's wall.
+    site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], seed: int
+) -> list[tuple[GaussianCloud, I64]]:
+    """Cover walls with Gaussians at each level of `CELLS`, and return clouds and each Gaussian's
+    wall.
     """
     starts, ends, base, height, owner, is_front = walls
     length = np.linalg.norm(ends - starts, axis=1)
-    bays = np.maximum(np.round(length / BAY_M), 1).astype(np.int64)
-    floors = np.maximum(np.round(height / FLOOR_M), 1).astype(np.int64)
-    wall, u, v = grid_cells(bays * cells, floors * cells)
-    nu, nv = (bays * cells)[wall], (floors * cells)[wall]
-    iu, iv = np.floor(u * nu).astype(np.int64), np.floor(v * nv).astype(np.int64)
-    (bay, cu), (floor, cv) = np.divmod(iu, cells), np.divmod(iv, cells)
-    house = owner[wall]
-    # One number per window, the same at every level of detail.
+    bays, floors = cell_counts(length, BAY_M), cell_counts(height, FLOOR_M)
+    finest = CELLS[0][0]
+    wall, u, v = grid_cells(bays * finest, floors * finest)
+    column = (u * (bays * finest)[wall]).astype(np.int64)
+    row = (v * (floors * finest)[wall]).astype(np.int64)
+    bay, floor = column // finest, row // finest
+    fu, fv = (column % finest + 0.5) / finest, (row % finest + 0.5) / finest
+    house, front = owner[wall], is_front[wall]
+    # One number per window.
     key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
     pick = (key * 48_271 % 2_147_483_647) / 2_147_483_647
     glass = GLASS[np.minimum((pick * pick * 4).astype(np.int64), 3)]
-    wide = style["wide"][house]
-    fu, fv = (cu + 0.5) / cells, (cv + 0.5) / cells
-    first = np.where(wide, 0.17, 0.33)
-    front = is_front[wall]
+    first = np.where(style["wide"][house], 0.17, 0.33)
+    in_window = (fu > first) & (fu < 0.83)
     shop = (floor == 0) & front & style["shop"][house]
     entrance = (floor == 0) & front & ~style["shop"][house] & (bay == bays[wall] // 2)
-    sill = door = np.zeros(len(wall), dtype=bool)
-    if cells >= 6:
-        share = ((fu > first) & (fu < 0.83) & (fv > 0.33) & (fv < 0.83)).astype(np.float64)
-        sill = (fu > first) & (fu < 0.83) & (fv > 0.17) & (fv < 0.33)
-        band, door = (
-            shop & (fv > 0.66) & (fv < 0.83),
-            entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66),
-        )
-        if cells > 6:  # glazing bars and a thinner sill
-            bar = (np.abs(fu - (first + 0.83) / 2) < 0.04) | (np.abs(fv - 0.62) < 0.04)
-            share *= np.where(bar, 0.55, 1.0)
-            sill &= fv > 0.25
-    elif cells == 3:
-        share = np.where(
-            cu == 1,
-            np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)),
-            np.where(wide & (cv == 1), 0.3, 0.0),
-        )
-        band = shop & (cv == 2)
-        door = entrance & (cu == 1) & (cv <= 1)
-    else:
-        share = np.where(wide, 0.33, 0.25)
-        band = shop
+    sill = in_window & (fv > 0.25) & (fv < 0.33) & front
+    awning = shop & (fv > 0.66) & (fv < 0.83)
+    door = entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66)
+    glazing_bar = (np.abs(fu - (first + 0.83) / 2) < 0.04) | (np.abs(fv - 0.62) < 0.04)
+    share = np.where(in_window & (fv > 0.33) & (fv < 0.83), np.where(glazing_bar, 0.55, 1.0), 0.0)
     # Walls away from the street have fewer windows.
     share = np.where(front, share, 0.6 * share * (bay % 2 == 0))
-    shop_share = ((fu > 0.12) & (fv < 0.66)) * 1.0 if cells >= 6 else np.where(cv <= 1, 0.75, 0.0)
-    share = np.where(shop, shop_share, share)
+    share = np.where(shop, (fu > 0.12) & (fv < 0.66), share)
     shade = np.where(front, 1.0, 0.80) * (0.86 + 0.14 * np.clip(v * 2.5, 0, 1))
     texture = site.scenario.environment.texture
-    # The same hash by place gives every level the wall's large stains; the fine grain belongs to
-    # the finest level.
-    grain = (
-        site.rng(f"facade-grain-{cells}").standard_normal(len(wall))
-        * (0.035 if cells >= 6 else 0.015)
-        * texture
-    )
+    grain = 0.035 * texture * site.rng("facade-grain").standard_normal(len(wall))
     rgb = style["wall"][house] * (shade + grain)[:, None]
-    trim = sill & front
-    rgb[trim] = style["trim"][house[trim]] * shade[trim, None]
-    cornice = (iv == nv - 1) & (cells > 1)
-    rgb[cornice] = style["trim"][house[cornice]] * 0.92 * shade[cornice, None]
-    rgb = rgb + share[:, None] * (glass * np.where(front, 1.0, 0.85)[:, None] - rgb)
-    awning = style["awning"][house[band]]
-    rgb[band] = 0.5 * rgb[band] + 0.5 * awning if cells == 1 else awning
+    trim = style["trim"][house] * shade[:, None]
+    rgb[sill] = trim[sill]
+    cornice = row == (floors * finest)[wall] - 1
+    rgb[cornice] = 0.92 * trim[cornice]
+    rgb += share[:, None] * (glass * np.where(front, 1.0, 0.85)[:, None] - rgb)
+    rgb[awning] = style["awning"][house[awning]]
     rgb[door] = style["awning"][house[door]] * 0.6
 
-    plan = starts[wall] + u[:, None] * (ends - starts)[wall]
-    z = base[wall] - 0.2 + v * (height[wall] + 0.2)
-    means = np.column_stack([site.frame.to_world(plan), z])
-    scales = (
-        SPREAD * length[wall] / nu,
-        np.full(len(wall), 0.05),
-        SPREAD * (height[wall] + 0.2) / nv,
-    )
-    return cloud_of(means, _facing(site, starts, ends)[wall], np.stack(scales, axis=1), rgb), wall
+    levels = []
+    quats = _facing(site, starts, ends)
+    for cells, _ in CELLS:
+        across, up = bays * cells, floors * cells
+        begin = np.cumsum(across * up) - across * up
+        block = finest // cells
+        cell = begin[wall] + row // block * across[wall] + column // block
+        mean = np.column_stack([np.bincount(cell, channel) for channel in rgb.T]) / block**2
+        covered, u, v = grid_cells(across, up)
+        plan = starts[covered] + u[:, None] * (ends - starts)[covered]
+        z = base[covered] - 0.2 + v * (height[covered] + 0.2)
+        scales = (
+            SPREAD * (length / across)[covered],
+            np.full(len(covered), 0.05),
+            SPREAD * ((height + 0.2) / up)[covered],
+        )
+        means = np.column_stack([site.frame.to_world(plan), z])
+        cloud = cloud_of(means, quats[covered], np.column_stack(scales), mean)
+        levels.append((cloud, covered))
+    return levels
 
 
 def _facing(site: Site, start: F64, end: F64) -> F64:
@@ -253,7 +244,7 @@ def _roofs(
     """Cover the flat roofs, so that a house seen from above or afar is closed."""
     a, b = houses.front[:, 0], houses.front[:, 1]
     length = np.linalg.norm(b - a, axis=1)
-    n_u = np.maximum(np.round(length / cell_m / 2), 1).astype(np.int64)
+    n_u = cell_counts(length, 2 * cell_m)
     n_v = np.full(len(a), max(1, round(DEPTH_M / cell_m / 2)), dtype=np.int64)
     house, u, v = grid_cells(n_u, n_v)
     plan = a[house] + u[:, None] * (b - a)[house] + v[:, None] * DEPTH_M * houses.away[house]
@@ -265,4 +256,4 @@ def _roofs(
     )
     means = np.column_stack([xy, (base + houses.height_m)[house] - 0.05])
     quats = _facing(site, a, b)[house]
-    return cloud_of(means, quats, np.stack(scales, axis=1), 0.55 * wall_rgb[house]), house
+    return cloud_of(means, quats, np.column_stack(scales), 0.55 * wall_rgb[house]), house

@@ -14,6 +14,7 @@ distance as the cells do.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, left_o
 from alpasim_plugin.gaussians.scene.surfels import (
     SPREAD,
     THICKNESS,
+    cell_counts,
     cloud_of,
     grid_cells,
     quats_along,
@@ -165,27 +167,23 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
     return total
 
 
-def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
+def _verge(site: Site, off: F32, grain: F32, texture: float) -> F64:
     """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then
     forecourt or grass.
     """
-    sorts = [(GRASS, 0.20), (GRAVEL, 0.08)]
-    sort = (off < 1.0).astype(np.intp)
+    colour, contrast = np.tile(GRASS, (len(off), 1)), np.full(len(off), 0.20)
+    if site.highway:
+        zones = [(1.0, GRAVEL, 0.08)]
+    else:
+        has_forecourt = site.scenario.environment.buildings > 0.5
+        zones = [(FORECOURT_M, FORECOURT, 0.08)] if has_forecourt else []
+        zones.append((PAVEMENT_M, PAVEMENT, 0.06))
+    for reach_m, zone_rgb, zone_contrast in zones:
+        colour[off < reach_m], contrast[off < reach_m] = zone_rgb, zone_contrast
+    rgb = colour * (1 + texture * contrast * grain)[:, None]
     if not site.highway:
-        sorts[1:] = (
-            (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20),
-            (PAVEMENT, 0.06),
-        )
-        sort = (off < FORECOURT_M).astype(np.intp) + (off < PAVEMENT_M)
-    colours, contrast = (
-        np.array(column, dtype=np.float32)
-        for column in zip(*((c, k * texture) for c, k in sorts), strict=True)
-    )
-    rgb = colours[sort] * (1 + contrast[sort] * grain)[:, None]
-    if not site.highway:
-        joint = (np.abs(off - 1.3) < 0.07) & (off < PAVEMENT_M)
-        rgb[joint] = np.float32(0.85) * rgb[joint]
-    return np.asarray(rgb)
+        rgb[np.abs(off - 1.3) < 0.07] *= 0.85
+    return rgb
 
 
 def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
@@ -238,9 +236,7 @@ def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
     for _ in range(max(3, len(path) // 6)):
         start = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, 14))
-        line = start + np.cumsum(
-            0.35 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0
-        )
+        line = start + np.cumsum(0.35 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
         cv2.polylines(
             dark,
             [to_pixels(line, low, cell_m)],
@@ -343,82 +339,52 @@ def _ground_nodes(
     floors: tuple[int, ...],
     keep_inside: bool,
 ) -> list[SceneNode]:
-    means = _pyramid(image.rgb)
-    heights = _pyramid(image.height[:, :, None])
+    averages = _pyramid(np.dstack([image.rgb, image.height]))
     levels = []
     for floor in floors:
         parts = []
-        wanted = np.maximum(image.level, floor)
-        for k, leaf in enumerate(_leaves(wanted, floor)):
-            if leaf is None or not leaf.any():
-                continue
+        for k, leaf in enumerate(_leaves(np.maximum(image.level, floor))):
             i, j = np.nonzero(leaf)
             size = image.cell_m * (1 << k)
-            plan = image.low + np.stack([(j + 0.5) * size, (i + 0.5) * size], axis=1)
+            plan = image.low + np.column_stack([(j + 0.5) * size, (i + 0.5) * size])
             t = np.floor((plan - site.low) / TILE_M).astype(np.int64)
             inside = fine_tiles[
                 np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1),
                 np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1),
             ]
-            keep = inside if keep_inside else ~inside
-            parts.append(
-                (
-                    plan[keep],
-                    np.full(int(keep.sum()), size),
-                    means[k][i, j][keep],
-                    heights[k][i, j, 0][keep].astype(np.float64),
-                )
-            )
-        if not parts:
-            continue
-        plan, size_m, rgb, above = (np.concatenate(c) for c in zip(*parts, strict=True))
-        cloud = _flat(
-            site, plan, size_m, rgb, np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0))
-        )
+            keep = inside == keep_inside
+            parts.append((plan[keep], np.full(keep.sum(), size), averages[k][i, j][keep]))
+        plan, size_m, painted = (np.concatenate(column) for column in zip(*parts, strict=True))
+        above = painted[:, 3]
+        height_m = np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0))
+        cloud = _flat(site, plan, size_m, painted[:, :3], height_m)
         levels.append((image.cell_m * (1 << floor), cloud, tile_numbers(plan - site.low, tile_m)))
     return nodes_by_tile(name, levels)
 
 
 def _pyramid(image: F32) -> list[F32]:
-    """Return the image and its averages over squares of 2, 4, ... cells."""
+    """Return an image ``(H, W, C)`` and its averages over squares of 2, 4, ... cells."""
     out = [image]
     for _ in range(MAX_LEVEL):
-        h, w, c = out[-1].shape
-        if h % 2 or w % 2:
-            break
-        if c == 1:
-            out.append(np.asarray(out[-1].reshape(h // 2, 2, w // 2, 2, c).mean(axis=(1, 3))))
-            continue
-        rows, below = out[-1][0::2], out[-1][1::2]
-        # The same sum in the same order, of whole images: numpy is slow along two axes.
-        out.append(
-            np.float32(0.25) * (rows[:, 0::2] + rows[:, 1::2] + below[:, 0::2] + below[:, 1::2])
-        )
+        height, width = out[-1].shape[:2]
+        size = (width // 2, height // 2)
+        out.append(cv2.resize(out[-1], size, interpolation=cv2.INTER_AREA))
     return out
 
 
-def _leaves(level: I64, floor: int) -> list[Bool | None]:
+def _leaves(level: I64) -> list[Bool]:
     """Return per quadtree level which squares are leaves: the largest ones in which no cell needs a
     smaller square.
     """
-    can: list[Bool] = []
-    least = level
+    can = []
     for k in range(MAX_LEVEL + 1):
-        can.append(np.asarray(least >= k))
-        h, w = least.shape
-        if h % 2 or w % 2:
-            break
-        least = np.minimum(least[0::2], least[1::2])
-        least = np.minimum(least[:, 0::2], least[:, 1::2])
-    leaves: list[Bool | None] = []
-    for k, mask in enumerate(can):
-        if k < floor:
-            leaves.append(None)
-            continue
-        if k + 1 < len(can):
-            mask = mask & ~np.repeat(np.repeat(can[k + 1], 2, axis=0), 2, axis=1)
-        leaves.append(mask)
-    return leaves
+        can.append(level >= k)
+        level = np.minimum(level[0::2], level[1::2])
+        level = np.minimum(level[:, 0::2], level[:, 1::2])
+    leaves = [
+        mask & ~np.repeat(np.repeat(larger, 2, axis=0), 2, axis=1) for mask, larger in pairwise(can)
+    ]
+    return [*leaves, can[-1]]
 
 
 def _flat(
@@ -428,9 +394,7 @@ def _flat(
     means, normals = _on_ground(site, plan, above_m)
     quats = upright_quats(normals, site.frame.yaw_rad)
     s = SPREAD * size_m
-    return cloud_of(
-        means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb.astype(np.float64)
-    )
+    return cloud_of(means, quats, np.column_stack([s, s, THICKNESS * size_m]), rgb)
 
 
 def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
@@ -442,7 +406,7 @@ def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
     east, north = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     dx = site.height_at(xy + east) - site.height_at(xy - east)
     dy = site.height_at(xy + north) - site.height_at(xy - north)
-    normals = np.stack([-dx / 2, -dy / 2, np.ones_like(z)], axis=1)
+    normals = np.column_stack([-dx / 2, -dy / 2, np.ones_like(z)])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return np.column_stack([xy, z + above_m]), normals
 
@@ -459,8 +423,8 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
     direction = unit(strokes.end - strokes.start)
     levels = []
     for cell_m, link_m, across_m in ((0.125, 0.19, 0.15), (0.3, 0.75, 0.25), (0.8, 1.5, 0.5)):
-        n_u = np.maximum(np.round(length / link_m), 1).astype(np.int64)
-        n_v = np.maximum(np.round(strokes.width_m / across_m), 1).astype(np.int64)
+        n_u = cell_counts(length, link_m)
+        n_v = cell_counts(strokes.width_m, across_m)
         owner, u, v = grid_cells(n_u, n_v)
         along = direction[owner]
         left = left_of(along)
@@ -479,9 +443,7 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
         # A lone row is half as strong at its own edge (sigma 0.42 of the width); rows side by side
         # must close the gap between them.
         across = np.where(single, 0.42, SPREAD) * (strokes.width_m / n_v)[owner]
-        scales = np.stack(
-            [0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1
-        )
+        scales = np.column_stack([0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)])
         levels.append(
             (
                 cell_m,

@@ -16,6 +16,7 @@ from alpasim_plugin.gaussians.scene.site import CELL_M, Roadside, Site, contours
 from alpasim_plugin.gaussians.scene.surfels import (
     IDENTITY,
     SPREAD,
+    cell_counts,
     cloud_of,
     quad_surfels,
     quats_along,
@@ -184,16 +185,14 @@ def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
     """Return which places are off the road by ``clear_m``, not on actors' ground and outside
     houses.
     """
-    free = (site.look_up(site.off_road_m, at).astype(np.float64) >= clear_m) & ~site.look_up(
-        site.taken, at
-    ).astype(bool)
+    free = (site.look_up(site.off_road_m, at) >= clear_m) & ~site.look_up(site.taken, at)
     for front, away in zip(houses.front, houses.away, strict=True):
         d = at - front.mean(axis=0)
         half = np.linalg.norm(front[1] - front[0]) / 2
         along = np.array([-away[1], away[0]])
         depth = d @ away
         free &= ~((np.abs(d @ along) < half + 0.8) & (depth > -0.9) & (depth < DEPTH_M + 1.0))
-    return np.asarray(free)
+    return free
 
 
 class LampPosts(NamedTuple):
@@ -241,7 +240,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     items: list[Item] = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         poles = rods(start, end, 0.085, POLE_RGB, step)
-        links = np.maximum(np.round(np.linalg.norm(end - start, axis=1) / step), 1).astype(np.int64)
+        links = cell_counts(np.linalg.norm(end - start, axis=1), step)
         piece = np.repeat(np.arange(len(start)), links)
         lamp = cloud_of(tip, IDENTITY, (0.22, 0.22, 0.07), (0.85, 0.85, 0.80))
         items.append(

@@ -79,4 +79,4 @@ class SkyMask:
             flags=flags,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        return np.asarray(warped, dtype=np.float32)
+        return warped

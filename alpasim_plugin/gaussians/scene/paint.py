@@ -140,5 +140,4 @@ def _zebra(ring: F64) -> Strokes:
 
 def _strokes(start: F64, end: F64, width_m: float, colour: int) -> Strokes:
     n = len(start)
-    ends = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    return Strokes(*ends, np.full(n, width_m), np.full(n, colour, dtype=np.int64))
+    return Strokes(start, end, np.full(n, width_m), np.full(n, colour))

@@ -214,7 +214,7 @@ class SceneGraph:
         present = [name for name in self.actors if name in actor_poses]
         if present:
             index = [self._actor_index[name] for name in present]
-            poses = np.stack([np.asarray(actor_poses[name], dtype=np.float64) for name in present])
+            poses = np.stack([actor_poses[name] for name in present])
             centre = (
                 np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index])
                 + poses[:, :3, 3]
@@ -266,7 +266,7 @@ def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
         ((camera.height - camera.cy) / camera.fy, y, -1.0),
     ):
         seen &= sign * coordinate + slope * z > -radius * np.hypot(1.0, slope)
-    return np.asarray(seen)
+    return seen
 
 
 def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:

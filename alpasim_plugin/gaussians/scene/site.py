@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,13 +46,13 @@ class GroundFrame:
         """Map world points ``(N, 2+)`` to ground coordinates ``(N, 2)``."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         d = np.asarray(xy, dtype=np.float64)[:, :2] - self.origin_xy
-        return np.stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]], axis=1)
+        return np.column_stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]])
 
     def to_world(self, plan: F64) -> F64:
         """Map ground coordinates ``(N, 2)`` to world points ``(N, 2)``."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         x, y = plan[:, 0], plan[:, 1]
-        return np.stack([c * x - s * y, s * x + c * y], axis=1) + self.origin_xy
+        return np.column_stack([c * x - s * y, s * x + c * y]) + self.origin_xy
 
     def turned(self, plan: F64) -> F64:
         """Turn ground directions ``(N, 2)`` to level world directions ``(N, 3)``."""
@@ -113,7 +113,7 @@ class Site:
         """Return ground points ``(N, 2)`` as fixed-point pixels for OpenCV's drawing functions."""
         return to_pixels(plan, self.low, CELL_M)
 
-    def look_up(self, raster: npt.NDArray[np.generic], plan: F64) -> npt.NDArray[np.generic]:
+    def look_up(self, raster: npt.NDArray[Any], plan: F64) -> npt.NDArray[Any]:
         """Return the raster's values ``(N,)`` at ground points ``(N, 2)``; points outside take the
         border's value.
         """
@@ -155,7 +155,7 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
         if np.hypot(*chord) > 5.0
         else 2 * np.arctan2(heading[3], heading[0])
     )
-    frame = GroundFrame(path_world[0, :2].astype(np.float64), float(yaw))
+    frame = GroundFrame(path_world[0, :2], float(yaw))
     path = frame.to_ground(path_world)
     low = np.floor(path.min(axis=0) - REACH_M)
     size = np.ceil((path.max(axis=0) + REACH_M - low) / CELL_M).astype(int)
@@ -289,8 +289,8 @@ def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
         plan = site.low + (pixels + 0.5) * CELL_M
         wrapped = np.concatenate([plan[-SMOOTH:], plan, plan[:SMOOTH]])
         kernel = np.ones(SMOOTH) / SMOOTH
-        smooth = np.stack(
-            [np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)], axis=1
+        smooth = np.column_stack(
+            [np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)]
         )[SMOOTH:-SMOOTH]
         h, w = mask.shape
         inner = (
@@ -319,9 +319,7 @@ def _road_on_left(site: Site, line: F64) -> F64:
     d = np.gradient(line, axis=0)
     left = left_of(unit(d))
     signed = site.off_road_m - site.inside_m
-    nearer = site.look_up(signed, line + left).astype(np.float64) < site.look_up(
-        signed, line - left
-    ).astype(np.float64)
+    nearer = site.look_up(signed, line + left) < site.look_up(signed, line - left)
     return line if np.mean(nearer) >= 0.5 else line[::-1].copy()
 
 
@@ -341,4 +339,4 @@ def unit(vectors: F64) -> F64:
 
 def left_of(along: F64) -> F64:
     """Return rows ``(N, 2)`` turned to the left by a right angle."""
-    return np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return np.column_stack([-along[:, 1], along[:, 0]])

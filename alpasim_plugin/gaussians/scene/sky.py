@@ -103,7 +103,7 @@ def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
         grid.astype(np.float32), (STEP_PX * columns, STEP_PX * rows), interpolation=cv2.INTER_LINEAR
     )
     first = STEP_PX // 2  # it takes the values for those of the middles of squares
-    return np.asarray(finer[first : first + height, first : first + width])
+    return finer[first : first + height, first : first + width]
 
 
 def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
@@ -161,7 +161,4 @@ def _periodic_noise(
     at_y = np.broadcast_to(
         (np.arange(height, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (height, WIDTH)
     )
-    return np.asarray(
-        cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC),
-        dtype=np.float64,
-    )
+    return cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC)

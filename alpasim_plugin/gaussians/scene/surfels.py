@@ -7,6 +7,7 @@ while the outline stays within a quarter of a cell of the true edge.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)  # a quaternion along the axes
 
 
 def cloud_of(
-    means: F64,
+    means: npt.ArrayLike,
     quats: npt.ArrayLike,
     scales: npt.ArrayLike,
     rgb: npt.ArrayLike,
@@ -39,10 +40,11 @@ def cloud_of(
         rgb: ``(N, 3)`` 0..1.
         opacity: ``(N,)``.
     """
-    n = len(means)
+    centres = np.asarray(means, dtype=np.float64)
+    n = len(centres)
     colours = np.clip(np.broadcast_to(rgb, (n, 3)), 0.0, 1.0)
     return GaussianCloud(
-        np.asarray(means, dtype=np.float64),
+        centres,
         np.array(np.broadcast_to(quats, (n, 4)), dtype=np.float32),
         np.array(np.broadcast_to(scales, (n, 3)), dtype=np.float32),
         np.array(np.broadcast_to(opacity, (n,)), dtype=np.float32),
@@ -51,7 +53,7 @@ def cloud_of(
 
 
 def with_sheen(
-    cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.ArrayLike
+    cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: Sequence[float]
 ) -> GaussianCloud:
     """Return the cloud with first-degree colour: surfaces seen at a glancing angle show more of the
     sky.
@@ -65,7 +67,7 @@ def with_sheen(
         strength: ``(N,)``, 0 for matt.
         sky_rgb: Colour that is mirrored.
     """
-    add = strength[:, None] * np.asarray(sky_rgb, dtype=np.float64)[None, :]  # (N, 3)
+    add = np.outer(strength, sky_rgb)  # (N, 3)
     sh = np.zeros((len(cloud), 4, 3), dtype=np.float32)
     sh[:, 0] = cloud.sh[:, 0] + dc_from_rgb(0.5 + add)
     for k, axis, sign in ((1, 1, -1.0), (2, 2, 1.0), (3, 0, -1.0)):
@@ -78,7 +80,7 @@ def upright_quats(normals: F64, yaw_rad: npt.ArrayLike) -> F64:
     after turning it by a heading.
     """
     nx, ny, nz = normals.T
-    tilt = np.stack([1 + nz, -ny, nx, np.zeros_like(nz)], axis=-1)
+    tilt = np.column_stack([1 + nz, -ny, nx, np.zeros_like(nz)])
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     return quat_multiply(tilt, np.broadcast_to(quat_from_yaw(yaw_rad), tilt.shape))
 
@@ -88,11 +90,16 @@ def quats_along(direction: F64, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> F64:
     to ``up`` as can be.
     """
     x = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
-    ups = np.broadcast_to(np.asarray(up, dtype=np.float64), x.shape)
+    ups = np.broadcast_to(up, x.shape)
     steep = np.abs(np.sum(x * ups, axis=1, keepdims=True)) > 0.99
     y = np.cross(np.where(steep, np.array([1.0, 0.0, 0.0]), ups), x)
     y /= np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-12)
     return quat_from_matrix(np.stack([x, y, np.cross(x, y)], axis=-1))
+
+
+def cell_counts(length_m: F64, cell_m: float | F64) -> I64:
+    """Return how many cells of a size cover lengths, at least one each."""
+    return np.maximum(np.round(length_m / cell_m), 1).astype(np.int64)
 
 
 def grid_cells(n_u: I64, n_v: I64) -> tuple[I64, F64, F64]:
@@ -113,7 +120,7 @@ def grid_cells(n_u: I64, n_v: I64) -> tuple[I64, F64, F64]:
 
 
 def quad_surfels(
-    corners: F64, rgb: F64, cell_m: npt.ArrayLike, noise: F64 | None = None, spread: float = SPREAD
+    corners: F64, rgb: F64, cell_m: float | F64, noise: F64 | None = None, spread: float = SPREAD
 ) -> tuple[GaussianCloud, I64, F64]:
     """Cover quadrilaterals with flat Gaussians.
 
@@ -131,20 +138,18 @@ def quad_surfels(
         The cloud, each Gaussian's quadrilateral ``(N,)``, and each quadrilateral's normal ``(M,
         3)``.
     """
-    c = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 3)
-    cell = np.broadcast_to(np.asarray(cell_m, dtype=np.float64), (len(c),))
+    c = corners.reshape(-1, 4, 3)
     edge_u = (c[:, 1] - c[:, 0] + c[:, 2] - c[:, 3]) / 2
     edge_v = (c[:, 3] - c[:, 0] + c[:, 2] - c[:, 1]) / 2
     len_u, len_v = np.linalg.norm(edge_u, axis=1), np.linalg.norm(edge_v, axis=1)
-    n_u = np.maximum(np.round(len_u / cell), 1).astype(np.int64)
-    n_v = np.maximum(np.round(len_v / cell), 1).astype(np.int64)
+    n_u, n_v = cell_counts(len_u, cell_m), cell_counts(len_v, cell_m)
     x = edge_u / np.maximum(len_u, 1e-9)[:, None]
     normal = np.cross(edge_u, edge_v)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     quats = quat_from_matrix(np.stack([x, np.cross(normal, x), normal], axis=-1))
     size_u, size_v = len_u / n_u, len_v / n_v
-    scales = np.stack(
-        [spread * size_u, spread * size_v, THICKNESS * np.minimum(size_u, size_v) + 0.004], axis=1
+    scales = np.column_stack(
+        [spread * size_u, spread * size_v, THICKNESS * np.minimum(size_u, size_v) + 0.004]
     )
     owner, u, v = grid_cells(n_u, n_v)
     u, v = u[:, None], v[:, None]
@@ -152,7 +157,7 @@ def quad_surfels(
     means = (corner[:, 0] * (1 - u) + corner[:, 1] * u) * (1 - v) + (
         corner[:, 3] * (1 - u) + corner[:, 2] * u
     ) * v
-    colour = np.asarray(rgb, dtype=np.float64)[owner]
+    colour = rgb[owner]
     if noise is not None:
         colour = colour * (1 + 0.025 * np.resize(noise, len(owner))[:, None])
     return cloud_of(means, quats[owner], scales[owner], colour), owner, normal
@@ -171,10 +176,10 @@ def rods(
         step_m: Length of one link.
     """
     length = np.linalg.norm(end - start, axis=1)
-    n = np.maximum(np.round(length / step_m), 1).astype(np.int64)
+    n = cell_counts(length, step_m)
     owner, s, _ = grid_cells(n, np.ones_like(n))
-    radius = 0.75 * np.broadcast_to(np.asarray(radius_m, dtype=np.float64), (len(n),))[owner]
+    radius = 0.75 * np.broadcast_to(radius_m, (len(n),))[owner]
     along = (end - start)[owner]
-    scales = np.stack([SPREAD * (length / n)[owner], radius, radius], axis=1)
-    colours = np.broadcast_to(np.asarray(rgb, dtype=np.float64), (len(n), 3))[owner]
+    scales = np.column_stack([SPREAD * (length / n)[owner], radius, radius])
+    colours = np.broadcast_to(rgb, (len(n), 3))[owner]
     return cloud_of(start[owner] + s[:, None] * along, quats_along(along), scales, colours)
