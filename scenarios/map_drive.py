@@ -6,6 +6,7 @@ Only the part of the map around the route enters the scene.
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from alpasim_plugin.world.signals import lights_on
 from scenarios.expert import ExpertStyle, drive
 from scenarios.map_lines import ground_of
 from scenarios.map_route import LaneGraph, Spot, Way
+from scenarios.map_traffic import place_followers, vehicles
 from scenarios.opendrive import bordered, read_lanes
 from scenarios.opendrive_road import (
     OdrMap,
@@ -32,7 +34,7 @@ from scenarios.opendrive_road import (
     road_points,
     sided,
 )
-from scenarios.opendrive_signals import GREEN_S, Head, traffic_lights, with_cycles
+from scenarios.opendrive_signals import CYCLE, GREEN_S, Head, traffic_lights, with_cycles
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
 from scenarios.variation import Drawn
@@ -89,7 +91,9 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     end_us = round(LONGEST_S * 1e6)
     if duration_us is not None:
         end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
-    run = drive(driven, 0.0, vehicle, style, (), (), end_us, lane_map.signals)
+    rng = stream(drawn.scene_id, spec.seed, "scenario/map/vehicles")
+    followers = place_followers(LaneGraph(near), way, line, spec.map.vehicles, rng)
+    run = drive(driven, 0.0, vehicle, style, (), followers, end_us, lane_map.signals)
     return RecordedLog(
         drawn.scene_id,
         "opendrive",
@@ -97,11 +101,11 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         ground_of(lane_map, run.ego_log.xyz),
         run.ego_log,
         vehicle,
-        (),
+        vehicles(followers, run.followers),
         (),
         tuple(float(x) for x in origin),
         files.content_hash,
-        (*_said(odr, way, line, goal_m), *notes, *light_notes),
+        (*_said(odr, way, goal_m, heads, len(followers)), *notes, *light_notes),
         route=Route(line.xyz[::4], way.lane_ids),
     )
 
@@ -127,7 +131,7 @@ def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, odr: OdrMap, T_local_map
     best: Way | None = None
     longest_m = 0.0
     for _ in range(DRAWS):
-        begin = starts or [_drawn_spot(graph, rng)]
+        begin = starts or [graph.drawn_spot(rng)]
         if goals is not None:
             way = graph.between(begin, goals)
             if way is not None:
@@ -151,15 +155,6 @@ def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, odr: OdrMap, T_local_map
             "name map.route.from and map.route.to, or use a map with longer lanes",
         )
     return best
-
-
-def _drawn_spot(graph: LaneGraph, rng: np.random.Generator) -> Spot:
-    """Draw a place, lanes by their length, outside of junctions."""
-    open_lanes = [key for key, lane in graph.lanes.items() if not lane.is_intersection]
-    keys = open_lanes or list(graph.lanes)
-    lengths = np.array([graph.length_m[key] for key in keys])
-    key = keys[int(rng.choice(len(keys), p=lengths / lengths.sum()))]
-    return Spot(key, float(rng.uniform(0.0, graph.length_m[key])))
 
 
 def _spots(text: str, graph: LaneGraph, odr: OdrMap, T_local_map: F64) -> list[Spot]:
@@ -234,5 +229,22 @@ def _timed(
     return with_cycles(heads, begins_us)
 
 
-def _said(odr: OdrMap, way: Way, line: Path, goal_m: float) -> tuple[str, ...]:
-    return ()
+def _said(
+    odr: OdrMap, way: Way, goal_m: float, heads: Sequence[Head], vehicles: int
+) -> tuple[str, ...]:
+    """Return what was chosen, and the signs of the whole map by their type."""
+    notes = [
+        f"route of {goal_m:.0f} m from lane {way.lane_ids[0]}, with {vehicles} vehicles; the map "
+        f"within {AROUND_M:.0f} m of it is used"
+    ]
+    signals = [one for road in odr.roads for one in road.signals]
+    signs = Counter(one.kind for one in signals if not one.dynamic)
+    if signals:
+        listed = ", ".join(f"{kind} ({n})" for kind, n in sorted(signs.items()))
+        notes.append(
+            f"{sum(signs.values())} signs by type: {listed or 'none'}; "
+            f"{len(signals) - sum(signs.values())} traffic lights"
+        )
+    if heads:
+        notes.append(f"the map has no times of its lights: {CYCLE}")
+    return tuple(notes)

@@ -54,6 +54,14 @@ class LaneGraph:
         both = (lane.left_neighbour, lane.right_neighbour)
         return tuple(key for key in both if key is not None and key in self.lanes)
 
+    def drawn_spot(self, rng: np.random.Generator) -> Spot:
+        """Draw a place, lanes by their length, outside of junctions where there is one."""
+        keys = [key for key, lane in self.lanes.items() if not lane.is_intersection]
+        keys = keys or list(self.lanes)
+        lengths = np.array([self.length_m[key] for key in keys])
+        key = keys[int(rng.choice(len(keys), p=lengths / lengths.sum()))]
+        return Spot(key, float(rng.uniform(0.0, self.length_m[key])))
+
     def between(self, starts: Sequence[Spot], goals: Sequence[Spot]) -> Way | None:
         """Return the shortest way from one of ``starts`` to one of ``goals``; None without one."""
         aims = {goal.lane_id: goal.at_m for goal in goals}

@@ -34,6 +34,9 @@ PEDESTRIAN_LIGHT = "1000002"
 GREEN_S, YELLOW_S, CLEAR_S = 10.0, 3.0, 2.0  # of each group; all are red between two groups
 WALK_END_S = 5.0  # people have red so long before the traffic may drive
 TURN_S = GREEN_S + YELLOW_S + CLEAR_S
+CYCLE = (
+    f"assumed {GREEN_S:g} s green, {YELLOW_S:g} s yellow, {CLEAR_S:g} s red for all, groups in turn"
+)
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
 PLATE_M = 0.1  # what is lower than this is painted on the road
 
