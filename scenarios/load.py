@@ -34,7 +34,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.world.paint import with_default_paint
 from alpasim_plugin.world.route import route_from_log
-from scenarios.budget import check_scenario
+from scenarios.budget import check_record, check_scenario
 from scenarios.build import built_drive
 from scenarios.cameras import camera_spec, check_mounts, given_cameras
 from scenarios.map_drive import map_drive
@@ -81,6 +81,7 @@ def load_scenario(
         drive = built_drive(drawn, _vehicle(default))
     elif drawn.spec.map is not None:
         drive = map_drive(drawn, _vehicle(default))
+        check_record(drive, drawn.document.path)
     else:
         drive = recorded_drive(drawn, source)
     scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))

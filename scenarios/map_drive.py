@@ -15,6 +15,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import project
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Lane, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path
@@ -63,12 +64,13 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     assert spec.map is not None
     path = drawn.document.folder_of(("map", "opendrive")) / spec.map.opendrive
     files = SourceFiles()
-    odr = parse_map(files, path, files.read_xml(path))
-    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
-    origin = _origin(odr)
-    T_local_map = np.eye(4)
-    T_local_map[:3, 3] = -origin
-    lanes, notes = read_lanes(files, path, odr, T_local_map)
+    with parsing(path, "repair this map, or use another one"):
+        odr = parse_map(files, path, files.read_xml(path))
+        odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
+        origin = _origin(odr)
+        T_local_map = np.eye(4)
+        T_local_map[:3, 3] = -origin
+        lanes, notes = read_lanes(files, path, odr, T_local_map)
     graph = LaneGraph(lanes)
     with drawn.at("map", "route"):
         way = _way(drawn, spec.map, graph, odr, T_local_map)

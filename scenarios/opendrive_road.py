@@ -569,7 +569,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             ),
             e.get("singleSide") == "true",
         )
-        for e, start, end in zip(elements, starts, [*starts[1:], road_m], strict=True)
+        for e, start, end in zip(elements, starts, [*starts, road_m][1:], strict=True)
     )
     if any(not 0 <= start <= road_m for start in starts):
         raise files.fail(

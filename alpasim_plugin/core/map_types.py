@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
+LEVEL_M = 3.0  # a stop line farther above or below belongs to another road
 
 Paint = Literal[
     "none",
@@ -81,6 +82,26 @@ class Signal:
                 return colour
             left_us -= lasts_us
         raise AssertionError("a time of a cycle is in one of its phases")
+
+    def crossings(self, line: F64, origin: F64) -> list[tuple[int, float]]:
+        """Return where a line ``(N, 3)`` passes the stop line in the direction of its traffic: the
+        vertex before, and the share of the way to the next one.
+
+        Args:
+            line: Metres, relative to ``origin``.
+            origin: ``(3,)`` world point.
+        """
+        start, along = self.stop[0] - origin, self.stop[1, :2] - self.stop[0, :2]
+        normal = np.array([-along[1], along[0]])
+        normal *= np.sign(normal @ (np.cos(self.heading_rad), np.sin(self.heading_rad)))
+        beyond = (line[:, :2] - start[:2]) @ normal
+        found = []
+        for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
+            share = float(beyond[k] / (beyond[k] - beyond[k + 1]))
+            aside = (line[k, :2] + share * (line[k + 1, :2] - line[k, :2]) - start[:2]) @ along
+            if 0.0 <= aside <= along @ along and abs(line[k, 2] - start[2]) <= LEVEL_M:
+                found.append((k, share))
+        return found
 
 
 @dataclass(frozen=True)

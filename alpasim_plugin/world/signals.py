@@ -11,7 +11,6 @@ from alpasim_plugin.core.types import Signal
 from alpasim_plugin.world.path import Path
 
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
-LEVEL_M = 3.0  # a line farther above or below the path belongs to another road
 
 
 @dataclass(frozen=True)
@@ -28,17 +27,9 @@ def lights_on(path: Path, signals: Sequence[Signal] | None) -> tuple[LightAhead,
     for signal in signals or ():
         if signal.pedestrians:
             continue
-        start, along = signal.stop[0], signal.stop[1, :2] - signal.stop[0, :2]
-        normal = np.array([-along[1], along[0]])
-        normal *= np.sign(normal @ (np.cos(signal.heading_rad), np.sin(signal.heading_rad)))
-        beyond = (path.xyz[:, :2] - start[:2]) @ normal
-        for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
-            share = beyond[k] / (beyond[k] - beyond[k + 1])
-            point = path.xyz[k] + share * (path.xyz[k + 1] - path.xyz[k])
-            aside = (point[:2] - start[:2]) @ along
-            if 0.0 <= aside <= along @ along and abs(point[2] - start[2]) <= LEVEL_M:
-                s_m = path.s[k] + share * (path.s[k + 1] - path.s[k])
-                found.append(LightAhead(float(s_m), signal))
+        for k, share in signal.crossings(path.xyz, np.zeros(3)):
+            s_m = path.s[k] + share * (path.s[k + 1] - path.s[k])
+            found.append(LightAhead(float(s_m), signal))
     return tuple(sorted(found, key=lambda light: light.s_m))
 
 

@@ -24,7 +24,6 @@ NO_LIMITS = "the speed limits of the lanes"
 SHORT = "more than three instants"
 NO_SIGNALS = "the states of the traffic lights"
 RED = ("red", "red_yellow")
-LEVEL_M = 3.0  # a line farther above or below the middle of the ego belongs to another road
 
 
 class Judged:
@@ -153,22 +152,11 @@ class Judged:
             return None
         front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
         out = np.zeros(len(t_us), dtype=np.bool_)
+        line = np.column_stack([front, self._xyz[:, 2]])
         for signal in (one for one in self._signals if not one.pedestrians):
-            start, along = signal.stop[0] - self._origin, signal.stop[1, :2] - signal.stop[0, :2]
-            normal = np.array([-along[1], along[0]])
-            normal *= np.sign(normal @ (np.cos(signal.heading_rad), np.sin(signal.heading_rad)))
-            beyond = (front - start[:2]) @ normal
-            for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
-                share = beyond[k] / (beyond[k] - beyond[k + 1])
-                aside = (front[k] + share * (front[k + 1] - front[k]) - start[:2]) @ along
-                crosses = (
-                    0.0 <= aside <= along @ along and abs(self._xyz[k, 2] - start[2]) <= LEVEL_M
-                )
-                out[k + 1] |= (
-                    crosses
-                    and signal.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k]))))
-                    in RED
-                )
+            for k, share in signal.crossings(line, self._origin):
+                passed_us = round(float(t_us[k] + share * (t_us[k + 1] - t_us[k])))
+                out[k + 1] |= signal.colour_at(passed_us) in RED
         return out
 
     def traffic_lights(self) -> Part:

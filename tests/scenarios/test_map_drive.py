@@ -6,13 +6,20 @@ Every map is made here.
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
+from scenarios.opendrive import read_lanes
+from scenarios.opendrive_road import parse_map
+from scenarios.opendrive_signals import traffic_lights, with_cycles
+from scenarios.recorded import SourceFiles
 from tests.files.test_opendrive import lane, road, section
+
+FILES = SourceFiles()
 
 
 def light(i: str, s: float, more: str = "", kind: str = "1000001", t: float = -5.0) -> str:
@@ -117,3 +124,112 @@ def test_the_expert_waits_at_the_stop_line_and_who_drives_on_is_caught(tmp_path)
     assert signal.colour_at(int(made.ego_log.t_us[np.searchsorted(front, 90.0)])) != "red"
     on_free_road_us = round((90.0 - front[0]) / 10.0 * 1e6)
     assert signal.colour_at(on_free_road_us) == "red"
+
+
+def junction_of(*parts: str) -> str:
+    links = '<laneLink from="-1" to="-1"/>'
+    connection = (
+        f'<connection incomingRoad="1" connectingRoad="2" contactPoint="start">{links}</connection>'
+    )
+    return f'<junction id="9">{connection}</junction>{"".join(parts)}'
+
+
+def test_lights_of_a_junction_take_turns_and_people_walk_while_their_road_has_red(tmp_path):
+    validity = '<validity fromLane="-1" toLane="-1"/>'
+    incoming = road("1", section(0, lane(-1), lane(-2)), length=100, after="junction:9")
+    inside = road("2", section(0, lane(-1)), x=100, length=20, junction="9", before="road:1:end")
+    crossing = (
+        '<signal id="z" s="95" t="-3.5" type="1000003" dynamic="no" orientation="+" width="8"/>'
+    )
+    parts = (
+        with_signals(incoming, light("a", 98, validity), light("p", 95, kind="1000002"), crossing),
+        with_signals(inside, '<signalReference id="a" s="12" t="-5" orientation="+"/>'),
+        with_signals(
+            road("3", section(0, lane(-1)), x=400, length=100, after="junction:9"), light("b", 98)
+        ),
+        junction_of('<controller id="n"><control signalId="b"/></controller>'),
+    )
+    root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
+    odr = parse_map(FILES, "map.xodr", root)
+    lanes, _ = read_lanes(FILES, "map.xodr", odr, np.eye(4))
+    heads, notes = traffic_lights(odr, lanes, np.eye(4))
+    assert not notes
+    signals = with_cycles(heads, {"9": 1_000_000})
+    by = {(one.name, one.lanes): one for one in signals}
+    assert set(by) == {
+        ("a", ("1.0.-1",)),
+        ("a", ("2.0.-1",)),
+        ("p", ("1.0.-1", "1.0.-2")),
+        ("b", ("3.0.-1",)),
+    }
+    assert by["a", ("2.0.-1",)].stop[:, 0] == pytest.approx([100.0, 100.0])
+    walk, go, other = by["p", ("1.0.-1", "1.0.-2")], by["a", ("1.0.-1",)], by["b", ("3.0.-1",)]
+    assert walk.stop[:, 0] == pytest.approx([93.0, 97.0])
+    assert walk.pedestrians
+    for t_us in range(0, 60_000_000, 500_000):
+        colours = go.colour_at(t_us), other.colour_at(t_us), walk.colour_at(t_us)
+        assert "red" in colours[:2]
+        assert colours[0] == "red" or colours[2] == "red"
+    assert {one.colour_at(1_000_000) for one in signals} == {"green", "red"}
+
+
+def test_what_stands_beside_a_road_is_part_of_the_map_and_what_does_not_fit_is_said(tmp_path):
+    outline = "".join(f'<cornerLocal u="{u}" v="{v}"/>' for u, v in ((-2, -4), (2, -4), (2, 4)))
+    objects = (
+        f'<objects><object type="crosswalk" s="50" t="0" hdg="0"><outline>{outline}</outline></object>'
+        '<object type="tree" s="10" t="9"/></objects>'
+    )
+    sign = '<signal id="s" s="30" t="-5" type="205" dynamic="no" orientation="+" zOffset="2" height="0.9" width="0.8"/>'
+    lost = '<signalReference id="nobody" s="1" t="0" orientation="+"/>'
+    first, second = two_roads(sign, lost, light("in the field", 150, t=40))
+    made = scenario(tmp_path, (first.replace("</road>", f"{objects}</road>"), second))
+    x = made.world_origin[0]
+    (ring,) = made.lane_map.crosswalks
+    assert ring[:3, :2] + [x, made.world_origin[1]] == pytest.approx(
+        np.array([[48, -4], [52, -4], [52, 4]])
+    )
+    ((pose, box),) = made.lane_map.signs
+    assert pose[:3, 3] == pytest.approx([30.0 - x, -5.0 - made.world_origin[1], 2.45])
+    assert box.width_m == 0.8
+    for word in ("tree", "references", "205 (1)"):
+        assert any(word in note for note in made.notes)
+
+
+def test_vehicles_start_apart_keep_apart_and_wait_for_red(tmp_path):
+    parts = two_roads(light("7", 98), STOP)
+    made = scenario(tmp_path, parts, *named("1:0", "2:200"), "map.vehicles=4", seed=3)
+    assert 0 < len(made.actors) <= 4
+    assert {actor.behaviour.kind for actor in made.actors} == {"idm"}
+    starts = [made.ego_log.xyz[0, :2], *(actor.track.xyz[0, :2] for actor in made.actors)]
+    for n, one in enumerate(starts):
+        assert all(np.hypot(*(one - other)) >= 20.0 for other in starts[:n])
+    again = scenario(tmp_path, parts, *named("1:0", "2:200"), "map.vehicles=4", seed=3)
+    assert again.content_hash == made.content_hash
+    assert all(
+        np.array_equal(a.track.xyz, b.track.xyz)
+        for a, b in zip(made.actors, again.actors, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (road("1", section(0, lane(-1)), length=10),),  # too short for a route
+        (road("1", length=100),),  # without lanes
+        (road("1", section(0, lane(-1)), length=0, view="<geometry/>"),),  # broken numbers
+        (with_signals(road("1", section(0, lane(-1)), length=90), light("7", 98, "<validity/>")),),
+    ],
+)
+def test_a_map_that_cannot_be_driven_is_refused(tmp_path, parts):
+    with pytest.raises(InputError):
+        scenario(tmp_path, parts)
+
+
+def test_dangling_links_and_roads_without_length_are_noted(tmp_path):
+    parts = (
+        road("1", section(0, lane(-1, None, -1)), length=100, after="road:8:start"),
+        road("5", section(0, lane(-1)), length=0, view="<!-- none -->"),
+    )
+    made = scenario(tmp_path, parts)
+    assert any("1.0.-1" in note for note in made.notes)
+    assert any("without length" in note for note in made.notes)
