@@ -43,6 +43,7 @@ from scenarios.variation import Drawn
 ROUTE_M = 200.0  # length of a route that is drawn
 SHORTEST_ROUTE_M = 20.0
 DRAWS = 100
+REAR_M = 2.0  # room behind the rear axle where the map begins
 AHEAD_M = 120.0  # the route goes on so far behind the end of the drive
 AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
 LONGEST_S = 300.0  # of a drive
@@ -74,6 +75,8 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     graph = LaneGraph(lanes)
     with drawn.at("map", "route"):
         way = _way(drawn, spec.map, graph, odr, T_local_map)
+    if not graph.before(way.lane_ids[0]):
+        way = replace(way, start_m=max(way.start_m, REAR_M))
     goal_m = graph.line(way).length_m - way.beyond_m
     way = graph.carried_on(way, AHEAD_M)
     line = graph.line(way)
@@ -146,10 +149,10 @@ def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, odr: OdrMap, T_local_map
             continue
         spot = begin[int(rng.integers(len(begin)))]
         way = graph.drawn(spot, ROUTE_M, rng)
-        length_m = graph.line(way).length_m - way.beyond_m
+        length_m = graph.driven_m(way)
         if length_m > longest_m:
             best, longest_m = way, length_m
-        if way.beyond_m > 0:
+        if length_m >= ROUTE_M:
             break
     if best is None or longest_m < SHORTEST_ROUTE_M:
         raise InputError(

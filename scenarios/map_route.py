@@ -15,6 +15,7 @@ from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 STATION_M = 2.0  # of the driven line, which is smooth in between
 CHANGE_M = 40.0  # length of a lane change, where the lanes are as long
 SHORTEST_CHANGE_M = 20.0
+NARROWEST_M = 2.2  # of a lane on which a car fits
 CHANGE_COST_M = 50.0  # a way is so much longer before a lane change is worth it
 
 
@@ -38,15 +39,29 @@ class Way:
 
 
 class LaneGraph:
-    """Lanes for vehicles and how they follow one another."""
+    """Lanes for vehicles and how they follow one another; a lane that opens or closes, narrow at one
+    end, is not among them.
+    """
 
     def __init__(self, lanes: Mapping[str, Lane]) -> None:
-        self.lanes = {key: lane for key, lane in lanes.items() if lane.kind in ("vehicle", "bus")}
+        self.lanes = {
+            key: lane
+            for key, lane in lanes.items()
+            if lane.kind in ("vehicle", "bus") and _least_width_m(lane) >= NARROWEST_M
+        }
         self.length_m = {k: float(arc_lengths(v.centre)[-1]) for k, v in self.lanes.items()}
 
     def following(self, lane_id: str) -> tuple[str, ...]:
         """Return the lanes that follow a lane."""
         return tuple(key for key in self.lanes[lane_id].successors if key in self.lanes)
+
+    def before(self, lane_id: str) -> tuple[str, ...]:
+        """Return the lanes that a lane follows."""
+        return tuple(key for key in self.lanes if lane_id in self.lanes[key].successors)
+
+    def driven_m(self, way: Way) -> float:
+        """Return the length of a way without lane changes, up to its goal."""
+        return sum(self.length_m[key] for key in way.lane_ids) - way.start_m - way.beyond_m
 
     def beside(self, lane_id: str) -> tuple[str, ...]:
         """Return the neighbours of a lane into which one may change."""
@@ -147,3 +162,10 @@ class LaneGraph:
         steps = np.diff(self.lanes[lane_id].centre[:, :2], axis=0)
         first, last = (np.arctan2(step[1], step[0]) for step in (steps[0], steps[-1]))
         return abs(float(wrap_angle(last - first)))
+
+
+def _least_width_m(lane: Lane) -> float:
+    """Return the width of a lane where it is narrowest; its edges have the same stations."""
+    assert lane.left is not None
+    assert lane.right is not None
+    return float(np.linalg.norm((lane.left - lane.right)[:, :2], axis=1).min())

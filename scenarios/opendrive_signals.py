@@ -31,7 +31,7 @@ from scenarios.opendrive_road import (
 )
 
 PEDESTRIAN_LIGHT = "1000002"
-GREEN_S, YELLOW_S, CLEAR_S = 10.0, 3.0, 2.0  # of each group; all are red between two groups
+GREEN_S, YELLOW_S, CLEAR_S = 6.0, 3.0, 2.0  # of each group; all are red between two groups
 WALK_END_S = 5.0  # people have red so long before the traffic may drive
 TURN_S = GREEN_S + YELLOW_S + CLEAR_S
 CYCLE = (

@@ -233,3 +233,22 @@ def test_dangling_links_and_roads_without_length_are_noted(tmp_path):
     made = scenario(tmp_path, parts)
     assert any("1.0.-1" in note for note in made.notes)
     assert any("without length" in note for note in made.notes)
+
+
+def test_the_whole_car_starts_on_the_map(tmp_path):
+    made = scenario(tmp_path, two_roads(), *named("1:0", "2:150"))
+    rear = made.vehicle.box.length_m / 2 - made.vehicle.rear_axle_to_centre_m
+    assert made.ego_log.xyz[0, 0] + made.world_origin[0] > rear
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_short_road_gives_a_short_route(tmp_path, seed):
+    made = scenario(tmp_path, (road("1", section(0, lane(-1)), length=90),), seed=seed)
+    assert 20.0 < np.ptp(made.ego_log.xyz[:, 0]) < 90.0
+
+
+def test_a_lane_that_closes_is_not_driven(tmp_path):
+    closing = lane(-2).replace('b="0"', 'b="-0.035"')
+    made = road("1", section(0, lane(-1), closing), length=100)
+    for seed in range(4):
+        assert scenario(tmp_path, (made,), seed=seed).route.lane_ids == ("1.0.-1",)
