@@ -49,7 +49,7 @@ def test_what_it_copies_is_there_and_is_sent(repo, steps):
     )
 
 
-def engine() -> str | None:
+def engine():
     """Return a container engine that answers."""
     for name in ("docker", "podman"):
         if (

@@ -50,13 +50,13 @@ class Module:
     top: tuple[ast.stmt, ...]
 
 
-def name_of(path: Path) -> str:
+def name_of(path):
     parts = list(path.relative_to(REPO).with_suffix("").parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 @cache
-def modules() -> tuple[Module, ...]:
+def modules():
     found = []
     gc.disable()  # collections while a million nodes are made take as long as making them
     for path in (
@@ -76,12 +76,12 @@ def modules() -> tuple[Module, ...]:
     return tuple(found)
 
 
-def room_of(module: str) -> str | None:
+def room_of(module):
     """Return the room that a module lies in; None for the face of the package."""
     return next((room for room in ROOMS if module == room or module.startswith(room + ".")), None)
 
 
-def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
+def imported(nodes):
     found: set[str] = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -91,7 +91,7 @@ def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
     return {name for name in found if name.split(".")[0] in PACKAGES}
 
 
-def may_import(room: str) -> set[str]:
+def may_import(room):
     """Return the rooms that a room may import besides itself."""
     if room in PLUG_INS:  # the laboratory may use the block generators, which ship without it
         return set(ROOMS[: ROOMS.index(room)])
@@ -100,7 +100,7 @@ def may_import(room: str) -> set[str]:
     return set(ROOMS[: ROOMS.index(room)])
 
 
-def upward_imports(module: Module) -> list[str]:
+def upward_imports(module):
     """Return a line for every import that a module's room may not make."""
     room = room_of(module.name)
     if room is None:
@@ -141,7 +141,7 @@ def test_no_room_imports_in_a_circle():
     done = set()
     path = []
 
-    def visit(name: str) -> list[str]:
+    def visit(name):
         if name in path:
             return [*path[path.index(name) :], name]
         if name in done or name not in arrows:
@@ -155,7 +155,7 @@ def test_no_room_imports_in_a_circle():
     assert [circle for name in arrows if (circle := visit(name))] == []
 
 
-def targets_of(module: Module) -> set[str]:
+def targets_of(module):
     """Return the modules that a module imports when it runs: not what only type checkers import,
     nor a package for one of its modules.
     """
@@ -175,7 +175,7 @@ def targets_of(module: Module) -> set[str]:
     return (found & names) - {module.name}
 
 
-def is_for_type_checkers(node: ast.AST) -> bool:
+def is_for_type_checkers(node):
     return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 

@@ -15,7 +15,7 @@ from alpasim_plugin.log.wire import logging_pb2
 from tests.examples import examples
 
 
-def entry(t_us: int = 7, ids: tuple[str, ...] = ("EGO",)) -> logging_pb2.LogEntry:
+def entry(t_us=7, ids=("EGO",)):
     pose = logging_pb2.ActorPoses.ActorPose
     return logging_pb2.LogEntry(
         actor_poses=logging_pb2.ActorPoses(
@@ -24,7 +24,7 @@ def entry(t_us: int = 7, ids: tuple[str, ...] = ("EGO",)) -> logging_pb2.LogEntr
     )
 
 
-def write(path: Path, entries: list[logging_pb2.LogEntry]) -> Path:
+def write(path, entries):
     with AslFile(path) as file:
         for e in entries:
             file.write(e)
@@ -155,7 +155,7 @@ def test_name_appears_only_when_finished(tmp_path):
 
 
 def test_failed_writer_leaves_a_readable_part_and_no_log(tmp_path):
-    def fail() -> None:
+    def fail():
         with AslFile(tmp_path / "a.asl") as file:
             file.write(entry())
             raise RuntimeError("the rollout broke")

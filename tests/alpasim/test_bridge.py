@@ -11,7 +11,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import grpc
 import pytest
@@ -132,8 +131,8 @@ def test_the_client_asks_again_only_after_what_may_pass(upstream, renderer, monk
     monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
     frame, seen = drive(1)[0], []
 
-    def fault(code: Any, text: str, times: int) -> Any:
-        def answer(asked: Any, context: Any, data: bytes) -> bytes:
+    def fault(code, text, times):
+        def answer(asked, context, data):
             seen.append(code)
             return data if len(seen) > times else context.abort(code, text)
 
@@ -160,7 +159,7 @@ def test_the_client_refuses_what_the_runtime_refuses(items):
     """No item for a camera, or one without success."""
 
     class Refused(StandInRenderer):
-        def batch_render_rgb(self, asked: Any, context: Any) -> sensorsim_pb2.BatchRGBRenderReturn:
+        def batch_render_rgb(self, asked, context):
             item = sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=CAMERA)
             return sensorsim_pb2.BatchRGBRenderReturn(items=[item][:items])
 

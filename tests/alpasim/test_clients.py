@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from concurrent import futures
-from typing import Any
 
 import grpc
 import numpy as np
@@ -20,7 +19,6 @@ from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
 from alpasim_plugin.core.parts import build, resolve
-from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.wire import (
     FRONT_WIDE,
@@ -58,17 +56,15 @@ def scenario(scene):
 class Calls(grpc.ServerInterceptor):
     """Notes the order of the calls."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.made: list[str] = []
 
-    def intercept_service(self, continuation: Any, details: Any) -> Any:
+    def intercept_service(self, continuation, details):
         self.made.append(details.method.rsplit("/", 1)[1])
         return continuation(details)
 
 
-def serve(
-    name: str, implementation: object, interceptor: Calls | None = None
-) -> tuple[grpc.Server, str]:
+def serve(name, implementation, interceptor=None):
     server = grpc.server(
         futures.ThreadPoolExecutor(8), interceptors=(interceptor,) if interceptor else ()
     )
@@ -94,7 +90,7 @@ def driver(scene):
     server.stop(0)
 
 
-def drive(scenario: Scenario, renderer: str, policy: str) -> tuple[RolloutLog, dict[str, Any]]:
+def drive(scenario, renderer, policy):
     made = build(resolve("policy", policy), scenario=scenario)
     with Recorder(scenario, 0, images="png") as recorder:
         run_rollout(scenario, make_renderer(renderer, scenario, 0), made, 0, recorder)
@@ -140,32 +136,32 @@ def test_renderer_and_driver_over_sockets_at_once(scenario, scene, inside, drive
 class Scripted:
     """A driver that answers as told."""
 
-    def __init__(self, *answers: egodriver_pb2.DriveResponse) -> None:
+    def __init__(self, *answers: egodriver_pb2.DriveResponse):
         self._answers, self.sessions, self.motion = list(answers), [], []
 
-    def get_version(self, request: Any, context: Any) -> common_pb2.VersionId:
+    def get_version(self, request, context):
         return common_pb2.VersionId(version_id="scripted")
 
-    def start_session(self, request: Any, context: Any) -> common_pb2.SessionRequestStatus:
+    def start_session(self, request, context):
         self.sessions.append(request)
         return common_pb2.SessionRequestStatus()
 
-    def close_session(self, request: Any, context: Any) -> common_pb2.Empty:
+    def close_session(self, request, context):
         return common_pb2.Empty()
 
-    def submit_image_observation(self, request: Any, context: Any) -> common_pb2.Empty:
+    def submit_image_observation(self, request, context):
         assert request.camera_image.logical_id == FRONT_WIDE
         return common_pb2.Empty()
 
-    def submit_egomotion_observation(self, request: Any, context: Any) -> common_pb2.Empty:
+    def submit_egomotion_observation(self, request, context):
         self.motion.append(request)
         return common_pb2.Empty()
 
-    def submit_route(self, request: Any, context: Any) -> common_pb2.Empty:
+    def submit_route(self, request, context):
         assert len(request.route.waypoints) == 20
         return common_pb2.Empty()
 
-    def drive(self, request: Any, context: Any) -> egodriver_pb2.DriveResponse:
+    def drive(self, request, context):
         return self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
 
 
@@ -209,21 +205,19 @@ def test_an_end_of_session_and_a_missing_service_are_said(scenario):
 class Failing:
     """A renderer that fails so many times before it answers."""
 
-    def __init__(self, code: grpc.StatusCode, times: int) -> None:
+    def __init__(self, code, times):
         self.code, self.times, self.asked = code, times, 0
 
-    def get_version(self, request: Any, context: Any) -> common_pb2.VersionId:
+    def get_version(self, request, context):
         return common_pb2.VersionId(version_id="failing")
 
-    def get_available_scenes(self, request: Any, context: Any) -> common_pb2.AvailableScenesReturn:
+    def get_available_scenes(self, request, context):
         return common_pb2.AvailableScenesReturn(scene_ids=["*"])
 
-    def get_available_cameras(
-        self, request: Any, context: Any
-    ) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(self, request, context):
         return sensorsim_pb2.AvailableCamerasReturn()
 
-    def batch_render_rgb(self, request: Any, context: Any) -> sensorsim_pb2.BatchRGBRenderReturn:
+    def batch_render_rgb(self, request, context):
         self.asked += 1
         if self.asked <= self.times:
             context.abort(self.code, "not now")

@@ -4,12 +4,10 @@ driver service, a score.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from concurrent import futures
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import grpc
 import numpy as np
@@ -19,7 +17,6 @@ import yaml
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.core.parts import build, resolve
-from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import SERVICE_PATHS
@@ -53,41 +50,41 @@ class Inside:
     are serialised all the same.
     """
 
-    def __init__(self, services: dict[str, object]) -> None:
+    def __init__(self, services):
         self._services = {SERVICE_PATHS[name]: (name, one) for name, one in services.items()}
 
     def unary_unary(
         self,
-        path: str,
-        request_serializer: Callable[[Any], bytes],
-        response_deserializer: Callable[[bytes], Any],
-    ) -> Any:
+        path,
+        request_serializer,
+        response_deserializer,
+    ):
         prefix, _, call = path.rpartition("/")
         name, one = self._services.get(f"{prefix}/", ("", None))
 
-        def ask(request: Any, timeout: float | None = None, wait_for_ready: bool = False) -> Any:
+        def ask(request, timeout=None, wait_for_ready=False):
             got = methods(name)[call].request.FromString(request_serializer(request))
             return response_deserializer(getattr(one, call)(got, Caller()).SerializeToString())
 
         return ask
 
-    def close(self) -> None:
+    def close(self):
         """Nothing is open."""
 
 
 class Caller:
     """The context of a call without a socket."""
 
-    def time_remaining(self) -> None:
+    def time_remaining(self):
         return None
 
-    def is_active(self) -> bool:
+    def is_active(self):
         return True
 
-    def add_callback(self, callback: Any) -> bool:
+    def add_callback(self, callback):
         return True
 
-    def abort(self, code: Any, text: str) -> None:
+    def abort(self, code, text):
         raise AssertionError(f"{code}: {text}")
 
 
@@ -99,7 +96,7 @@ class Network:
     over_sockets: bool
     stack: ExitStack
 
-    def add(self, services: dict[str, object]) -> str:
+    def add(self, services):
         if self.over_sockets:
             server = grpc.server(futures.ThreadPoolExecutor(4), options=list(OPTIONS))
             server.add_generic_rpc_handlers(
@@ -127,9 +124,7 @@ def renderer(scene):
 
 
 @contextmanager
-def chain(
-    network: Network, scene: str, renderer: dict[str, object], overrides: list[str]
-) -> Iterator[tuple[str, str, str]]:
+def chain(network, scene, renderer, overrides):
     """Start the services; give the addresses of the fixed renderer, the one behind it, and the
     driver.
     """
@@ -159,13 +154,11 @@ def chain(
 
 
 @cache
-def loaded(scene: str) -> Scenario:
+def loaded(scene):
     return load_scenario(scene)
 
 
-def drive(
-    scene: str, renderer: str, policy: str, overrides: list[str] | None = None, seed: int = 0
-) -> RolloutLog:
+def drive(scene, renderer, policy, overrides=None, seed=0):
     scenario = loaded(scene)
     with Recorder(scenario, seed, images="png") as recorder:
         made = make_renderer(renderer, scenario, seed, threads=1, overrides=overrides or ())
@@ -175,19 +168,19 @@ def drive(
     return recorder.log()
 
 
-def measured(rollout: RolloutLog, scene: str) -> dict[str, float | None]:
+def measured(rollout, scene):
     series = score(rollout, loaded(scene).scene, preset("paper"))
     return {name: one.value for name, one in reduce_rollout(series, preset("paper")).values.items()}
 
 
 def both(
-    scene: str,
-    renderer: dict[str, object],
-    overrides: list[str],
-    encoding: str,
-    monkeypatch: pytest.MonkeyPatch,
-    renderers: list[str],
-) -> list[list[RolloutLog]]:
+    scene,
+    renderer,
+    overrides,
+    encoding,
+    monkeypatch,
+    renderers,
+):
     """Drive every renderer over sockets, then without any; ``{front}`` and ``{base}`` in a name are
     the services' addresses.
     """
@@ -214,14 +207,14 @@ def both(
     return logs
 
 
-def assert_equal(one: RolloutLog, other: RolloutLog, scene: str) -> None:
+def assert_equal(one, other, scene):
     np.testing.assert_array_equal(one.ego.xyz, other.ego.xyz)
     np.testing.assert_array_equal(one.ego.quat, other.ego.quat)
     assert [image.data for image in one.images] == [image.data for image in other.images]
     assert measured(one, scene) == measured(other, scene)
 
 
-def apart(one: RolloutLog, other: RolloutLog, frames: int) -> float:
+def apart(one, other, frames):
     """Return the mean absolute difference of the first frames, in grey levels."""
     pairs = zip(one.images[:frames], other.images[:frames], strict=True)
     return float(

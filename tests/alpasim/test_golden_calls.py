@@ -4,7 +4,6 @@ every answer valid and in order.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +19,7 @@ Entry = logging_pb2.LogEntry
 class RecordedRenderer(StandInRenderer):
     """Answer as the log's renderer did."""
 
-    def __init__(self, entries: list[Entry]) -> None:
+    def __init__(self, entries):
         super().__init__()
         self._cameras = next(
             e.available_cameras_return for e in entries if e.HasField("available_cameras_return")
@@ -30,27 +29,23 @@ class RecordedRenderer(StandInRenderer):
         )
         self._images = {(i.logical_id, i.frame_end_us): i.image_bytes for i in images}
 
-    def get_available_cameras(
-        self, asked: Any, context: Any
-    ) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(self, asked, context):
         return self._cameras
 
-    def get_available_ego_masks(
-        self, asked: Any, context: Any
-    ) -> sensorsim_pb2.AvailableEgoMasksReturn:
+    def get_available_ego_masks(self, asked, context):
         return sensorsim_pb2.AvailableEgoMasksReturn()
 
-    def _image(self, asked: sensorsim_pb2.RGBRenderRequest, context: Any) -> bytes:
+    def _image(self, asked, context):
         return self._images[asked.camera_intrinsics.logical_id, asked.frame_end_us]
 
 
-def complete_logs(shared_data: Path) -> list[Path]:
+def complete_logs(shared_data):
     """Return the first log of each scene: the others were stripped of their requests."""
     scenes = sorted((shared_data / "alpasim-golden" / "rollouts").iterdir())
     return [sorted(scene.rglob("rollout.asl"))[0] for scene in scenes]
 
 
-def replay(log: Path, scenes: Path, **settings: Any) -> list[bytes]:
+def replay(log, scenes, **settings: Any):
     """Make the calls of a log in its order and check each answer; return the images."""
     entries = list(AslReader(log))
     images = []

@@ -7,7 +7,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +24,7 @@ from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
@@ -49,13 +48,13 @@ class Cruise(Policy):
 
     sensors = (SensorSpec("front"),)
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.poses, self.is_closed = 0, False
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         pass
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         self.poses, self.cameras, self.frames = (
             len(observation.history),
             observation.cameras,
@@ -65,14 +64,14 @@ class Cruise(Policy):
         x = 10e-6 * (times - observation.t_us)
         return Plan(observation.t_us, times, np.stack([x, 0 * x], axis=1), 0 * x)
 
-    def close(self) -> None:
+    def close(self):
         self.is_closed = True
 
 
-def driver_service(**options: Any) -> tuple[DriverService, list[Cruise]]:
+def driver_service(**options: Any):
     made: list[Cruise] = []
 
-    def make(scenario: Any) -> Policy:
+    def make(scenario):
         made.append(Cruise())
         return made[-1]
 
@@ -80,7 +79,7 @@ def driver_service(**options: Any) -> tuple[DriverService, list[Cruise]]:
 
 
 @contextmanager
-def served(name: str, workers: int = 2, **options: Any) -> Iterator[Host]:
+def served(name, workers=2, **options: Any):
     """Run one of our two servers with little to spare."""
     with ExitStack() as stack:
         if name == "EgodriverService":
@@ -93,13 +92,13 @@ def served(name: str, workers: int = 2, **options: Any) -> Iterator[Host]:
         yield stack.enter_context(hosted({name: service}, workers=workers, **options))
 
 
-def failure(call: Callable[[], object]) -> tuple[Any, str]:
+def failure(call):
     with pytest.raises(grpc.RpcError) as caught:
         call()
     return caught.value.code(), caught.value.details()
 
 
-def is_served(host: Host, name: str, **options: Any) -> bool:
+def is_served(host, name, **options: Any):
     """Tell whether somebody else, over a connection of their own, gets an answer."""
     with grpc.insecure_channel(host.address, [("grpc.use_local_subchannel_pool", 1)]) as channel:
         answer = Stub(channel, name).get_version(EMPTY, timeout=20, **options)
@@ -110,22 +109,22 @@ def is_served(host: Host, name: str, **options: Any) -> bool:
 class Silence:
     """The request stream of a caller that stays silent and then closes."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.over = threading.Event()
 
-    def __iter__(self) -> Iterator[bytes]:
+    def __iter__(self):
         self.over.wait(60)
         yield from ()
 
 
-def say_nothing(service: str, method: str) -> Callable[[Any, Silence], Any]:
+def say_nothing(service, method):
     return lambda channel, silence: channel.stream_stream(methods(service)[method].path)(
         iter(silence)
     )
 
 
-def reflect(channel: Any, silence: Silence) -> Any:
-    def questions() -> Iterator[Any]:
+def reflect(channel, silence):
+    def questions():
         yield reflection_pb2.ServerReflectionRequest(list_services="*")
         yield from silence
 
@@ -235,7 +234,7 @@ def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_
 # --- sessions of a driver
 
 
-def opening(name: str) -> egodriver_pb2.DriveSessionRequest:
+def opening(name):
     request = egodriver_pb2.DriveSessionRequest(session_uuid=name)
     mount = common_pb2.Pose(quat=common_pb2.Quat(w=1.0))
     request.rollout_spec.vehicle.available_cameras.add(
@@ -244,15 +243,13 @@ def opening(name: str) -> egodriver_pb2.DriveSessionRequest:
     return request
 
 
-def seen(
-    name: str, t_us: int, size: tuple[int, int] = (48, 32)
-) -> egodriver_pb2.RolloutCameraImage:
+def seen(name, t_us, size=(48, 32)):
     picture = encode_image(np.zeros((*size[::-1], 3), np.uint8))
     camera_image = {"logical_id": "front", "frame_end_us": t_us, "image_bytes": picture}
     return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
 
 
-def moved(name: str, *times_us: int) -> egodriver_pb2.RolloutEgoTrajectory:
+def moved(name, *times_us: int):
     poses = [
         {"timestamp_us": t_us, "pose": {"vec": {"x": t_us * 1e-5}, "quat": {"w": 1.0}}}
         for t_us in times_us

@@ -12,7 +12,7 @@ GROUND_M = -1.9  # the plane z
 BOX = np.array([[8.0, -1.0, -1.9], [12.0, 1.0, -0.4]])  # least and greatest corner
 
 
-def plain_lengths(rays: np.ndarray) -> np.ndarray:
+def plain_lengths(rays):
     """How far each ray goes until it meets the plane or the box; infinite where it meets
     neither.
     """

@@ -10,10 +10,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import grpc
 import pytest
@@ -58,14 +56,14 @@ serve_policy(Cruise, sys.argv[1])
 """
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])
 
 
 @contextmanager
-def driver(address: str, *more: str) -> Iterator[None]:
+def driver(address, *more: str):
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, address, *more], env=environment
@@ -108,10 +106,10 @@ def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_drive
 class Answering:
     """A driver that fails with a given status."""
 
-    def __init__(self, code: Any, text: str = "as told") -> None:
+    def __init__(self, code, text="as told"):
         self.code, self.text = code, text
 
-    def drive(self, request: Any, context: Any) -> Any:
+    def drive(self, request, context):
         if self.code is grpc.StatusCode.DEADLINE_EXCEEDED:
             time.sleep(1.0)
         context.abort(self.code, self.text)

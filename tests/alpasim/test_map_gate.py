@@ -5,7 +5,6 @@ paint is no evidence.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,9 +24,9 @@ from alpasim_plugin.alpasim.server.map_gate import (
 from alpasim_plugin.alpasim.server.sources import MAP_OFF
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.core.geometry import interpolate, se2
-from alpasim_plugin.core.types import F64, U8, Box, CameraSpec, LaneMap, Marking
+from alpasim_plugin.core.types import Box, CameraSpec, LaneMap, Marking
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
-from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -38,7 +37,7 @@ AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135], [0, 0, 1]]), AHEAD)
 
 
-def road(aside_m: float = 0.0, dashed: bool = False) -> LaneMap:
+def road(aside_m=0.0, dashed=False):
     """A straight road along x with three lines; the middle of its right lane is y = 0."""
     paints = ("solid_white", "dashed_white" if dashed else "solid_yellow", "solid_white")
     lines = [
@@ -50,11 +49,11 @@ def road(aside_m: float = 0.0, dashed: bool = False) -> LaneMap:
     )  # type: ignore[arg-type]
 
 
-def prepared(aside_m: float = 0.0, **options: bool) -> PreparedMap:
+def prepared(aside_m=0.0, **options: bool):
     return prepare_map(road(aside_m, **options))
 
 
-def photograph(contrast: int = 90, noise: float = 6.0, aside_m: float = 0.0, **options: bool) -> U8:
+def photograph(contrast=90, noise=6.0, aside_m=0.0, **options: bool):
     """A grey road with the paint of `road`, as thin as paint is, and a textured roadside."""
     scene = prepared(aside_m, **options)
     scene.segments.style[:, 0] = 5.0  # the width in pixels
@@ -68,7 +67,7 @@ def photograph(contrast: int = 90, noise: float = 6.0, aside_m: float = 0.0, **o
     return np.repeat(np.clip(out, 0, 255), 3, axis=2).astype(np.uint8)
 
 
-def judged(rgb: U8, scene_map: PreparedMap, T: F64 = AHEAD) -> Any:
+def judged(rgb, scene_map, T=AHEAD):
     return contradiction(scene_map, SPEC, T, (), rgb)
 
 
@@ -147,7 +146,7 @@ def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side():
     assert agreement(Pieces(rows[:9], ones[:9], 4 * ones[:9]), paint) is None
 
 
-def ask(size: tuple[int, int] = (240, 136)) -> Any:
+def ask(size=(240, 136)):
     scenario = load_scenario("smoke/straight")
     t_us = scenario.start_us + 1_000_000
     pose = wire_pose(
@@ -169,7 +168,7 @@ def ask(size: tuple[int, int] = (240, 136)) -> Any:
 
 @pytest.mark.parametrize(("aside_m", "is_off"), [(0.0, False), (1.75, True)])
 def test_a_server_drops_a_wrong_map_and_says_so(aside_m, is_off, overrides, caplog):
-    def served(*more: str, moved_m: float = aside_m) -> tuple[U8, int]:
+    def served(*more: str, moved_m=aside_m):
         made = assemble(
             Settings(
                 renderer="onefixer+clean",

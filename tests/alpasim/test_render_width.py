@@ -9,11 +9,10 @@ import pytest
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.test_sensorsim_local import SCENE, ask
 
 
-def frames(requests: list[sensorsim_pb2.RGBRenderRequest], **settings: object) -> list[bytes]:
+def frames(requests, **settings: object):
     made = assemble(Settings(scenes=[SCENE], threads=1, **settings))  # type: ignore[arg-type]
     return [made.service.frames.answers([asked], CallTime())[0] for asked in requests]
 

@@ -35,9 +35,7 @@ def served():
         yield Stub(channel, "SensorsimService"), made
 
 
-def ask(
-    t_s: float = 1.0, spec: sensorsim_pb2.CameraSpec | None = None
-) -> sensorsim_pb2.RGBRenderRequest:
+def ask(t_s=1.0, spec=None):
     """Return the request for the recorded pose after a time, with the first moving car."""
     scenario = load_scenario(SCENE)
     t_us = scenario.start_us + int(t_s * 1e6)
@@ -201,9 +199,7 @@ def test_what_is_not_here_is_refused_with_a_reason(served, call, code, found):
     assert found in caught.value.details()
 
 
-def changed(
-    scene_id: str | None = None, track: str | None = None
-) -> sensorsim_pb2.RGBRenderRequest:
+def changed(scene_id=None, track=None):
     asked = ask()
     if scene_id is not None:
         asked.scene_id = scene_id

@@ -33,7 +33,7 @@ EMPTY = common_pb2.Empty()
 JPEG, PNG = sensorsim_pb2.JPEG, sensorsim_pb2.PNG
 
 
-def batch(requests: list[sensorsim_pb2.RGBRenderRequest]) -> sensorsim_pb2.BatchRGBRenderRequest:
+def batch(requests):
     item = sensorsim_pb2.BatchRGBRenderRequestItem
     return sensorsim_pb2.BatchRGBRenderRequest(
         items=[item(camera_name=r.camera_intrinsics.logical_id, request=r) for r in requests]
@@ -140,7 +140,7 @@ def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overri
 def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
     upstream, overrides, tmp_path
 ):
-    def version(**settings: object) -> common_pb2.VersionId:
+    def version(**settings: object):
         with in_front_of(upstream, **settings) as (stub, _):
             return stub.get_version(EMPTY)
 

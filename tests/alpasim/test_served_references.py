@@ -4,12 +4,10 @@ whatever was asked before.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry, resolve_served
+from alpasim_plugin.alpasim.server.caches import SceneCache, resolve_served
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import RenderRequest
 
@@ -32,11 +30,11 @@ def file(tmp_path_factory):
     return path
 
 
-def served(file: Path, renderer: str) -> SceneEntry:
+def served(file, renderer):
     return SceneCache([file], resolve_served(renderer), False, threads=1).get("served")
 
 
-def request(entry: SceneEntry, t_us: int) -> RenderRequest:
+def request(entry, t_us):
     scenario = entry.scenario
     camera = scenario.cameras[0]
     pose = interpolate(scenario.ego_log, scenario.start_us + t_us) @ camera.T_rig_camera

@@ -4,28 +4,23 @@ road.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.history import HistoryTree, apart, on_line
-from alpasim_plugin.alpasim.server.views import View, read_view
+from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 
 Tree = HistoryTree[tuple[bytes, ...]]
 
 
-def tree(
-    max_bytes: int = 1 << 30, expiry_s: float = 60.0, clock: Callable[[], float] = lambda: 0.0
-) -> Tree:
+def tree(max_bytes=1 << 30, expiry_s=60.0, clock=lambda: 0.0):
     return HistoryTree(max_bytes, expiry_s, clock)
 
 
-def serve(kept: Tree, view: View, size: int = 100) -> tuple[bytes, ...]:
+def serve(kept, view, size=100):
     """Give a view its lineage: the keys of all frames from the start of its drive to itself. That
     is all that a fixer could depend on.
     """
@@ -36,11 +31,11 @@ def serve(kept: Tree, view: View, size: int = 100) -> tuple[bytes, ...]:
     return known.state
 
 
-def views(*args: object, **options: object) -> list[View]:
+def views(*args: object, **options: object):
     return [read_view(r) for r in drive(*args, **options)]  # type: ignore[arg-type]
 
 
-def interleaved(drives: Sequence[Sequence[View]], seed: int) -> list[View]:
+def interleaved(drives, seed):
     """Return the frames of all drives mixed at random, each drive's in its own order."""
     rng, left = np.random.default_rng(seed), [list(d) for d in drives]
     out = []
@@ -108,7 +103,7 @@ def test_another_place_camera_lens_or_scene_starts_a_history():
 
 
 def test_drives_that_differ_in_traffic_alone_stay_apart():
-    def with_car(requests: list[sensorsim_pb2.RGBRenderRequest], later_mps: float) -> list[View]:
+    def with_car(requests, later_mps):
         for step, r in enumerate(requests):
             car = r.dynamic_objects.add(track_id="car")
             for pose, t_s in (

@@ -12,8 +12,6 @@ from alpasim_plugin.alpasim.server import views
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
 from alpasim_plugin.alpasim.server.views import read_lens, straight_of
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import Lens
-from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import pinhole
 
@@ -21,7 +19,7 @@ Spec = sensorsim_pb2.CameraSpec
 RAYS = np.array([[0.0, 0.0], [0.3, -0.1], [-0.5, 0.2], [0.6, 0.3], [-0.2, -0.35]])  # x / z, y / z
 
 
-def shown_at(lens: Lens, pixel: F64) -> F64:
+def shown_at(lens, pixel):
     """Return the direction x/z, y/z that a place of the picture shows, read off the covering
     pinhole.
     """
@@ -34,7 +32,7 @@ def shown_at(lens: Lens, pixel: F64) -> F64:
     return (place + 0.5 - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
 
 
-def distorted() -> Spec:
+def distorted():
     spec = pinhole(320, 180)
     p = spec.opencv_pinhole_param
     p.focal_length_x, p.focal_length_y, p.principal_point_x = 200, 210, 150
@@ -44,7 +42,7 @@ def distorted() -> Spec:
     return spec
 
 
-def fisheye() -> Spec:
+def fisheye():
     p = sensorsim_pb2.OpenCVFisheyeCameraParam(
         principal_point_x=160, principal_point_y=90, focal_length_x=200, focal_length_y=190
     )
@@ -52,7 +50,7 @@ def fisheye() -> Spec:
     return Spec(opencv_fisheye_param=p, resolution_w=320, resolution_h=180, logical_id="c")
 
 
-def ftheta(backward: bool) -> Spec:
+def ftheta(backward):
     p = sensorsim_pb2.FthetaCameraParam(principal_point_x=165, principal_point_y=88)
     if backward:
         p.reference_poly = sensorsim_pb2.FthetaCameraParam.PIXELDIST_TO_ANGLE
@@ -64,7 +62,7 @@ def ftheta(backward: bool) -> Spec:
     return Spec(ftheta_param=p, resolution_w=320, resolution_h=180, logical_id="c")
 
 
-def by_opencv(spec: Spec) -> F64:
+def by_opencv(spec):
     p, rays = spec.opencv_pinhole_param, np.column_stack([RAYS, np.ones(len(RAYS))])
     K = np.array(
         [
@@ -79,7 +77,7 @@ def by_opencv(spec: Spec) -> F64:
     )[0][:, 0]
 
 
-def by_opencv_fisheye(spec: Spec) -> F64:
+def by_opencv_fisheye(spec):
     p, rays = spec.opencv_fisheye_param, np.column_stack([RAYS, np.ones(len(RAYS))])
     K = np.array(
         [
@@ -93,7 +91,7 @@ def by_opencv_fisheye(spec: Spec) -> F64:
     )[0][:, 0]
 
 
-def by_ftheta(spec: Spec) -> F64:
+def by_ftheta(spec):
     """The overlay's formula: theta = atan2(|xy|, z); pixel = [[c, d], [e, 1]] (r(theta) xy / |xy|)
     + principal point.
     """

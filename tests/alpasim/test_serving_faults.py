@@ -10,8 +10,6 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 import grpc
 import numpy as np
@@ -37,7 +35,7 @@ EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode
 
 
-def failure(call: Callable[[], object]) -> tuple[Any, str]:
+def failure(call):
     with pytest.raises(grpc.RpcError) as caught:
         call()
     return caught.value.code(), caught.value.details()
@@ -155,7 +153,7 @@ def test_a_caller_that_leaves_or_is_late_costs_nobody_else(upstream, renderer, o
     entered = threading.Event()
     leave = threading.Event()
 
-    def slow(asked: Any, context: Any, data: bytes) -> bytes:
+    def slow(asked, context, data):
         entered.set()
         leave.wait(30)
         return data

@@ -5,20 +5,19 @@ shows it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
-from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
+from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import read_lens, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.shutter import bands
-from alpasim_plugin.core.types import U8, Exposure, RenderRequest
+from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
@@ -35,11 +34,11 @@ RIGHT, LEFT = sensorsim_pb2.ROLLING_LEFT_TO_RIGHT, sensorsim_pb2.ROLLING_RIGHT_T
 
 
 def ask(
-    shutter_type: int = DOWN,
-    turn_rad: float = 0.03,
-    ms: int = 30,
-    spec: sensorsim_pb2.CameraSpec | None = None,
-) -> Any:
+    shutter_type=DOWN,
+    turn_rad=0.03,
+    ms=30,
+    spec=None,
+):
     """Return the request of a frame of the recorded drive, the rig turning while the shutter is
     open.
     """
@@ -73,7 +72,7 @@ def ask(
     return asked
 
 
-def exposure(asked: Any, shutter: Shutter = "asked") -> Exposure | None:
+def exposure(asked, shutter="asked"):
     view = read_view(asked)
     return exposure_of(
         asked.camera_intrinsics,
@@ -124,7 +123,7 @@ def test_what_rolls(asked, shutter, rolls):
         assert set(found.actors_start) == {o.track_id for o in asked.dynamic_objects}
 
 
-def served(shutter: Shutter, asked: Any) -> U8:
+def served(shutter, asked):
     made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1, shutter=shutter))
     return decode_image(made.service.frames.answers([asked], CallTime())[0])
 

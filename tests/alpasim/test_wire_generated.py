@@ -8,7 +8,6 @@ import json
 import subprocess
 import sys
 import venv
-from pathlib import Path
 
 import pytest
 
@@ -40,7 +39,7 @@ print(google.protobuf.__version__)
 """
 
 
-def copied(folder: Path) -> Path:
+def copied(folder):
     """Copy the package to ``folder/bridge/wire``."""
     for source in [*WIRE.glob("*.py"), *PROTOS.glob("*.py")]:
         target = folder / "bridge" / "wire" / source.relative_to(WIRE)
@@ -49,7 +48,7 @@ def copied(folder: Path) -> Path:
     return folder
 
 
-def environment(folder: Path, *requirements: str) -> Path:
+def environment(folder, *requirements: str):
     """Make a virtual environment with some packages; return its Python."""
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"

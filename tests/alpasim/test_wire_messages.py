@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from google.protobuf.descriptor import Descriptor
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from alpasim_plugin.log import wire
@@ -16,14 +13,14 @@ MODULES = [
 ]
 
 
-def messages(descriptors: list[Descriptor]) -> Iterator[Descriptor]:
+def messages(descriptors):
     for descriptor in descriptors:
         if not descriptor.GetOptions().map_entry:
             yield descriptor
             yield from messages(list(descriptor.nested_types))
 
 
-def all_messages() -> list[Descriptor]:
+def all_messages():
     return [
         m
         for module in MODULES

@@ -43,7 +43,7 @@ def inputs(io, name="clip", **changes):
     return {key: io[f"in.{name}.{key}"] for key in ("x", "t", "text", "hdmap")} | changes
 
 
-def first_given(frames: int) -> torch.Tensor:
+def first_given(frames):
     mask = torch.zeros(1, 1, frames, 8, 12)
     mask[:, :, 0] = 1
     return mask

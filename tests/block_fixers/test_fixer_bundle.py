@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from alpasim_plugin.block_fixers.networks import load_networks
-from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
@@ -23,7 +20,7 @@ FRAMES = moving_picture(13)
 MAPS = maps_of(FRAMES)
 
 
-def parts(settings: OneFixerSettings) -> dict[str, dict[str, torch.Tensor]]:
+def parts(settings):
     """Return a transformer, an autoencoder and a prompt of two tokens."""
     sizes = DiTSizes(**settings.dit.model_dump())
     prompt = torch.arange(2.0 * sizes.text_width).view(2, -1).sin()
@@ -42,11 +39,11 @@ def bundle(tmp_path):
     return path
 
 
-def at(bundle: Path, *overrides: str) -> OneFixerSettings:
+def at(bundle, *overrides: str):
     return small_settings("holes=noise", f"weights.bundle={bundle}", *overrides)
 
 
-def spoil(bundle: Path, **changes: torch.Tensor | None) -> None:
+def spoil(bundle, **changes: torch.Tensor | None):
     """Write the bundle again with tensors replaced, or left out; a double underscore stands for a
     dot.
     """
@@ -59,7 +56,7 @@ def spoil(bundle: Path, **changes: torch.Tensor | None) -> None:
     save_file(tensors, bundle, header)
 
 
-def refusal(settings: OneFixerSettings) -> str:
+def refusal(settings):
     with pytest.raises(InputError) as caught:
         load_networks(settings)
     return str(caught.value)

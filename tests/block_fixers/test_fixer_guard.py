@@ -16,12 +16,12 @@ FRAMES = moving_picture(29)
 MAPS = maps_of(FRAMES)
 
 
-def video(*values: float) -> torch.Tensor:
+def video(*values: float):
     """Return one frame of 10 x 10 per value."""
     return torch.tensor(values).view(-1, 1, 1, 1).expand(-1, 10, 10, 3).clone()
 
 
-def failures(x: torch.Tensor) -> list[str]:
+def failures(x):
     return guard.failures(guard.measures(x).numpy())
 
 

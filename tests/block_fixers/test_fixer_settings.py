@@ -12,11 +12,11 @@ from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.parts import names
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.settings import FixerSettings, WeightsSettings, load_settings
+from alpasim_plugin.fixers.settings import FixerSettings, load_settings
 from tests.block_fixers.fixer_cases import small_settings
 
 
-def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
+def refusal(*overrides: str, name="onefixer-dit-tiny"):
     with pytest.raises(InputError) as caught:
         fixer_settings(name, overrides)
     return str(caught.value)
@@ -83,7 +83,7 @@ def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path,
     )
     monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
 
-    def weights(*overrides: str) -> WeightsSettings:
+    def weights(*overrides: str):
         return load_settings("shipped", OneFixerSettings, overrides).weights
 
     assert weights().bundle == str(tmp_path / "here.safetensors")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -37,7 +35,7 @@ def paths(shared_data, tmp_path):
     return [f"weights.{part}={path}" for part, path in files.items()]
 
 
-def load_width(path: Path) -> int:
+def load_width(path):
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
@@ -45,7 +43,7 @@ def load_width(path: Path) -> int:
         return int(file.get_slice(key).get_shape()[1])
 
 
-def settings_of(*overrides: str) -> OneFixerSettings:
+def settings_of(*overrides: str):
     settings = fixer_settings("onefixer-2b", ["precision=fp32", "codec_precision=fp32", *overrides])
     assert isinstance(settings, OneFixerSettings)
     return settings

@@ -156,7 +156,7 @@ def test_map_is_seen_only_where_the_settings_use_it(weights):
     seen, unseen = busy_settings(weights), busy_settings(weights, "uses_map=false")
     black = [np.zeros_like(m) for m in MAPS[:5]]
 
-    def first_block(settings, maps) -> np.ndarray:
+    def first_block(settings, maps):
         return pixels(list(fixer(settings).step(FRAMES[:5], maps)))
 
     assert not np.array_equal(first_block(seen, MAPS[:5]), first_block(seen, black))
@@ -181,7 +181,7 @@ def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through():
 # --- blocks that are refused
 
 
-def refused(session, block, maps) -> None:
+def refused(session, block, maps):
     with pytest.raises(InputError):
         session.step(block, maps)
 

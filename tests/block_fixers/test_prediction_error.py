@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.block_fixers.speculation import deviation, rotation_rad, same_view
 from alpasim_plugin.core.geometry import se2, se3
-from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest
+from alpasim_plugin.core.types import CameraSpec, RenderRequest
 
 CAMERA = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
 
 
-def facing_z(
-    x: float = 0.0, actors: Mapping[str, F64] | None = None, start_x: float | None = None
-) -> RenderRequest:
+def facing_z(x=0.0, actors=None, start_x=None):
     end, start = np.eye(4), np.eye(4)
     end[0, 3], start[0, 3] = x, x if start_x is None else start_x
     return RenderRequest(0, CAMERA, np.stack([start, end]), actors or {})
 
 
-def at_depth(z: float, x: float = 0.0) -> F64:
+def at_depth(z, x=0.0):
     return se3([x, 0.0, z], [1.0, 0.0, 0.0, 0.0])
 
 
@@ -45,7 +42,7 @@ def test_small_and_large_rotations_are_measured_exactly(angle):
 
 
 def test_an_actors_displacement_counts_less_the_further_away_it_is():
-    def off(depth: float) -> float:
+    def off(depth):
         return deviation(
             facing_z(actors={"a": at_depth(depth)}), facing_z(actors={"a": at_depth(depth, 0.1)})
         ).actor_m
@@ -63,7 +60,7 @@ def test_an_actor_that_turns_on_the_spot_counts():
 
 @pytest.mark.parametrize("swap", [False, True])
 def test_an_actor_that_came_or_left_is_beyond_any_tolerance_unless_behind(swap):
-    def off(depth: float) -> float:
+    def off(depth):
         pair = [facing_z(actors={"a": at_depth(depth)}), facing_z()]
         return deviation(*(reversed(pair) if swap else pair)).actor_m
 

@@ -26,7 +26,7 @@ SIZES = TinySizes(
 )
 
 
-def trained_like(seed: int = 0) -> TinyVAE:
+def trained_like(seed=0):
     """Return a network whose corrections are not zero and whose statistics are not trivial."""
     vae = TinyVAE.random(SIZES, seed)
     for part in (vae.encoder, vae.decoder):

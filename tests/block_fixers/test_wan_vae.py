@@ -39,7 +39,7 @@ def vae():
     return WanVAE.random(SMALL)
 
 
-def push_all(stream, x: Tensor, counts: list[int]) -> Tensor:
+def push_all(stream, x, counts):
     assert sum(counts) == x.shape[2]
     return torch.cat([stream.push(part) for part in x.split(counts, dim=2)], dim=2)
 

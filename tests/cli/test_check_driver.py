@@ -16,7 +16,7 @@ def test_a_scene_in_which_the_driver_is_lost_is_driven_once_more(times_lost, out
     losses = iter([InfrastructureError("a driver: UNAVAILABLE", "start it")] * times_lost)
     waited = []
 
-    def drive(*_: object) -> SimpleNamespace:
+    def drive(*_: object):
         error = next(losses, None)
         if error is not None:
             raise error

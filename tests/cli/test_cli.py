@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +15,7 @@ from evaluators import PRESETS
 GOOD = ["--renderer", "clean", "--policy", "log-replay"]
 
 
-def two_parts(text: str) -> tuple[str, str]:
+def two_parts(text):
     """Return message and hint of a printed error."""
     error, hint = text.strip().splitlines()
     assert error.startswith("error: ")
@@ -24,7 +23,7 @@ def two_parts(text: str) -> tuple[str, str]:
     return error, hint
 
 
-def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
+def bad_inputs(folder):
     """Return, by situation, a command line and what its error must mention."""
     (folder / "broken.yaml").write_text("version: 1\nroad: [\n")
     (folder / "typo.yaml").write_text("version: 1\nroda: {}\n")

@@ -75,7 +75,7 @@ def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run):
     assert all(len(info["code"][name]) == 12 for name in ("loop", "scoring"))
 
 
-def logs(exported: Path, policy: str) -> list[Path]:
+def logs(exported, policy):
     return sorted((exported / "clean" / slug(policy) / "rollouts").glob("*/*/rollout.asl"))
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import pytest
 
@@ -24,7 +23,7 @@ metrics:
 """
 
 
-def plan(**fields) -> Plan:
+def plan(**fields):
     small = {
         "scenes": SCENES,
         "seeds": (0, 1),
@@ -62,7 +61,7 @@ def runs(tmp_path_factory):
     return made
 
 
-def _set_failure_class(folder: Path, name: str) -> None:
+def _set_failure_class(folder, name):
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -230,7 +229,7 @@ def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert turned["diff"] == pytest.approx(-said["diff"])
 
 
-def _compare(capsys, *arguments: str) -> dict:
+def _compare(capsys, *arguments: str):
     assert run_command(["compare", *arguments, "--json"]) == 0
     return json.loads(capsys.readouterr().out)["paired"]
 
@@ -273,7 +272,7 @@ def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path
     assert "presets 'paper' and 'strict'" in capsys.readouterr().err
 
 
-def arms_run(folder: Path, renderers: tuple[str, ...], policies: tuple[str, ...]) -> Path:
+def arms_run(folder, renderers, policies):
     return vouch_for(
         make_run(
             folder, plan(renderers=renderers, policies=policies, scenes=SCENES[:4], seeds=(0,))

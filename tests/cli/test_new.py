@@ -13,7 +13,7 @@ from alpasim_plugin.cli.main import run_command
 from tests.docs.test_commands import parse
 
 
-def run_tests_of(file: Path) -> int:
+def run_tests_of(file):
     """Import a test file and call its tests; return how many there are."""
     spec = importlib.util.spec_from_file_location(file.stem, file)
     module = importlib.util.module_from_spec(spec)

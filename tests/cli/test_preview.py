@@ -22,7 +22,7 @@ timing: {duration_us: 3000000}
 EGO, LEAD = (0x0B, 0x6B, 0xB3), (0xC2, 0x54, 0x0A)
 
 
-def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
+def near(picture, rgb):
     """Count pixels of a colour, as strong as the last moment is drawn."""
     return int((np.abs(picture[..., ::-1].astype(int) - rgb).max(axis=2) < 24).sum())
 

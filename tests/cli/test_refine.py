@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -85,7 +84,7 @@ def test_bad_options_are_four_part_errors(source, options, mention, capsys):
     assert not source.with_name("out.mp4").exists()
 
 
-def pictures(folder: Path, count: int = 3, height: int = 36, channels: int = 3) -> Path:
+def pictures(folder, count=3, height=36, channels=3):
     folder.mkdir()
     for i in range(count):
         shape = (height, 64, channels) if channels > 1 else (height, 64)

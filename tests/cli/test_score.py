@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -55,7 +54,7 @@ def our_run(tmp_path_factory):
     return root
 
 
-def rows(folder: Path) -> list[dict]:
+def rows(folder):
     return pq.read_table(folder / "rollouts.parquet").to_pylist()
 
 

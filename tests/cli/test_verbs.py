@@ -5,10 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,7 +17,7 @@ OWN = [verb for panel in PANELS.values() for verb in panel]
 MOST_VERBS, MOST_OPTIONS = 17, 140
 
 
-def verbs_below(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def verbs_below(command, path=()):
     """Yield every command that does something, with the words that call it."""
     if hasattr(command, "commands"):
         for name, inner in command.commands.items():
@@ -31,7 +29,7 @@ def verbs_below(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tupl
 CORE = dict(item for verb in OWN for item in verbs_below(load_verb(verb), (verb,)))
 
 
-def options_of(command: Any) -> list[str]:
+def options_of(command):
     """Return the long name of every option of a command; of one with two states the second, which
     is not the default.
     """
@@ -58,7 +56,7 @@ def test_the_core_has_few_verbs_and_options():
 
 
 @cache
-def written(folder: str, ending: str) -> str:
+def written(folder, ending):
     """Return the text of all files of a folder, but for this one."""
     return "\n".join(
         path.read_text(encoding="utf-8")

@@ -17,9 +17,7 @@ from tests.examples import examples
 VEHICLE = Vehicle()
 
 
-def exact_arc(
-    state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float
-) -> BicycleState:
+def exact_arc(state, accel_mps2, dt_s, wheelbase_m):
     """Return the closed solution for a held wheel and a constant acceleration: an arc of a circle.
 
     The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord
@@ -38,7 +36,7 @@ def exact_arc(
     )
 
 
-def error_m(a: BicycleState, b: BicycleState) -> float:
+def error_m(a, b):
     return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m)
 
 
@@ -93,7 +91,7 @@ def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_w
     finest step is the truth.
     """
 
-    def drive(step_s: float) -> BicycleState:
+    def drive(step_s):
         state = BicycleState(0.0, 0.0, 0.0, 15.0, 0.0)
         for k in range(80):
             state = step(

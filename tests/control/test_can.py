@@ -11,7 +11,6 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.runs.rollout import run_rollout
 from scenarios.load import load_scenario
 
@@ -22,7 +21,7 @@ can = pytest.importorskip("can")
 
 from alpasim_plugin.control.bicycle import BicycleState  # noqa: E402
 from alpasim_plugin.control.can_bus import HOLD_US, STOP_MPS2, Address, Exchange, open_bus  # noqa: E402
-from alpasim_plugin.control.can_codec import BadFrame, Codec, checksum_of, load_map, open_codec  # noqa: E402
+from alpasim_plugin.control.can_codec import BadFrame, checksum_of, load_map, open_codec  # noqa: E402
 from alpasim_plugin.control.can_ecu import LaneKeeper, serve  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
 from alpasim_plugin.core.types import Vehicle  # noqa: E402
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 
 class NoCamera(Renderer):
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         raise AssertionError("nothing is rendered for a policy without cameras")
 
 
@@ -48,15 +47,15 @@ def wires(request):
         yield one, other
 
 
-def exchange(codec: Codec, bus: can.BusABC) -> Exchange:
+def exchange(codec, bus):
     return Exchange(bus, codec, timeout_s=0.001)
 
 
-def send(bus: can.BusABC, frame_id: int, data: bytes) -> None:
+def send(bus, frame_id, data):
     bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=False))
 
 
-def commands(codec: Codec, wheel_deg: float, accel_mps2: float) -> list[can.Message]:
+def commands(codec, wheel_deg, accel_mps2):
     return [
         codec.encode_command(codec.map.steer, wheel_deg),
         codec.encode_command(codec.map.accel, accel_mps2),
@@ -206,7 +205,7 @@ def curve():
     return load_scenario("smoke/curve", overrides=("timing.duration_us=4000000",))
 
 
-def drive(scenario: Scenario, name: str) -> tuple[np.ndarray, dict]:
+def drive(scenario, name):
     """Drive over a bus of two threads; return the driven path and the policy's facts."""
     stop, address = threading.Event(), Address.parse(name)
     with open_bus(address) as bus:

@@ -4,7 +4,6 @@ broken.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +24,7 @@ TRACKER = make_controller("bicycle", VEHICLE)
 Array = npt.ArrayLike
 
 
-def plan_of(t_s: Array, x: Array, y: Array, yaw: Array) -> Trajectory:
+def plan_of(t_s, x, y, yaw):
     t, x_, y_, yaw_ = (
         np.broadcast_to(np.asarray(v, dtype=np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw)
     )
@@ -38,11 +37,11 @@ def plan_of(t_s: Array, x: Array, y: Array, yaw: Array) -> Trajectory:
 
 
 def drive(
-    plan: Trajectory | Callable[[EgoState], Trajectory],
-    start: EgoState,
-    seconds: float,
-    step_us: int = 100_000,
-) -> list[EgoState]:
+    plan,
+    start,
+    seconds,
+    step_us=100_000,
+):
     states = [start]
     for _ in range(round(seconds * 1e6 / step_us)):
         now = states[-1]
@@ -52,13 +51,11 @@ def drive(
     return states
 
 
-def at(
-    x: float = 0.0, y: float = 0.0, yaw: float = 0.0, speed: float = 0.0, steer: float = 0.0
-) -> EgoState:
+def at(x=0.0, y=0.0, yaw=0.0, speed=0.0, steer=0.0):
     return EgoState(0, se2(x, y, yaw), speed, steer_rad=steer)
 
 
-def xy(states: list[EgoState]) -> npt.NDArray[np.float64]:
+def xy(states):
     return np.array([s.T_world_rig[:2, 3] for s in states])
 
 
@@ -134,7 +131,7 @@ def test_noisy_plan_that_stops_is_left_standing_without_creeping_or_reversing(sp
     x = np.where(t < stop_s, speed * t - 1.5 * t * t, speed**2 / 6)
     random = np.random.default_rng(0)
 
-    def noisy(_: EgoState) -> Trajectory:
+    def noisy(_):
         return plan_of(
             t,
             x + random.normal(0, 0.05, len(t)),

@@ -38,7 +38,7 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
 }
 
 
-def full(fd: int) -> None:
+def full(fd):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -119,7 +119,7 @@ def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path, monke
     (folder / "x").write_text("old")
     rename, refusals = Path.replace, iter([False, True, False])
 
-    def replace(self: Path, target: Path) -> Path:
+    def replace(self, target):
         if next(refusals):
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         return rename(self, target)
@@ -146,7 +146,7 @@ def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_a_read_only_folder_is_an_error_with_four_parts(write, tmp_path, monkeypatch):
-    def refuse(self: Path, *rest: object, **more: object) -> None:
+    def refuse(self, *rest: object, **more: object):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(atomic.os, "fsync", lambda handle: refuse(tmp_path))

@@ -7,7 +7,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +20,7 @@ def own_cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-def read(folder: Path) -> str:
+def read(folder):
     text = (folder / "text").read_text() if (folder / "text").exists() else ""
     if not text.startswith("good"):
         raise InputError(f"{folder / 'text'}: {text!r}", "make it again")
@@ -31,7 +30,7 @@ def read(folder: Path) -> str:
 def test_is_made_at_the_first_call_and_read_at_the_second(own_cache):
     made = []
 
-    def make(folder: Path) -> None:
+    def make(folder):
         made.append(folder)
         (folder / "text").write_text("good 1")
 
@@ -42,7 +41,7 @@ def test_is_made_at_the_first_call_and_read_at_the_second(own_cache):
 
 
 def test_damaged_folder_is_made_again_with_a_warning(own_cache, capfd):
-    def make(folder: Path) -> None:
+    def make(folder):
         (folder / "text").write_text("good 2")
 
     cached("texts", "k", make, read, "a text")
@@ -56,7 +55,7 @@ def test_damaged_folder_is_made_again_with_a_warning(own_cache, capfd):
 
 
 def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_cache):
-    def fails(folder: Path) -> None:
+    def fails(folder):
         (folder / "text").write_text("good but unfinished")
         raise RuntimeError("fell over")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
@@ -44,13 +43,13 @@ class Tagged(BaseModel):
     parts: tuple[AnyPart, ...]
 
 
-def write(tmp_path: Path, text: str, name: str = "a.yaml") -> Path:
+def write(tmp_path, text, name="a.yaml"):
     path = tmp_path / name
     path.write_text(text)
     return path
 
 
-def error_of(tmp_path: Path, text: str, model: type[BaseModel] = Car) -> InputError:
+def error_of(tmp_path, text, model=Car):
     path = write(tmp_path, text)
     with pytest.raises(InputError) as e:
         validate(model, load_yaml(path))

@@ -83,7 +83,7 @@ def hostile(tmp_path):
     return tmp_path
 
 
-def simrun(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def simrun(folder, *arguments: str):
     """Run a command in a folder by a script that lies elsewhere, as the installed one does."""
     script = folder.parent / "bin" / "simrun"
     script.parent.mkdir(exist_ok=True)
@@ -105,7 +105,7 @@ def simrun(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def ran(folder: Path) -> str:
+def ran(folder):
     return (folder / "ran").read_text() if (folder / "ran").exists() else ""
 
 

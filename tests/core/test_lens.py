@@ -10,7 +10,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, sides_of
-from alpasim_plugin.core.types import F64, CameraSpec, Frame, LensModel
+from alpasim_plugin.core.types import CameraSpec, Frame, LensModel
 
 W, H = 320, 240
 K = np.array([[100.0, 0.0, 158.0], [0.0, 102.0, 121.0], [0.0, 0.0, 1.0]])
@@ -20,18 +20,18 @@ FTHETA = LensModel("ftheta", (0.0, 92.0, 0.0, -1.5), (), (1.01, 0.002, -0.001), 
 BACKWARD = LensModel("ftheta", (), (0.0, 1 / 90, 0.0, 1e-9), max_angle_rad=np.deg2rad(100))
 
 
-def camera(lens: LensModel | None) -> CameraSpec:
+def camera(lens):
     focal = 2.0 if lens and lens.kind == "opencv" else 1.0
     return CameraSpec("c", W, H, np.diag([focal, focal, 1.0]) @ K, np.eye(4), lens=lens)
 
 
-def colours(ray: F64) -> F64:
+def colours(ray):
     """A smooth colour for every direction."""
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     return 127.5 + 100 * np.sin(2.5 * unit + [0.0, 1.0, 2.0])
 
 
-def by_equations(spec: CameraSpec, ray: F64) -> F64:
+def by_equations(spec, ray):
     """Where a lens shows rays ``(N, 3)``, by OpenCV and by the equation of f-theta lenses."""
     lens, none = spec.lens, np.zeros(3)
     from_corner = spec.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]

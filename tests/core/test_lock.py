@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ with one_writer(Path(sys.argv[1]), "a folder"):
 """
 
 
-def holder(path: Path, seconds: float, repo: Path) -> subprocess.Popen[str]:
+def holder(path, seconds, repo):
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(path), str(seconds)],
         stdout=subprocess.PIPE,

@@ -40,7 +40,7 @@ def home(tmp_path, monkeypatch):
     return tmp_path
 
 
-def chosen_by_nobody(home: Path, **variables: str) -> list[str]:
+def chosen_by_nobody(home, **variables: str):
     """Return what another user's process chooses who cannot write the source: cache, kernels, and
     the mode of the cache.
     """
@@ -83,7 +83,7 @@ def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache():
 
 
 def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(home, monkeypatch):
-    def refuse(prefix: str) -> str:
+    def refuse(prefix):
         raise FileNotFoundError
 
     monkeypatch.setattr(os, "access", lambda path, mode: False)
@@ -117,7 +117,7 @@ def test_compiled_kernels_that_are_damaged_are_no_fault_of_a_part(tmp_path):
     script.write_text(USES_A_KERNEL.format(repo=str(REPO)))
     kept.mkdir()
 
-    def exit_code() -> int:
+    def exit_code():
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}
         return subprocess.run([sys.executable, str(script)], env=environment).returncode
 

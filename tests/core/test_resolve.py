@@ -74,7 +74,7 @@ def test_an_installed_part_does_not_reach_other_distributions(tmp_path):
 
 def test_optional_members_get_their_defaults_and_required_ones_are_named():
     class Bare:
-        def render(self, request: object) -> object:
+        def render(self, request):
             return request
 
     renderer = complete(Bare(), Renderer)
@@ -94,10 +94,10 @@ def test_a_fixer_without_preview_previews_on_a_copy_of_itself():
         blocks = BlockRule(2, 2)
         seen = 0
 
-        def reset(self, seed: int) -> None:
+        def reset(self, seed):
             self.seen = 0
 
-        def step(self, block: list[int], maps: list[object]) -> list[int]:
+        def step(self, block, maps):
             self.seen += len(block)
             return [self.seen] * len(block)
 

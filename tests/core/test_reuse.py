@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -44,7 +43,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def made(folder: Path, renderer: str, *more: str) -> int:
+def made(folder, renderer, *more: str):
     """Drive and return when the rollout's log was written."""
     words = (
         "--renderer",

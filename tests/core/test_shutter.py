@@ -12,7 +12,6 @@ import pytest
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.shutter import (
     MOST_BANDS,
-    Along,
     at_share,
     bands,
     bands_of,
@@ -20,7 +19,7 @@ from alpasim_plugin.core.shutter import (
     motion_px,
     rolling,
 )
-from alpasim_plugin.core.types import F64, CameraSpec, Exposure, RenderRequest
+from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
 
 WIDTH, HEIGHT = 64, 32
 FORWARD = np.array(
@@ -32,12 +31,12 @@ SPEC = CameraSpec(
 
 
 def asked(
-    start: F64,
-    end: F64,
-    actors: dict[str, tuple[F64, F64]] | None = None,
-    along: Along = "rows",
-    back: bool = False,
-) -> RenderRequest:
+    start,
+    end,
+    actors=None,
+    along="rows",
+    back=False,
+):
     """A request from rig poses at shutter start and end."""
     given = actors or {}
     exposure = Exposure(

@@ -12,7 +12,6 @@ import sys
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -45,7 +44,7 @@ class Installed:
     package: Path  # folder of the installed modules
     work: Path
 
-    def simrun(self, *arguments: str, code: int = 0) -> Any:
+    def simrun(self, *arguments: str, code=0):
         """Run a command in the folder and return its JSON document."""
         command = [str(self.python), "-m", "alpasim_plugin.cli.main", *arguments, "--json"]
         path = os.pathsep.join([str(REPO), *(p for p in sys.path if "site-packages" in p)])
@@ -62,7 +61,7 @@ class Installed:
         assert done.returncode == code, done.stdout + done.stderr
         return json.loads(done.stdout)
 
-    def drive(self, out: str, *parts: str, workers: int = 1) -> dict[str, bool]:
+    def drive(self, out, *parts: str, workers=1):
         """Drive and return for every rollout whether it was made anew."""
         rest = (
             "--seeds",
@@ -79,7 +78,7 @@ class Installed:
         self.simrun(*parts, *rest, "drive.toycsv")
         return {path: before.get(path) != at for path, at in self.made(out).items()}
 
-    def made(self, out: str) -> dict[str, int]:
+    def made(self, out):
         """Return when every rollout's log was written."""
         folder = self.work / out / "rollouts"
         return {
@@ -87,7 +86,7 @@ class Installed:
             for log in sorted(folder.rglob("rollout.asl"))
         }
 
-    def edit(self, name: str, old: str, new: str) -> None:
+    def edit(self, name, old, new):
         """Change a file of the installed package."""
         file = self.package / name
         assert old in file.read_text()
@@ -177,7 +176,7 @@ def test_parts_named_by_import_path_are_driven_again_where_they_were_edited(
         shutil.copy(TOY / "entry_points.txt", installed.package / "simrun_toy-1.0.dist-info")
 
 
-def edit_and_drive_again(installed: Installed, out: str, *parts: str) -> None:
+def edit_and_drive_again(installed, out, *parts: str):
     """Edit the fixer's weights and then the module of all parts, and check after each what is
     driven anew.
     """

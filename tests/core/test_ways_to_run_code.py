@@ -27,23 +27,23 @@ Way = Callable[[Path, "Bait"], list[list[str]]]  # (folder, bait) -> commands to
 class Bait:
     """What leaves its name in a file when it is run, in the languages that the ways need."""
 
-    def __init__(self, folder: Path, name: str) -> None:
+    def __init__(self, folder, name):
         self.mark, self.name = folder.parent / "ran", name
 
     @property
-    def python(self) -> str:
+    def python(self):
         return f"open({str(self.mark)!r}, 'a').write({self.name!r} + ' ')\n"
 
     @property
-    def shell(self) -> str:
+    def shell(self):
         return f"echo {self.name} >> {self.mark}"
 
-    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+    def __reduce__(self):
         return exec, (self.python,)
 
 
-def python_file(*names: str) -> Way:
-    def way(folder: Path, bait: Bait) -> list[list[str]]:
+def python_file(*names: str):
+    def way(folder, bait):
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(bait.python)
@@ -56,7 +56,7 @@ def python_file(*names: str) -> Way:
     return way
 
 
-def metadata(folder: Path, bait: Bait) -> list[list[str]]:
+def metadata(folder, bait):
     (folder / "evil.py").write_text(bait.python)
     info = folder / "evil-1.0.dist-info"
     info.mkdir()
@@ -75,7 +75,7 @@ def metadata(folder: Path, bait: Bait) -> list[list[str]]:
     return [["list", "policies"], ["--help"], ["evil"]]
 
 
-def path_file(folder: Path, bait: Bait) -> list[list[str]]:
+def path_file(folder, bait):
     (folder / "evil.pth").write_text(f"import os; exec({bait.python!r})\n")
     (folder / "lib" / "python3.11" / "site-packages").mkdir(parents=True)
     (folder / "lib" / "python3.11" / "site-packages" / "evil.pth").write_text(
@@ -85,7 +85,7 @@ def path_file(folder: Path, bait: Bait) -> list[list[str]]:
     return [["compare", "run"]]
 
 
-def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
+def git_hooks(folder, bait):
     subprocess.run(["git", "init", "-q", "."], cwd=folder, check=True)
     (folder / "kept.txt").write_text("as committed")
     subprocess.run(["git", "add", "kept.txt"], cwd=folder, check=True)
@@ -112,7 +112,7 @@ def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
     return [[*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
 
 
-def yaml_tags(folder: Path, bait: Bait) -> list[list[str]]:
+def yaml_tags(folder, bait):
     (folder / "tag.yaml").write_text(f"!!python/object/apply:os.system [{bait.shell!r}]\n")
     (folder / "key.yaml").write_text(
         f"version: 1\nscene_id: !!python/object/apply:os.system [{bait.shell!r}]\n"
@@ -121,7 +121,7 @@ def yaml_tags(folder: Path, bait: Bait) -> list[list[str]]:
     return [*commands, ["gate", "run", "--gate", "tag.yaml"]]
 
 
-def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
+def pickles_of_a_run(folder, bait):
     for name in (
         "results.pkl",
         "rollouts.pkl",
@@ -135,7 +135,7 @@ def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
     ]
 
 
-def weights(folder: Path, bait: Bait) -> list[list[str]]:
+def weights(folder, bait):
     torch.save({"weight": bait}, folder / "evil.pt")
     (folder / "evil.pkl.pt").write_bytes(pickle.dumps(bait))
     (folder / "evil.safetensors").write_bytes(pickle.dumps(bait))
@@ -154,7 +154,7 @@ def weights(folder: Path, bait: Bait) -> list[list[str]]:
     ]
 
 
-def object_arrays(folder: Path, bait: Bait) -> list[list[str]]:
+def object_arrays(folder, bait):
     np.save(folder / "evil.npy", np.array([bait], dtype=object), allow_pickle=True)
     np.savez(folder / "evil.npz", a=np.array([bait], dtype=object))
     (folder / "evil.asl").write_bytes((folder / "evil.npy").read_bytes())
@@ -164,7 +164,7 @@ def object_arrays(folder: Path, bait: Bait) -> list[list[str]]:
     ]
 
 
-def archive_that_leaves_its_folder(folder: Path, bait: Bait) -> list[list[str]]:
+def archive_that_leaves_its_folder(folder, bait):
     with zipfile.ZipFile(folder / "evil.usdz", "w") as archive:
         for name in (
             "../evil.py",
@@ -176,7 +176,7 @@ def archive_that_leaves_its_folder(folder: Path, bait: Bait) -> list[list[str]]:
     return [["run", "--dry-run", *DRIVE[1:], "evil.usdz"], ["view", "evil.usdz"]]
 
 
-def names_in_a_scenario(folder: Path, bait: Bait) -> list[list[str]]:
+def names_in_a_scenario(folder, bait):
     (folder / "evil.py").write_text(bait.python + "class Evil: pass\n")
     (folder / "scene.yaml").write_text(
         "version: 1\nextends: smoke/straight\npolicy: evil.py:Evil\nrenderer: evil:Evil\n"
@@ -185,7 +185,7 @@ def names_in_a_scenario(folder: Path, bait: Bait) -> list[list[str]]:
     return [["run", "--dry-run", *DRIVE[1:], name] for name in ("scene.yaml", "weights.yaml")]
 
 
-def notebook_and_startup(folder: Path, bait: Bait) -> list[list[str]]:
+def notebook_and_startup(folder, bait):
     (folder / ".ipython" / "profile_default" / "startup").mkdir(parents=True)
     (folder / ".ipython" / "profile_default" / "startup" / "00.py").write_text(bait.python)
     (folder / "matplotlibrc").write_text(f"backend: module://evil\n# {bait.shell}\n")
@@ -197,7 +197,7 @@ def notebook_and_startup(folder: Path, bait: Bait) -> list[list[str]]:
     return [["report", "run"], ["view", "smoke/straight", "--out", "p.png"]]
 
 
-def shells(folder: Path, bait: Bait) -> list[list[str]]:
+def shells(folder, bait):
     """Give names that a shell would run."""
     names = (f"$({bait.shell})", f"; {bait.shell} #", f"`{bait.shell}`", f"| {bait.shell}")
     commands = [["run", "--dry-run", *DRIVE[1:], name.replace("/", "")] for name in names]
@@ -208,7 +208,7 @@ def shells(folder: Path, bait: Bait) -> list[list[str]]:
     ]
 
 
-def programs(folder: Path, bait: Bait) -> list[list[str]]:
+def programs(folder, bait):
     for name in ("git", "ffmpeg", "nvidia-smi", "sinfo", "sysctl", "ps", "python", "python3", "sh"):
         (folder / name).write_text(f"#!/bin/sh\n{bait.shell}\n")
         (folder / name).chmod(0o755)

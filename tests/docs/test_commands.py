@@ -13,7 +13,6 @@ import shutil
 import subprocess
 import sys
 import venv
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from tests.docs.commands import (
     OTHER,
     SHORT,
     SIMRUN,
-    Command,
     commands,
     lines_of,
     pages,
@@ -41,7 +39,7 @@ COMMANDS = [one for one in commands(REPO, pages(REPO)) if not one.is_of_lab]
 RUN = [command for command in COMMANDS if not command.why_not_run]
 
 
-def parse(words: list[str]) -> None:
+def parse(words):
     """Parse a command line as `simrun` does, without running it."""
     args = with_verb(words)
     command: Any = load_verb(args[0])
@@ -52,7 +50,7 @@ def parse(words: list[str]) -> None:
     command.make_context(name, rest)
 
 
-def not_understood(some: Sequence[Command]) -> list[str]:
+def not_understood(some):
     """Return a line for every command that the command line refuses to parse."""
     refused = []
     for one in some:
@@ -77,7 +75,7 @@ def test_every_verb_is_on_a_page():
     assert [verb for verb in own if not re.search(rf"simrun {verb}\b", text)] == []
 
 
-def needing_the_checkout(some: Sequence[Path]) -> list[str]:
+def needing_the_checkout(some):
     """Return a line for every command of some pages that works in a checkout only."""
     needs = []
     for page in some:
@@ -186,7 +184,7 @@ def empty(tmp_path_factory):
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def shortened(words: tuple[str, ...]) -> list[str]:
+def shortened(words):
     """Return a command that does the same in seconds: short drives, one seed, nothing fitted."""
     if words[:3] == ("new", "policy", "my_policy"):
         return [
@@ -208,7 +206,7 @@ def shortened(words: tuple[str, ...]) -> list[str]:
     return args
 
 
-def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
+def call(simrun, folder, words):
     environment = {
         key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")
     }
@@ -239,7 +237,7 @@ def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun, empty, co
     assert "Traceback" not in done.stderr
 
 
-def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
+def prepare(simrun, folder, words):
     """Make the run that a command reads, once."""
     runs = {
         "runs/us101": ["--renderer", "3dgs", "real/us101", *NOTHING_FITTED],

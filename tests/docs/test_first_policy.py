@@ -39,6 +39,6 @@ def test_every_step_of_the_page_does_what_it_says(repo, tmp_path, monkeypatch):
     assert list(Path("runs/blind").rglob("why.html"))
 
 
-def outcomes(run: str) -> dict[str, dict[str, int]]:
+def outcomes(run):
     summary = json.loads(Path(run, "summary.json").read_text())
     return {name: entry["endings"] for name, entry in summary["outcomes"].items()}

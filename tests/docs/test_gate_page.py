@@ -20,12 +20,12 @@ POLICIES = ("log-replay", "constant-velocity", "pure-pursuit", NOISY)
 BASELINES = ("log-replay", "constant-velocity")
 
 
-def gate_file() -> str:
+def gate_file():
     (text,) = re.findall(r"```yaml\n(# gate\.yaml\n.*?)```", PAGE.read_text(), re.DOTALL)
     return text
 
 
-def workflow() -> tuple[list[str], list[str]]:
+def workflow():
     """Return the words of the two commands of the page's job: drive, and gate."""
     lines = re.findall(r"- run: simrun (.*)", PAGE.read_text())
     drive, gate = (shlex.split(line, comments=True) for line in lines)

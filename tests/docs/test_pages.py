@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import re
 from functools import cache
-from pathlib import Path
 
 import pytest
 
@@ -21,13 +20,13 @@ OF_LAB = re.compile(r"\blab[/.]")  # files and modules of the laboratory
 HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.M)
 
 
-def without_code(text: str) -> str:
+def without_code(text):
     """Drop fenced blocks: what stands there is no link and no heading."""
     return re.sub(r"^```.*?^```", "", text, flags=re.S | re.M)
 
 
 @cache
-def anchors(page: Path) -> frozenset[str]:
+def anchors(page):
     """Return the anchors of a page's headings, as GitHub makes them."""
     headings = HEADING.findall(without_code(page.read_text(encoding="utf-8")))
     return frozenset(
@@ -35,7 +34,7 @@ def anchors(page: Path) -> frozenset[str]:
     )
 
 
-def local_links(page: Path) -> list[tuple[Path, str]]:
+def local_links(page):
     """Return file and anchor of every link of a page that leads to a file."""
     out = []
     for target in LINK.findall(without_code(page.read_text(encoding="utf-8"))):
@@ -51,7 +50,7 @@ def pages(repo):
     return [repo / "CHANGELOG.md", *commands.pages(repo)]
 
 
-def broken_links(repo: Path, pages: list[Path], to_lab: bool) -> list[str]:
+def broken_links(repo, pages, to_lab):
     """Return the links that lead nowhere, of those that lead to the laboratory's pages or of the
     others.
     """
@@ -91,7 +90,7 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo, pages):
     assert missing == []
 
 
-def reachable(docs: Path) -> set[Path]:
+def reachable(docs):
     """Return the pages that the index leads to."""
     seen, queue = {docs / "index.md"}, [docs / "index.md"]
     while queue:
@@ -113,7 +112,7 @@ def test_every_page_is_reachable_from_the_index(repo):
     ] == []
 
 
-def unshown(folder: Path, pages: list[Path]) -> list[str]:
+def unshown(folder, pages):
     """Return the pictures of a folder that no page shows."""
     shown = {file for page in pages for file, _ in local_links(page)}
     return [
@@ -127,7 +126,7 @@ def test_every_picture_is_shown(repo, pages):
     assert unshown(repo / "docs" / "img", pages) == []
 
 
-def files_not_there(repo: Path, pages: list[Path]) -> list[str]:
+def files_not_there(repo, pages):
     """Return the source files that pages name and that do not exist."""
     roots = (
         repo,
@@ -153,7 +152,7 @@ def test_files_that_pages_name_exist(repo, pages):
     assert [line for line in files_not_there(repo, pages) if not OF_LAB.search(line)] == []
 
 
-def imports_of_nothing(repo: Path, pages: list[Path]) -> list[str]:
+def imports_of_nothing(repo, pages):
     """Return the names that examples in Python import and that do not exist; an example that does
     not parse raises.
     """

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -54,7 +53,7 @@ COMMANDS = [
 
 
 @contextmanager
-def running(words: Sequence[str], folder: Path) -> Iterator[None]:
+def running(words, folder):
     """Run a service until its caller is done; it must say that it serves, and end well when it is
     stopped.
     """
@@ -73,7 +72,7 @@ def running(words: Sequence[str], folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def control_unit(address: str, unit: str) -> Iterator[None]:
+def control_unit(address, unit):
     with subprocess.Popen([sys.executable, "-m", unit, address]) as process:
         time.sleep(
             3.0

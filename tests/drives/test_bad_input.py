@@ -23,10 +23,10 @@ pytestmark = pytest.mark.slow
 Change = Callable[[Path], None]
 
 
-def poses(change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> Change:
+def poses(change):
     """Change the poses of a KITTI folder."""
 
-    def apply(folder: Path) -> None:
+    def apply(folder):
         path = folder / "poses.txt"
         rows = [
             np.array([float(word) for word in line.split()]).reshape(3, 4)
@@ -39,54 +39,54 @@ def poses(change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> Change:
     return apply
 
 
-def not_a_number(rows: list[np.ndarray]) -> list[np.ndarray]:
+def not_a_number(rows):
     rows[5][0, 3] = np.nan
     return rows
 
 
-def left_handed(rows: list[np.ndarray]) -> list[np.ndarray]:
+def left_handed(rows):
     rows[7][:, 0] *= -1
     return rows
 
 
-def sheared(rows: list[np.ndarray]) -> list[np.ndarray]:
+def sheared(rows):
     rows[2][:, 1] *= 1.4
     return rows
 
 
-def centimetres_from_the_twelfth_on(rows: list[np.ndarray]) -> list[np.ndarray]:
+def centimetres_from_the_twelfth_on(rows):
     start = rows[11][:, 3].copy()
     for row in rows[12:]:
         row[:, 3] = start + 100 * (row[:, 3] - start)
     return rows
 
 
-def standing(rows: list[np.ndarray]) -> list[np.ndarray]:
+def standing(rows):
     for row in rows:
         row[:, 3] = rows[0][:, 3]
     return rows
 
 
-def turning_only(rows: list[np.ndarray]) -> list[np.ndarray]:
+def turning_only(rows):
     for i, row in enumerate(rows):
         row[:, :3] = cv2.Rodrigues(np.array([0.0, 0.05 * i, 0.0]))[0]
         row[:, 3] = 0.001 * i
     return rows
 
 
-def other_poses(rows: list[np.ndarray]) -> list[np.ndarray]:
+def other_poses(rows):
     """Poses of a drive to the side."""
     for row in rows:
         row[:, 3] = [row[2, 3], 0.0, 0.0]
     return rows
 
 
-def cut_off(folder: Path) -> None:
+def cut_off(folder):
     path = folder / "image_r/000010.png"
     path.write_bytes(path.read_bytes()[:-200])
 
 
-def cut_off_jpeg(folder: Path) -> None:
+def cut_off_jpeg(folder):
     for path in sorted((folder / "image_r").iterdir()):
         data = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
         path.with_suffix(".jpg").write_bytes(
@@ -95,12 +95,12 @@ def cut_off_jpeg(folder: Path) -> None:
         path.unlink()
 
 
-def another_size(folder: Path) -> None:
+def another_size(folder):
     path = folder / "image_l/000004.png"
     cv2.imwrite(str(path), cv2.imread(str(path))[:-8])
 
 
-def printed_colours(folder: Path) -> None:
+def printed_colours(folder):
     for path in sorted((folder / "image_l").iterdir()):
         path.with_suffix(".jpg").write_bytes(
             cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
@@ -113,14 +113,14 @@ def printed_colours(folder: Path) -> None:
     path.write_bytes(bytes(data))
 
 
-def hundred_megapixels(folder: Path) -> None:
+def hundred_megapixels(folder):
     path = folder / "image_l/000000.png"
     data = bytearray(path.read_bytes())
     data[16:24] = struct.pack(">II", 10_000, 10_000)
     path.write_bytes(bytes(data))
 
 
-def many_pictures_without_poses(folder: Path) -> None:
+def many_pictures_without_poses(folder):
     path = folder / "poses.txt"
     path.write_text("\n".join(path.read_text().splitlines()[:12]))
 

@@ -15,16 +15,16 @@ HEIGHT_M = 1.6
 PATH_X = np.arange(0.0, 60.0, 1.0)
 
 
-def road(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def road(x, y):
     """Return a road that rises to a crest, tilts, and has kerbs of 12 cm beside it."""
     return 0.6 * np.sin(x / 20) + 0.02 * y + np.where(np.abs(y) > 2.0, 0.12, 0.0)
 
 
-def path() -> np.ndarray:
+def path():
     return np.column_stack([PATH_X, 0 * PATH_X, road(PATH_X, 0 * PATH_X) + HEIGHT_M])
 
 
-def points_on(xy: np.ndarray, lift: np.ndarray | float = 0.0, spread_m: float = 0.01) -> Points:
+def points_on(xy, lift=0.0, spread_m=0.01):
     z = road(xy[:, 0], xy[:, 1]) + lift
     return Points(
         np.column_stack([xy, z]),

@@ -18,7 +18,7 @@ from scenarios.load import load_scenario
 LOW, HIGH = np.array([12.0, 1.6, 0.0]), np.array([16.4, 3.4, 1.5])  # a parked car
 
 
-def surface(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+def surface(low, high, count):
     """Return points on the four sides of an upright box."""
     rng = stream("obstacles", 0, "surface")
     points = rng.uniform(low, high, (count, 3))
@@ -28,13 +28,13 @@ def surface(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     return points
 
 
-def cloud_at(points: np.ndarray, size_m: float = 0.06, opacity: float = 0.9) -> GaussianCloud:
+def cloud_at(points, size_m=0.06, opacity=0.9):
     n = len(points)
     quats, scales = np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), size_m)
     return GaussianCloud(points, quats, scales, np.full(n, opacity), np.zeros((n, 1, 3)))
 
 
-def straight(length_m: float = 30.0) -> Trajectory:
+def straight(length_m=30.0):
     x = np.arange(0.0, length_m)
     return Trajectory(
         (x * 1e5).astype(np.int64),
@@ -43,7 +43,7 @@ def straight(length_m: float = 30.0) -> Trajectory:
     )
 
 
-def points_at(xyz: np.ndarray, spread_m: float) -> Points:
+def points_at(xyz, spread_m):
     return Points(
         xyz, np.full(xyz.shape, 0.5), np.tile(np.eye(3) * spread_m**2 / 3, (len(xyz), 1, 1))
     )

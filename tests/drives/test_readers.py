@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,8 +11,8 @@ import pytest
 
 from alpasim_plugin.drives.build import _points
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, place
-from alpasim_plugin.drives.source import SourceDrive, checked
+from alpasim_plugin.drives.placing import place
+from alpasim_plugin.drives.source import checked
 from tests.drives.street import COUNT, STEP_M, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
@@ -21,16 +20,16 @@ pytestmark = pytest.mark.slow
 WAY_M = (COUNT - 1) * STEP_M
 
 
-def told(*given: Any) -> None:
+def told(*given: Any):
     """Take reports of progress."""
 
 
-def opened(folder: Path) -> tuple[SourceDrive, PlacedDrive]:
+def opened(folder):
     drive = checked(read_source(folder), folder)
     return drive, place(drive, _points(drive, folder, told), camera_height_m=1.5)
 
 
-def assert_is_the_street(placed: PlacedDrive, rel: float = 0.03) -> None:
+def assert_is_the_street(placed, rel=0.03):
     ego = placed.ego.xyz
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx(WAY_M, rel=rel)
     assert np.abs(placed.strip.section_errors).max() < 0.05

@@ -5,7 +5,6 @@ Gaussians; and not in another frame.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ pytestmark = pytest.mark.slow
 UNIT = 0.2  # of the model, metres
 
 
-def street_cloud(scale: float = UNIT, turn: np.ndarray | None = None) -> GaussianCloud:
+def street_cloud(scale=UNIT, turn=None):
     """Return the street's road and walls as Gaussians, in a unit and a frame of their own."""
     rng = stream("splat", 0, "street")
     road = rng.uniform([-2.0, -4.0, 0.0], [40.0, 4.0, 0.0], (12_000, 3))
@@ -45,9 +44,7 @@ def street_cloud(scale: float = UNIT, turn: np.ndarray | None = None) -> Gaussia
     )
 
 
-def poses_of(
-    folder: Path, scale: float = UNIT, turn: np.ndarray | None = None, photographs: bool = False
-) -> Path:
+def poses_of(folder, scale=UNIT, turn=None, photographs=False):
     """Write the poses of the drive in the model's frame."""
     path = write_transforms(folder) / "transforms.json"
     document = json.loads(path.read_text())
@@ -64,7 +61,7 @@ def poses_of(
     return path
 
 
-def assert_drives(out: Path) -> None:
+def assert_drives(out):
     scenario = load_scenario(out / "scenario.yaml")
     ego = scenario.ego_log.xyz
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.05)

@@ -31,7 +31,7 @@ from tests.evaluators.golden import RUN, SETS, close, golden_set
 ALPASIM = PRESETS["alpasim"]
 
 
-def same(got: Any, want: Any, path: str = "") -> list[str]:
+def same(got, want, path=""):
     """List where two documents differ; numbers to 1e-4 absolute or 1e-5 relative."""
     if isinstance(want, dict) and isinstance(got, dict):
         odd = [f"{path}/{key}" for key in set(got) ^ set(want)]
@@ -102,9 +102,7 @@ def test_runs_that_alpasim_stops_at_stop_here_with_the_same_metric(shared_data, 
 # --- by hand
 
 
-def rollout(
-    name: str, scene: str = "s", n: int = 4, absent: tuple[str, ...] = (), **values: Any
-) -> ScoredRollout:
+def rollout(name, scene="s", n=4, absent=(), **values: Any):
     """A rollout of n steps in which nothing happens, except for what is given as a number or one
     number a step.
     """
@@ -128,7 +126,7 @@ def rollout(
     return ScoredRollout(scene, name, tuple(made), *RUN)
 
 
-def table(*rollouts: ScoredRollout) -> dict[str, Any]:
+def table(*rollouts: ScoredRollout):
     return over_sweeps(reduce_run(rollouts, ALPASIM))
 
 

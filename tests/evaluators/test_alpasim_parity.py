@@ -5,14 +5,12 @@ after its modifiers.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evaluators import PRESETS, reduce_rollout
 from evaluators.alpasim import load_settings
-from evaluators.metrics.presets import Preset
 from tests.evaluators.golden import close, expected, scored
 
 ALPASIM = PRESETS["alpasim"]
@@ -50,9 +48,7 @@ SCENES = (
 )
 
 
-def assert_steps(
-    log: Path, archive: Path, preset: Preset, rails: bool = True, table: Path | None = None
-) -> None:
+def assert_steps(log, archive, preset, rails=True, table=None):
     found = {one.name: one for one in scored(log, archive, preset, rails)}
     want = expected(table or log.parent)
     assert set(found) == set(want)
@@ -77,13 +73,13 @@ def assert_steps(
 
 
 def assert_reduced(
-    log: Path,
-    archive: Path,
-    preset: Preset,
-    want: dict,
-    rails: bool = True,
-    skip: frozenset[str] = frozenset(),
-) -> None:
+    log,
+    archive,
+    preset,
+    want,
+    rails=True,
+    skip=frozenset(),
+):
     values = {
         name: one.value
         for name, one in reduce_rollout(scored(log, archive, preset, rails), preset).values.items()
@@ -98,7 +94,7 @@ def assert_reduced(
             assert close(got, value), (name, got, value)
 
 
-def summary_rows(folder: Path, aggregate: str = "aggregate") -> dict[tuple[str, str], dict]:
+def summary_rows(folder, aggregate="aggregate"):
     rows = json.loads((folder / aggregate / "results-summary.json").read_text())["rollouts"]
     return {(row["clipgt_id"], row["rollout_id"]): row for row in rows}
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import LaneMap, RolloutLog, Trajectory
+from alpasim_plugin.core.types import Trajectory
 from evaluators import METRICS, PRESETS, preset, reduce_rollout, rollout_values, score
 from evaluators.alpasim import (
     EvalSettings,
@@ -47,12 +47,12 @@ def test_distance_to_the_side_ignores_what_was_driven_past_the_end(path, at, awa
     assert from_corridor(line, s, point, distance_m) == pytest.approx([away_m])
 
 
-def drift(y_end: float, x_end: float = 50.0) -> RolloutLog:
+def drift(y_end, x_end=50.0):
     ego = track(np.linspace(0.0, x_end, 51), np.linspace(0.0, y_end, 51))
     return rollout(ego, log=RECORDED, warmup_us=500_000)
 
 
-def values(log: RolloutLog, chosen, road: LaneMap = TWO_LANES):
+def values(log, chosen, road=TWO_LANES):
     return {
         name: one.value
         for name, one in rollout_values(score(log, scene(road, log), chosen), chosen).items()
@@ -94,7 +94,7 @@ def test_progress_is_a_share_of_what_the_recording_reaches():
 
 
 def test_a_road_edge_overhead_is_not_touched():
-    def edge(y: float, z: float) -> np.ndarray:
+    def edge(y, z):
         x = np.arange(-50.0, 200.0, 2.0)
         return np.column_stack([x, np.full_like(x, y), np.full_like(x, z)])
 

@@ -28,7 +28,7 @@ def test_of_zeros_and_ones_it_is_the_bound_of_clopper_and_pearson(k, n):
     assert upper_bound(values, 1.0) == pytest.approx(stats.beta.ppf(0.975, k + 1, n - k), abs=1e-6)
 
 
-def by_drawing(values: np.ndarray, most: float) -> float:
+def by_drawing(values, most):
     """Return the bound by its definition: the quantile of the weighted mean with uniform weights on
     the simplex.
     """

@@ -4,7 +4,6 @@ verdicts, and what is missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,7 @@ METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacl
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")
 
 
-def rows_like_a_run(
-    renderers: Sequence[str], policies: Sequence[str], scenes: int, seeds: Sequence[int], key: int
-) -> list[dict[str, Any]]:
+def rows_like_a_run(renderers, policies, scenes, seeds, key):
     """Make rows with failures, invalid and infinite values, and cells that one side lacks."""
     rng = np.random.Generator(np.random.Philox(key))
     rows = []
@@ -64,7 +61,7 @@ def rows_like_a_run(
     return rows
 
 
-def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+def table_of(rows):
     types = {**dict.fromkeys(KEYS, pa.string()), "seed": pa.int64()}
     names = [
         name
@@ -80,9 +77,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
     )
 
 
-def by_rows(
-    rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping[str, str]
-) -> dict[str, Any]:
+def by_rows(rows, baseline, bases):
     """Aggregate as the documentation says, with rows in memory."""
     out: dict[str, dict[str, Any]] = {"metrics": {}, "paired": {}, "paired_with_base": {}}
     policies = list(dict.fromkeys(row["policy"] for row in rows))
@@ -128,7 +123,7 @@ def test_columns_give_what_rows_give(
     baseline, bases = renderers[-1], {"onefixer": "3dgs"}
     wanted = by_rows(rows, baseline, bases)
 
-    def numbers_by_renderer(table: RolloutTable) -> dict[str, Any]:
+    def numbers_by_renderer(table):
         return {
             block: part
             for block, part in numbers(table, baseline, bases).items()

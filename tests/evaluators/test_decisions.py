@@ -17,11 +17,11 @@ from evaluators.statistics.decision import (
 )
 
 
-def rng(key: int) -> np.random.Generator:
+def rng(key):
     return np.random.Generator(np.random.Philox(key))
 
 
-def asked(*metrics: tuple[str, float], **fields) -> Question:
+def asked(*metrics: tuple[str, float], **fields):
     return Question(tuple(metric_question(name, margin) for name, margin in metrics), **fields)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.statistics.gate import (
     GateSpec,
-    GateVerdict,
     MetricRule,
     judge,
     load_gate,
@@ -35,7 +33,7 @@ RULES = {
 Rows = list[dict[str, Any]]
 
 
-def rows(renderer: str = "3dgs", scenes: int = SCENES, seeds: int = 1, policy: str = "p") -> Rows:
+def rows(renderer="3dgs", scenes=SCENES, seeds=1, policy="p"):
     """Rows of one renderer, the same for each."""
     rng = np.random.Generator(np.random.Philox(9))
     made = []
@@ -55,21 +53,19 @@ def rows(renderer: str = "3dgs", scenes: int = SCENES, seeds: int = 1, policy: s
     return made
 
 
-def table_of(made: Rows) -> RolloutTable:
+def table_of(made):
     return RolloutTable.of_table(pa.Table.from_pylist(made))
 
 
-def judged(
-    run: Rows, spec: GateSpec, stored: Rows | None = None, name: str = "", **fields: Any
-) -> GateVerdict:
+def judged(run, spec, stored=None, name="", **fields: Any):
     base = None if stored is None else table_of(stored)
     return judge(table_of(run), spec, base, name, **fields)
 
 
-def add(change: float, metric: str = "lateral_distance_m", where: slice = slice(None)):
+def add(change, metric="lateral_distance_m", where=slice(None)):
     """Return a change of one metric in some of the rows."""
 
-    def changed(candidate: Rows) -> Rows:
+    def changed(candidate):
         for row in candidate[where]:
             row[metric] += change
         return candidate
@@ -77,8 +73,8 @@ def add(change: float, metric: str = "lateral_distance_m", where: slice = slice(
     return changed
 
 
-def invalid(metric: str, where: slice = slice(None)):
-    def changed(candidate: Rows) -> Rows:
+def invalid(metric, where=slice(None)):
+    def changed(candidate):
         for row in candidate[where]:
             row[metric], row[f"{metric}_valid"] = None, False
         return candidate
@@ -87,7 +83,7 @@ def invalid(metric: str, where: slice = slice(None)):
 
 
 def both(*changes: Callable[[Rows], Rows]):
-    def changed(candidate: Rows) -> Rows:
+    def changed(candidate):
         for change in changes:
             candidate = change(candidate)
         return candidate
@@ -95,7 +91,7 @@ def both(*changes: Callable[[Rows], Rows]):
     return changed
 
 
-def same(candidate: Rows) -> Rows:
+def same(candidate):
     return candidate
 
 
@@ -103,13 +99,11 @@ ONE, THREE = slice(4, 5), slice(5, 8)
 NEW = add(1.0, "collision_at_fault", ONE)
 
 
-def gate(**fields: Any) -> GateSpec:
+def gate(**fields: Any):
     return GateSpec(**{"version": 1, "metrics": RULES, **fields})
 
 
-def code(
-    now, before=same, spec: GateSpec | None = None, is_noisy: bool = False, **size: int
-) -> int:
+def code(now, before=same, spec=None, is_noisy=False, **size: int):
     """Return the exit code of a change of the run and one of its baseline."""
     stored = before(rows(renderer="clean", **size))
     return judged([*stored, *now(rows(**size))], spec or gate(), repeatable=not is_noisy).exit_code
@@ -149,24 +143,24 @@ def code(
 )
 def test_a_suite_is_green_where_nothing_is_new_and_distances_are_within_their_margins(
     now, before, wanted
-) -> None:
+):
     assert code(now, before) == wanted
 
 
 @pytest.mark.parametrize("is_noisy", [False, True])
 @pytest.mark.parametrize("scenes", [1, 3, SCENES])
-def test_equal_runs_of_any_size_are_green(scenes: int, is_noisy: bool) -> None:
+def test_equal_runs_of_any_size_are_green(scenes, is_noisy):
     assert code(same, scenes=scenes, is_noisy=is_noisy) == 0
 
 
-def test_seeds_of_a_scene_are_averaged_and_each_must_have_its_pair() -> None:
+def test_seeds_of_a_scene_are_averaged_and_each_must_have_its_pair():
     assert code(add(0.4, where=ONE), seeds=2) == 0  # of two seeds: the scene by two margins
     assert code(add(0.7, where=ONE), seeds=2) == 1
     assert code(NEW, seeds=2) == 1
     assert code(lambda run: run[1:], seeds=2) == 2
 
 
-def test_new_events_are_accepted_by_number_and_margins_by_size() -> None:
+def test_new_events_are_accepted_by_number_and_margins_by_size():
     accepting = RULES | {"collision_at_fault": MetricRule(max_new=1)}
     assert code(NEW, spec=gate(metrics=accepting)) == 0
     assert code(NEW, spec=gate(max_new=1)) == 0
@@ -180,8 +174,8 @@ def test_new_events_are_accepted_by_number_and_margins_by_size() -> None:
     assert code(add(1e-3, where=ONE), spec=gate(metrics=none)) == 1
 
 
-def test_without_a_better_side_a_change_to_either_is_worse() -> None:
-    def biased(bias: float):
+def test_without_a_better_side_a_change_to_either_is_worse():
+    def biased(bias):
         return lambda run: [
             row | {"lateral_bias_m": bias, "lateral_bias_m_valid": True} for row in run
         ]
@@ -195,7 +189,7 @@ def test_without_a_better_side_a_change_to_either_is_worse() -> None:
     ]
 
 
-def test_a_distance_that_an_event_cut_short_is_compared_with_none() -> None:
+def test_a_distance_that_an_event_cut_short_is_compared_with_none():
     """A rollout that ends early is near its path for as long as it lasts."""
     short = both(add(1.0, "collision_any", ONE), add(-0.3, where=ONE))
     spec = gate(metrics={"lateral_distance_m": RULES["lateral_distance_m"]})
@@ -213,7 +207,7 @@ def test_a_distance_that_an_event_cut_short_is_compared_with_none() -> None:
     assert driven_on.exit_code == 0  # its rollouts go on after an event
 
 
-def test_a_verdict_counts_and_names_what_changed() -> None:
+def test_a_verdict_counts_and_names_what_changed():
     stored = add(1.0, "collision_at_fault", THREE)(rows("clean"))
     verdict = judged([*stored, *both(NEW, add(0.4, where=ONE))(rows())], gate())
     checks = {check.metric: check for check in verdict.checks}
@@ -231,10 +225,10 @@ def test_a_verdict_counts_and_names_what_changed() -> None:
 # --- policies that are not repeatable
 
 
-def often(share: float, key: int, metric: str = "collision_at_fault"):
+def often(share, key, metric="collision_at_fault"):
     """Return rows in which an event happens at random."""
 
-    def changed(candidate: Rows) -> Rows:
+    def changed(candidate):
         rng = np.random.Generator(np.random.Philox(key))
         for row in candidate:
             row[metric] = float(rng.random() < share)
@@ -263,7 +257,7 @@ def test_a_policy_that_is_not_repeatable_is_tested_over_its_seeds(now, before, s
     assert code(now, before, is_noisy=True, seeds=seeds) == wanted
 
 
-def test_an_undecided_gate_says_how_many_seeds_would_decide() -> None:
+def test_an_undecided_gate_says_how_many_seeds_would_decide():
     verdict = judged([*rows("clean"), *often(0.0, 1)(rows())], gate(), repeatable=False)
     undecided = {check.metric: check for check in verdict.checks if check.cause == "undecided"}
     assert undecided["offroad"].entry["seeds"] == 3
@@ -274,7 +268,7 @@ def test_an_undecided_gate_says_how_many_seeds_would_decide() -> None:
 # --- what scenes stand for
 
 
-def test_a_gate_about_other_scenes_is_refused_where_they_are_too_few_and_else_decides() -> None:
+def test_a_gate_about_other_scenes_is_refused_where_they_are_too_few_and_else_decides():
     others = {name: rule for name, rule in RULES.items() if rule.must_decide}
     spec = gate(population="scenes", metrics=others)
     with pytest.raises(InputError) as caught:
@@ -296,8 +290,8 @@ def test_a_gate_about_other_scenes_is_refused_where_they_are_too_few_and_else_de
 # --- what is compared with what
 
 
-def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators() -> None:
-    def failed(kind: str):
+def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators():
+    def failed(kind):
         return lambda run: [run[0] | {"status": "failed", "failure_class": kind}, *run[1:]]
 
     assert code(failed("renderer")) == 4
@@ -306,7 +300,7 @@ def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators() -
     assert code(failed("evaluator")) == 5
 
 
-def test_renderers_and_policies_are_judged_one_by_one() -> None:
+def test_renderers_and_policies_are_judged_one_by_one():
     both_renderers = [*rows("clean"), *rows("good"), *add(0.5)(rows("worse one"))]
     verdict = judged(both_renderers, gate())
     distances = [c for c in verdict.checks if c.metric == "lateral_distance_m"]
@@ -323,7 +317,7 @@ def test_renderers_and_policies_are_judged_one_by_one() -> None:
     }
 
 
-def test_a_stored_baseline_meets_the_renderer_of_the_same_name() -> None:
+def test_a_stored_baseline_meets_the_renderer_of_the_same_name():
     stored = [*rows("clean"), *rows()]
     verdict = judged([*rows("clean"), *add(0.5)(rows())], gate(), stored, "main.json")
     assert {(c.renderer, c.cause) for c in verdict.checks if c.metric == "lateral_distance_m"} == {
@@ -333,7 +327,7 @@ def test_a_stored_baseline_meets_the_renderer_of_the_same_name() -> None:
     assert verdict.baseline == "main.json"
 
 
-def test_a_gate_of_limits_names_a_new_collision_where_there_is_a_baseline() -> None:
+def test_a_gate_of_limits_names_a_new_collision_where_there_is_a_baseline():
     stored = rows()
     collided = add(1.0, "collision_any", ONE)(rows())
     limits = gate(metrics={"lateral_distance_m": MetricRule(max=9.0)})
@@ -345,7 +339,7 @@ def test_a_gate_of_limits_names_a_new_collision_where_there_is_a_baseline() -> N
     assert any("collision_any" in check.text for check in accepted.checks)
 
 
-def test_names_that_are_not_there_are_refused() -> None:
+def test_names_that_are_not_there_are_refused():
     one = rows("clean")
     for run, spec in (
         (one, gate()),
@@ -358,7 +352,7 @@ def test_names_that_are_not_there_are_refused() -> None:
     assert judged(one, limits).exit_code == 0  # limits need no second renderer
 
 
-def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides() -> None:
+def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
     assert EXIT_CODES == {
         "pass": 0,
         "regression": 1,
@@ -415,7 +409,7 @@ def test_shipped_gates_load_by_name(name):
         ("version: 1\nmetrics: {offroad: {margin: 0.1}\n", ":2:", "not valid YAML"),
     ],
 )
-def test_a_bad_gate_file_is_refused_with_its_line_and_a_hint(tmp_path: Path, text, place, mention):
+def test_a_bad_gate_file_is_refused_with_its_line_and_a_hint(tmp_path, text, place, mention):
     path = tmp_path / "gate.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:

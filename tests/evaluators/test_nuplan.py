@@ -28,7 +28,7 @@ SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_
 }
 
 
-def states(rows) -> EgoStates:
+def states(rows):
     pose, velocity, accel = (
         np.array([row[key] for row in rows], dtype=float)
         for key in ("pose", "velocity", "acceleration")
@@ -38,7 +38,7 @@ def states(rows) -> EgoStates:
     return EgoStates(t_us, pose[:, :2], pose[:, 2], velocity, accel, size, (FRONT_M - REAR_M) / 2)
 
 
-def tracks(worlds) -> Tracks:
+def tracks(worlds):
     kinds = {
         "bicycles": "vru",
         "pedestrians": "vru",
@@ -76,7 +76,7 @@ def tracks(worlds) -> Tracks:
     )
 
 
-def devkit_statistics(values) -> dict[str, float]:
+def devkit_statistics(values):
     """Greatest, least and mean, and the 90th percentile of the magnitudes, to two digits, as the
     devkit reports a series.
     """
@@ -85,7 +85,7 @@ def devkit_statistics(values) -> dict[str, float]:
     return {name: round(float(value), 2) for name, value in reduced.items()}
 
 
-def found_statistics(name, scene) -> list[float | bool]:
+def found_statistics(name, scene):
     """The values that the devkit lists for a metric, in its order, as far as our definitions give
     them.
     """

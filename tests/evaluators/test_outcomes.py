@@ -26,7 +26,7 @@ DT_S, V = 0.1, 8.0
 T = np.arange(0.0, 12.0, DT_S)
 
 
-def track(x, y=0.0) -> Trajectory:
+def track(x, y=0.0):
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     xyz = np.stack([x, y, np.zeros(len(x))], axis=1)
     return Trajectory(
@@ -36,14 +36,12 @@ def track(x, y=0.0) -> Trajectory:
     )
 
 
-def travelled(v) -> np.ndarray:
+def travelled(v):
     """Return how far speeds ``(T,)`` lead."""
     return np.concatenate([[0.0], np.cumsum(np.asarray(v, float)[:-1] * DT_S)])
 
 
-def drive(
-    ego: Trajectory, recorded: Trajectory | None = None, actors: dict[str, Trajectory] | None = None
-) -> tuple[RolloutLog, Scene]:
+def drive(ego, recorded=None, actors=None):
     vehicle = Vehicle()
     T_rig_box = np.eye(4)
     T_rig_box[:3, 3] = [vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2]
@@ -69,7 +67,7 @@ def drive(
     return log, Scene("road", LaneMap({}, ()), path, vehicle)
 
 
-def fired(*of) -> set[str]:
+def fired(*of):
     return {
         one.name
         for one in evaluate_outcomes(*drive(*of), PRESETS["paper"])
@@ -77,7 +75,7 @@ def fired(*of) -> set[str]:
     }
 
 
-def slowing(to: float = 0.4, after_s: float = 3.0) -> np.ndarray:
+def slowing(to=0.4, after_s=3.0):
     return np.where(after_s > T, V, np.maximum(V - 3.0 * (T - after_s), to))
 
 
@@ -180,7 +178,7 @@ def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest()
 
 
 def test_outcomes_are_counted_by_arm_with_place_and_time():
-    def manifest(policy: str, scene: str, **flags: float) -> dict:
+    def manifest(policy, scene, **flags: float):
         metrics = {
             name: {"value": value, "valid": True}
             for name, value in ({"progress": 1.0} | flags).items()

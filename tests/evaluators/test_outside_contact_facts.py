@@ -18,13 +18,13 @@ EGO = Box(4.049 + 1.127, 2.297, 1.8)  # front and rear overhang from the rear ax
 CENTRE_AHEAD_M = (4.049 - 1.127) / 2
 
 
-def poses(rows: list[list[float]], t_us: list[int], ahead_m: float = 0.0) -> Trajectory:
+def poses(rows, t_us, ahead_m=0.0):
     x, y, yaw = np.array(rows, dtype=float).T
     xyz = np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw), np.zeros_like(x)], axis=1)
     return Trajectory(np.array(t_us, dtype=np.int64), xyz, quat_from_yaw(yaw))
 
 
-def first_contacts(path) -> dict[str, int]:
+def first_contacts(path):
     data = json.loads(path.read_text())
     egos = [data["ego"], *data.get("ego_future_states", [])]
     worlds = [data["world"], *data.get("world_future_states", [])]

@@ -25,10 +25,10 @@ from tests.evaluators.eval_build import (
 from tests.evaluators.reference import open_loop_by_plan
 
 
-def plan(now: int, x, y=0.0, samples=(), dt_us=DT_US) -> LoggedPlan:
+def plan(now, x, y=0.0, samples=(), dt_us=DT_US):
     """A plan whose box centre runs along the given positions from step ``now`` on."""
 
-    def poses(xs, ys) -> Trajectory:
+    def poses(xs, ys):
         n = np.size(xs)
         return offset_trajectory(
             track(xs, ys, t_us=now * DT_US + dt_us * np.arange(n)), inverse(T_RIG_BOX)
@@ -164,7 +164,7 @@ def test_without_samples_there_is_no_min_ade():
     ]
 
 
-def image(t_us: int, level: int, camera="front", suffix=".png") -> LoggedImage:
+def image(t_us, level, camera="front", suffix=".png"):
     pixels = np.full((8, 12, 3), level, np.uint8)
     return LoggedImage(camera, t_us, t_us, cv2.imencode(suffix, pixels)[1].tobytes())
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from evaluators.metrics.contact import find_contacts
 from evaluators.metrics.footprint import ActorTable, ego_footprints
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
-from scenarios.recorded import RecordedLog
 from tests.examples import first_of
 
 PAPER = PRESETS["paper"]
@@ -33,13 +31,13 @@ LOGS = (*ARGOVERSE, "USA_US101-3_3_T-1", "USA_Lanker-1_1_T-1")
 
 
 @lru_cache(maxsize=6)
-def read(folder: Path, name: str) -> RecordedLog:
+def read(folder, name):
     if name in ARGOVERSE:
         return read_argoverse(folder / "av2" / name)
     return read_commonroad(folder / "commonroad" / f"{name}.xml")
 
 
-def replayed(log: RecordedLog, t_us: np.ndarray) -> tuple[RolloutLog, Scene]:
+def replayed(log, t_us):
     T_rig_box = np.eye(4)
     T_rig_box[:3, 3] = [log.vehicle.rear_axle_to_centre_m, 0.0, log.vehicle.box.height_m / 2]
     rig = trajectory_from_poses(t_us, interpolate(log.ego_log, t_us))
@@ -63,7 +61,7 @@ def replayed(log: RecordedLog, t_us: np.ndarray) -> tuple[RolloutLog, Scene]:
     return rollout, Scene(log.scene_id, log.lane_map, log.ego_log, log.vehicle)
 
 
-def grid(log: RecordedLog) -> np.ndarray:
+def grid(log):
     return np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1] + 1, 100_000)
 
 

@@ -22,7 +22,7 @@ def bad(**changes):
     return broken, scene(TWO_LANES, log)
 
 
-def broken_track(index, **values) -> Trajectory:
+def broken_track(index, **values):
     poses = track(np.arange(4.0), 0.0)
     arrays = {"t_us": poses.t_us.copy(), "xyz": poses.xyz.copy(), "quat": poses.quat.copy()}
     for name, value in values.items():

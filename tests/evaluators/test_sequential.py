@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -26,15 +25,15 @@ from evaluators.statistics.decision import closed
 PLAN = Plan(0.1, 50, 0.05)
 
 
-def rng(key: int) -> np.random.Generator:
+def rng(key):
     return np.random.Generator(np.random.Philox(key))
 
 
-def capital(draws: Draws, mean: float, plan: Plan = PLAN) -> np.ndarray:
+def capital(draws, mean, plan=PLAN):
     return np.exp(betting.log_capital(draws, mean, betting.bet_sizes(draws, mean, plan)))
 
 
-def log_chance(gap: float, left: float, slope: float) -> float:
+def log_chance(gap, left, slope):
     """Siegmund (1985), equation 3.15, as it stands."""
     normal = [
         0.5 * math.erfc(-at / math.sqrt(2 * left))
@@ -43,9 +42,7 @@ def log_chance(gap: float, left: float, slope: float) -> float:
     return math.log(normal[0] + math.exp(-2 * slope * gap) * normal[1])
 
 
-def plain_log_capital(
-    x: Sequence[float], low: float, high: float, mean: float, plan: Plan
-) -> list[float]:
+def plain_log_capital(x, low, high, mean, plan):
     """Bet scene by scene, as the modules' texts say."""
     half = (high - low) / 2
     imagined = betting.PRIOR_SCENES * (2 * betting.PRIOR_WIDTH * half) ** 2
@@ -80,7 +77,7 @@ def plain_log_capital(
 # --- the line
 
 
-def first(draws: Draws, n: int) -> Draws:
+def first(draws, n):
     return Draws(draws.x[..., :n], draws.reach)
 
 

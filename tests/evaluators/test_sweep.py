@@ -18,7 +18,7 @@ EGO = (4.855, 1.88)
 CAR = (4.5, 1.8)
 
 
-def pair(a: Motion, b: Motion) -> Motions:
+def pair(a, b):
     row = lambda *v: np.array([v], dtype=float)  # noqa: E731
     start = np.subtract(b.xy, a.xy)[None]
     return Motions(
@@ -30,12 +30,12 @@ def pair(a: Motion, b: Motion) -> Motions:
     )
 
 
-def contact(a: Motion, b: Motion) -> float | None:
+def contact(a, b):
     tau = float(first_contact(pair(a, b))[0])
     return tau if math.isfinite(tau) else None
 
 
-def assert_twins_agree(a: Motion, b: Motion) -> None:
+def assert_twins_agree(a, b):
     fast, slow = contact(a, b), first_touch(a, b)
     if fast is None:
         assert slow is None  # no contact is ever passed over
@@ -50,13 +50,11 @@ def assert_twins_agree(a: Motion, b: Motion) -> None:
         assert before == 0.0 or separation(a, b, Decimal(before)) > 0
 
 
-def still(x: float, y: float, yaw: float = 0.0, size=CAR) -> Motion:
+def still(x, y, yaw=0.0, size=CAR):
     return Motion((x, y), (0.0, 0.0), yaw, 0.0, size)
 
 
-def moving(
-    x: float, y: float, dx: float, dy: float, yaw: float = 0.0, turn: float = 0.0, size=CAR
-) -> Motion:
+def moving(x, y, dx, dy, yaw=0.0, turn=0.0, size=CAR):
     return Motion((x, y), (dx, dy), yaw, turn, size)
 
 

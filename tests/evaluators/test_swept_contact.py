@@ -234,7 +234,7 @@ def test_rounded_corners_are_refused():
 # --- twin
 
 
-def twin_rows(log) -> list[dict[str, str]]:
+def twin_rows(log):
     """Actors that touch in each row, by brute force: exact at steps, decimals between."""
     at_steps = contacts_by_step(log, STRICT)
     rows = [set(one.sides) for one in at_steps]
@@ -299,7 +299,7 @@ def moved(poses, t0, t1, size, log):
     return Motion(tuple(a), tuple(b - a), float(yaw0), float(yaw1 - yaw0), size)
 
 
-def fast_rows(log) -> list[dict[str, str]]:
+def fast_rows(log):
     origin = origin_of(log.ego, STRICT)
     ego, actors = ego_footprints(log, STRICT, origin), ActorTable(log, STRICT, origin)
     contacts, _ = find_contacts(ego, actors, log.ego.t_us)
@@ -351,7 +351,7 @@ def test_random_worlds_agree_with_the_twin(log):
                 assert on_the_edge(log, row, name), (row, name, got, want)
 
 
-def on_the_edge(log, row, name) -> bool:
+def on_the_edge(log, row, name):
     """Tell whether the answer flips within a nanometre of size, or, for the side, within the
     tolerance of the place.
     """

@@ -21,10 +21,6 @@ from alpasim_plugin.core.types import (
     LaneMap,
     LoggedImage,
     LoggedPlan,
-    MetricSeries,
-    RolloutLog,
-    Scene,
-    Trajectory,
 )
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
@@ -58,33 +54,29 @@ DRIVE = track(np.arange(80) * 1.0, 0.0)
 FRONT_WIDE = "camera_front_wide_120fov"
 
 
-def both(
-    log: RolloutLog, road: LaneMap = TWO_LANES
-) -> tuple[dict[str, MetricSeries], dict[str, MetricSeries]]:
+def both(log, road=TWO_LANES):
     """Score a log with ``alpasim`` and with ``strict``."""
     return by_name(score(log, scene(road, log), "alpasim")), by_name(
         score(log, scene(road, log), "strict")
     )
 
 
-def values(log: RolloutLog, preset: str, road: LaneMap = TWO_LANES) -> dict[str, float | None]:
+def values(log, preset, road=TWO_LANES):
     return {
         name: one.value
         for name, one in rollout_values(score(log, scene(road, log), preset), preset).items()
     }
 
 
-def image(t_us: int, bright: int, camera: str = FRONT_WIDE) -> LoggedImage:
+def image(t_us, bright, camera=FRONT_WIDE):
     data = cv2.imencode(".png", np.full((4, 6, 3), bright, np.uint8))[1].tobytes()
     return LoggedImage(camera, t_us - 30_000, t_us, data)
 
 
-def plan(
-    now_us: int, xs: np.ndarray, samples=(), step_us: int = DT_US, query_us: int | None = None
-) -> LoggedPlan:
+def plan(now_us, xs, samples=(), step_us=DT_US, query_us=None):
     """A plan of box centres from ``now_us`` on; samples are (x, y) arrays at the same spacing."""
 
-    def poses(x, y) -> Trajectory:
+    def poses(x, y):
         return offset_trajectory(
             track(x, y, t_us=now_us + step_us * np.arange(np.size(x))), inverse(T_RIG_BOX)
         )
@@ -325,7 +317,7 @@ def test_d28_an_answer_between_two_logged_times_is_read_from_the_next_one():
 class Bomb:
     """Leaves a file behind when unpickled."""
 
-    def __init__(self, target: Path) -> None:
+    def __init__(self, target):
         self.target = target
 
     def __reduce__(self):
@@ -354,7 +346,7 @@ def test_d24_nothing_in_a_log_is_ever_unpickled(tmp_path):
 
 
 class OutOfOrder:
-    def __call__(self, rollout: RolloutLog, scene: Scene):
+    def __call__(self, rollout, scene):
         raise ValueError("out of order")
 
 
@@ -371,7 +363,7 @@ def test_d18_an_evaluator_that_fails_is_never_swallowed():
 
 
 def test_d23_alpasims_spread_depends_on_how_rollouts_are_named():
-    def run(names: tuple[str, ...]) -> list[ScoredRollout]:
+    def run(names):
         drives = [(scene_id, end) for scene_id in ("s1", "s2") for end in (4, 8)]
         out = []
         for name, (scene_id, end) in zip(names, drives, strict=True):

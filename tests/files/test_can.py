@@ -5,8 +5,6 @@ Every database is made here.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command
@@ -16,13 +14,13 @@ pytest.importorskip("cantools", reason="the extra [can] is not installed")
 can = pytest.importorskip("can")
 
 from alpasim_plugin.control.can_bus import Address, Exchange, open_bus  # noqa: E402
-from alpasim_plugin.control.can_codec import Codec, load_map, open_codec  # noqa: E402
+from alpasim_plugin.control.can_codec import load_map, open_codec  # noqa: E402
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: SIM ECU\n'
 EXTENDED = 1 << 31
 
 
-def message(i: int, name: str, length: int, *signals: str) -> str:
+def message(i, name, length, *signals: str):
     return f"BO_ {i} {name}: {length} ECU\n" + "".join(f" SG_ {one}\n" for one in signals) + "\n"
 
 
@@ -31,9 +29,7 @@ ANGLE = 'ANGLE : 0|16@1- (0.1,0) [-900|900] "" SIM'
 ACCEL = 'ACCEL : 16|16@1- (0.001,0) [-10|5] "" SIM'
 
 
-def opened(
-    folder: Path, *parts: str, steer: str = "", accel: str = "", send: str = ""
-) -> tuple[Codec, Path]:
+def opened(folder, *parts: str, steer="", accel="", send=""):
     """Write a database and a map of it, and open both; the standard messages fill what is not
     given.
     """
@@ -48,7 +44,7 @@ def opened(
     return open_codec(*load_map(str(folder / "map.yaml"))), folder / "map.yaml"
 
 
-def answered(codec: Codec, *frames: can.Message) -> Exchange:
+def answered(codec, *frames: can.Message):
     """Send frames to one end of a bus and take them in at the other."""
     address = Address.parse(f"test-files-{id(frames)}")
     with open_bus(address, codec) as one, open_bus(address, codec) as other:

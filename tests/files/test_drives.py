@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import struct
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import check_motion, place
-from alpasim_plugin.drives.source import Points, SourceDrive, checked
+from alpasim_plugin.drives.source import Points, checked
 from alpasim_plugin.drives.splat import _in_frame
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street
@@ -27,11 +26,11 @@ STEP_M = 1.2
 LENS = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 160.0, "cy": 54.0}
 
 
-def poses(count: int) -> list[np.ndarray]:
+def poses(count):
     return [Street().pose(STEP_M * i) for i in range(count)]
 
 
-def transforms(folder: Path, names: list[str], order: list[int] | None = None, **keys: Any) -> Path:
+def transforms(folder, names, order=None, **keys: Any):
     """Write a ``transforms.json`` whose photograph i is taken i steps along the street."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = [
@@ -44,7 +43,7 @@ def transforms(folder: Path, names: list[str], order: list[int] | None = None, *
     return folder
 
 
-def colmap(model: Path, names: list[str], points: bool = True, camera: str = "") -> None:
+def colmap(model, names, points=True, camera=""):
     model.mkdir(parents=True)
     lens = camera or f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 160 54"
     (model / "cameras.txt").write_text(f"# cameras\n7 {lens}\n")
@@ -58,7 +57,7 @@ def colmap(model: Path, names: list[str], points: bool = True, camera: str = "")
     (model / "points3D.txt").write_text("1 1.0 0.0 0.0 90 90 90 0.5 1 0\n")
 
 
-def kitti(folder: Path, calib: str, pair: str = "image_2", times: str | None = None) -> Path:
+def kitti(folder, calib, pair="image_2", times=None):
     (folder / pair).mkdir(parents=True)
     for i in range(8):
         cv2.imwrite(str(folder / pair / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
@@ -70,11 +69,11 @@ def kitti(folder: Path, calib: str, pair: str = "image_2", times: str | None = N
     return folder
 
 
-def row(name: str, focal: float) -> str:
+def row(name, focal):
     return f"{name}: {focal} 0 160 0 0 {focal} 54 0 0 0 1 0\n"
 
 
-def along(drive: SourceDrive) -> list[float]:
+def along(drive):
     return [round(float(x), 3) for x in drive.path[:, 0]]
 
 
@@ -220,13 +219,13 @@ def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path):
         check_motion(drive, place(drive, street_points(drive)))
 
 
-def street_points(drive: SourceDrive) -> Any:
+def street_points(drive):
     from alpasim_plugin.drives.splat import _surface
 
     return _surface(street_cloud())
 
 
-def street_cloud() -> GaussianCloud:
+def street_cloud():
     rng = np.random.default_rng(0)
     points = rng.uniform([-2.0, -4.0, 0.0], [40.0, 4.0, 0.0], (6000, 3))
     points[:, 2] = Street().ground(points[:, 0])
@@ -283,9 +282,7 @@ SIDE = np.eye(4)
 SIDE[:3] = [[0, 0, -1, 0], [0, 1, 0, 0.1], [1, 0, 0, -0.3]]  # from the front camera to the left one
 
 
-def rig(
-    model: Path, folders: tuple[str, str], left: list[int], binary: bool = False, turn: float = 1.0
-) -> Path:
+def rig(model, folders, left, binary=False, turn=1.0):
     """Write a rig of two cameras, 7 ahead and 9 to the left, which has images of some frames only;
     frames and images are numbered against their order.
     """
@@ -294,7 +291,7 @@ def rig(
     (model / "cameras.txt").write_text(f"7 {lens}\n9 {lens}\n")
     (model / "points3D.txt").write_text("1 1.0 0.0 0.0 90 90 90 0.5 1 0\n")
 
-    def numbers(T: np.ndarray) -> str:
+    def numbers(T):
         return " ".join(repr(float(v)) for v in [*quat_from_matrix(T[:3, :3]), *T[:3, 3]])
 
     images, frames = [], []
@@ -317,7 +314,7 @@ def rig(
     return model
 
 
-def as_binary(model: Path) -> None:
+def as_binary(model):
     """Turn a rig's text files into binary ones."""
     p = (FOCAL, FOCAL, 160.0, 54.0)
     cameras = [struct.pack("<IiQQ4d", n, 1, WIDTH, HEIGHT, *p) for n in (7, 9)]

@@ -9,15 +9,12 @@ from __future__ import annotations
 import gzip
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import CleanReport
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, MIP_PX2
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays, write_ply
@@ -30,9 +27,7 @@ from tests.gaussians.test_ply_files import NAMES, element, make_cloud, write_ele
 from tests.gaussians.test_sog import write_sog
 
 
-def model(
-    path: Path, more: dict[str, float] | None = None, comments: str = "", without: str = ""
-) -> Path:
+def model(path, more=None, comments="", without=""):
     """Write five Gaussians with further properties and comments."""
     rows = ply_rows(make_cloud(k=1))
     names = [name for name in rows.dtype.names or () if name != without]
@@ -43,7 +38,7 @@ def model(
     return path
 
 
-def opened(path: Path) -> tuple[GaussianCloud, CleanReport]:
+def opened(path):
     return read_gaussians(path)
 
 
@@ -205,7 +200,7 @@ def test_keys_of_sog_are_known_noted_or_refused(tmp_path):
 # --- SPZ
 
 
-def write_spz(path: Path, version: int, flags: int, extensions: bytes = b"") -> Path:
+def write_spz(path, version, flags, extensions=b""):
     """Write six Gaussians of degree 2 with flags and extensions in the header's places."""
     plain_spz(path, version, 6, 2, body_streams(version, 6, 2))
     data = path.read_bytes()
@@ -219,7 +214,7 @@ def write_spz(path: Path, version: int, flags: int, extensions: bytes = b"") -> 
     return path
 
 
-def record(kind: int, *values: int) -> bytes:
+def record(kind, *values: int):
     return struct.pack(f"<II{len(values)}I", kind, 4 * len(values), *values)
 
 

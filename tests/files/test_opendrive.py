@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import LaneMap
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
 from scenarios.recorded import SourceFiles
@@ -20,14 +19,14 @@ FILES = SourceFiles()
 WIDTH = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
 
 
-def lane(i: int, before: int | None = None, after: int | None = None, more: str = "") -> str:
+def lane(i, before=None, after=None, more=""):
     links = "".join(
         f'<{tag} id="{k}"/>' for tag, k in (("predecessor", before), ("successor", after)) if k
     )
     return f'<lane id="{i}" type="driving" {more}><link>{links}</link>{WIDTH}</lane>'
 
 
-def section(s: float, *lanes: str, more: str = "") -> str:
+def section(s, *lanes: str, more=""):
     sides = {"left": [], "right": []}
     for one in lanes:
         sides["right" if 'id="-' in one else "left"].append(one)
@@ -36,15 +35,15 @@ def section(s: float, *lanes: str, more: str = "") -> str:
 
 
 def road(
-    i: str,
+    i,
     *sections: str,
-    x: float = 0.0,
-    length: float = 50.0,
-    junction: str = "-1",
-    before: str = "",
-    after: str = "",
-    view: str = "",
-) -> str:
+    x=0.0,
+    length=50.0,
+    junction="-1",
+    before="",
+    after="",
+    view="",
+):
     """Write a road along x; ``before`` and ``after`` name what joins it: ``road:2:start``."""
     links = ""
     for tag, text in (("predecessor", before), ("successor", after)):
@@ -56,12 +55,12 @@ def road(
     return f'<road id="{i}" length="{length}" junction="{junction}"><link>{links}</link><planView>{view}</planView><lanes>{"".join(sections)}</lanes></road>'
 
 
-def read(*parts: str) -> tuple[LaneMap, tuple[str, ...]]:
+def read(*parts: str):
     root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
     return lane_map_of(FILES, "map.xodr", parse_map(FILES, "map.xodr", root), np.eye(4))
 
 
-def span(lanes: LaneMap, key: str) -> tuple[float, float]:
+def span(lanes, key):
     x = lanes.lanes[key].centre[:, 0]
     return round(float(x[0]), 6), round(float(x[-1]), 6)
 
@@ -160,7 +159,7 @@ def test_a_lane_that_ends_inside_the_map_is_said():
 
 
 def test_links_of_a_road_between_two_junctions_stay_apart():
-    def junction(i: int, incoming: str, connecting: str, a: int, b: int) -> str:
+    def junction(i, incoming, connecting, a, b):
         link = f'<laneLink from="{a}" to="{b}"/>'
         ends = f'incomingRoad="{incoming}" connectingRoad="{connecting}" contactPoint="start"'
         return f'<junction id="{i}"><connection {ends}>{link}</connection></junction>'

@@ -7,7 +7,6 @@ Every file is made here.
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ ONE = 1 << 16
 WIDTH, HEIGHT = 48, 32
 
 
-def video(path: Path, matrix: tuple[int, int, int, int] | None = None, tracks: int = 1) -> Path:
+def video(path, matrix=None, tracks=1):
     """Write a video of a bright corner at the upper left, and put a display matrix a, b, c, d into
     its track's header.
     """
@@ -43,7 +42,7 @@ def video(path: Path, matrix: tuple[int, int, int, int] | None = None, tracks: i
     return path
 
 
-def bright(image: np.ndarray) -> tuple[bool, bool, tuple[int, int]]:
+def bright(image):
     """Return whether the bright corner lies below and on the right, and its height and width."""
     rows, columns = np.nonzero(image[..., 0] > 150)
     middle = rows.mean() > image.shape[0] / 2, columns.mean() > image.shape[1] / 2

@@ -41,7 +41,7 @@ assert fixer.trained and not fixed.events and (fixed.rgb != rgb).any()
 """
 
 
-def alone(*code: str) -> None:
+def alone(*code: str):
     """Run code in a process that can import neither room."""
     text = "".join((ALONE, *code)).replace("{rooms!r}", repr(ROOMS))
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=250)

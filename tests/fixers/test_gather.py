@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.fixers.gather import CPU
 from alpasim_plugin.fixers.network.pixel_generator import TORCH
 from alpasim_plugin.fixers.network.reference_blend import BlendHeads, in_floats, mix, sources_of
 
 
-def recordings(batch: int, references: int, height: int, width: int) -> Tensor:
+def recordings(batch, references, height, width):
     """References that hold, do not, or by half."""
     draw = torch.Generator().manual_seed(height + references)
     out = torch.randint(

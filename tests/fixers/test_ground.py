@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import F32, F64, U8, Box
+from alpasim_plugin.core.types import F64, Box
 from alpasim_plugin.fixers.ground import (
     FARTHEST_M,
     FREE_SHARE,
@@ -38,17 +38,17 @@ FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 
 NOBODY: Mapping[str, F64] = {}
 
 
-def rig(x_m: float) -> F64:
+def rig(x_m):
     return se2(x_m, 0.0, 0.0)
 
 
-def rays(T_world_camera: F64) -> F64:
+def rays(T_world_camera):
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     local = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     return np.asarray(local @ T_world_camera[:3, :3].T)
 
 
-def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
+def street(x_m, wall_m=np.inf):
     """Pose, depth and picture of a road with a pattern that is fixed to the world, and of a wall
     across it with another.
     """
@@ -69,12 +69,12 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
     return T, np.where(np.isfinite(depth), depth, 0).astype(np.float32), rgb
 
 
-def recorded(x_m: float, wall_m: float = np.inf) -> RecordedImage:
+def recorded(x_m, wall_m=np.inf):
     T, depth, rgb = street(x_m, wall_m)
     return RecordedImage(K, T, rgb, depth, NOBODY)
 
 
-def plain_ground(view: WarpTarget, T_world_rig: F64) -> F32:
+def plain_ground(view, T_world_rig):
     """Do what `ground_hypothesis` does, array by array: the reference of its kernel."""
     height, width = view.depth.shape
     down = T_world_rig[:3, 2] @ view.T_world_camera[:3, :3] @ np.linalg.inv(view.K)
@@ -88,7 +88,7 @@ def plain_ground(view: WarpTarget, T_world_rig: F64) -> F32:
     return np.where(free & ~on_boxes((height, width), view.placed.seen), z, 0).astype(np.float32)
 
 
-def off(image: U8, truth: U8, where: tuple[slice, slice]) -> float:
+def off(image, truth, where):
     return float(np.abs(image[..., :3].astype(float) - truth)[where].mean())
 
 

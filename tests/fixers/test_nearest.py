@@ -13,7 +13,7 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.warp import INCONSISTENT, VALID
 
 
-def reference(grey: int, holds: list[int]) -> np.ndarray:
+def reference(grey, holds):
     image = np.full((1, 4, 4), grey, np.uint8)
     image[..., 3] = holds
     return image

@@ -4,18 +4,14 @@ fault stays in the history.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_header, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import render_share
@@ -30,7 +26,7 @@ MAPS = maps_of(FRAMES)
 SIZES = PixelSizes((8, 12, 16), (0, 1, 1, 1, 1), 8, 4)
 
 
-def generator() -> PixelGenerator:
+def generator():
     """Return a network that changes frames and depends on its past."""
     torch.manual_seed(5)
     net = PixelGenerator(SIZES)
@@ -44,7 +40,7 @@ def bundle(tmp_path_factory):
     return write_bundle(tmp_path_factory.mktemp("pixel") / "small.safetensors")
 
 
-def write_bundle(path: Path) -> Path:
+def write_bundle(path):
     settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
     assert isinstance(settings, PixelFixerSettings)
     save_bundle(
@@ -53,7 +49,7 @@ def write_bundle(path: Path) -> Path:
     return path
 
 
-def at(bundle: Path, *overrides: str) -> PixelFixerSettings:
+def at(bundle, *overrides: str):
     settings = fixer_settings(
         "onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides]
     )
@@ -61,11 +57,11 @@ def at(bundle: Path, *overrides: str) -> PixelFixerSettings:
     return settings
 
 
-def session(bundle: Path, *overrides: str, seed: int = 0) -> PixelFixer:
+def session(bundle, *overrides: str, seed=0):
     return PixelFixer(at(bundle, *overrides), "scene", seed)
 
 
-def run(fixer: PixelFixer, frames: Sequence[Frame], maps: Sequence[U8] = ()) -> list[Frame]:
+def run(fixer, frames, maps=()):
     return [out for i, frame in enumerate(frames) for out in fixer.step([frame], maps[i : i + 1])]
 
 
@@ -191,9 +187,7 @@ def test_an_untrained_generator_returns_the_render(bundle):
 # --- the harmlessness guard
 
 
-def share(
-    out: Tensor, opacity: float = 1.0, sdmap: float = -1.0, before: Tensor | None = None
-) -> Tensor:
+def share(out, opacity=1.0, sdmap=-1.0, before=None):
     road = torch.full((1, 64, 64, 3), -0.2)
     before = road if before is None else before
     cover = torch.full((1, 64, 64, 1), opacity)
@@ -201,7 +195,7 @@ def share(
     return torch.zeros_like(cover) if found is None else found
 
 
-def invented(level: float = 0.9) -> Tensor:
+def invented(level=0.9):
     """Return a road with a bright thing on it."""
     out = torch.full((1, 64, 64, 3), -0.2)
     out[:, 24:40, 24:40] = level
@@ -237,7 +231,7 @@ def reading(tmp_path_factory):
     return path
 
 
-def with_reference(frame: Frame, grey: int, holds: int = 255) -> Frame:
+def with_reference(frame, grey, holds=255):
     image = np.full((*SIZE, 4), grey, np.uint8)
     image[..., 3] = holds
     return replace(frame, references=(image,))
@@ -271,3 +265,11 @@ def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading):
     )
     (out,) = session(reading, "holes=render").step([with_reference(grey, 240)], [])
     assert out.rgb.mean() > 200
+
+
+def test_more_steps_sample_from_noisier_sources(bundle):
+    two = make_fixer("onefixer@2", at(bundle, "steps=[1000,500]"), scene_id="scene")
+    assert two.label == "onefixer@2, 9 updates, steps [1000.0, 500.0] instead of [1000.0], fp32"
+    assert not np.array_equal(
+        pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1]))
+    )

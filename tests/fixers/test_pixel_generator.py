@@ -5,13 +5,11 @@ the start.
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.pixel_generator import (
     PixelGenerator,
     PixelSizes,
-    PixelState,
     pixel_noise,
     pixel_source,
     sparse_source,
@@ -21,23 +19,21 @@ from alpasim_plugin.fixers.network.pixel_layers import cells, pixels
 SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
 
 
-def network(seed: int = 0, sizes: PixelSizes = SMALL) -> PixelGenerator:
+def network(seed=0, sizes=SMALL):
     torch.manual_seed(seed)
     return PixelGenerator(sizes).requires_grad_(False)
 
 
-def frames(count: int, seed: int = 1, batch: int = 2) -> list[tuple[Tensor, Tensor, Tensor]]:
+def frames(count, seed=1, batch=2):
     source = torch.Generator().manual_seed(seed)
 
-    def draw(channels: int) -> Tensor:
+    def draw(channels):
         return torch.rand(batch, 32, 48, channels, generator=source)
 
     return [(2 * draw(3) - 1, draw(1), 2 * draw(3) - 1) for _ in range(count)]
 
 
-def rolled(
-    net: PixelGenerator, clip: list[tuple[Tensor, Tensor, Tensor]]
-) -> tuple[list[Tensor], PixelState]:
+def rolled(net, clip):
     state, out = net.start(clip[0][0]), []
     for render, opacity, sdmap in clip:
         made, state = net(render, opacity, sdmap, state)

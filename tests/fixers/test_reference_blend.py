@@ -17,7 +17,7 @@ SIZES = PixelSizes((16, 16, 16), blend=8)
 HEIGHT, WIDTH = 32, 64
 
 
-def trained_like(seed: int = 0) -> PixelGenerator:
+def trained_like(seed=0):
     """A network none of whose layers is zero, as after training."""
     net = PixelGenerator.random(SIZES, seed).eval().requires_grad_(False)
     draw = torch.Generator().manual_seed(seed)
@@ -26,7 +26,7 @@ def trained_like(seed: int = 0) -> PixelGenerator:
     return net
 
 
-def inputs(references: int, batch: int = 1, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def inputs(references, batch=1, seed=0):
     draw = torch.Generator().manual_seed(seed)
     render, sdmap = (torch.rand(batch, HEIGHT, WIDTH, 3, generator=draw) * 2 - 1 for _ in range(2))
     images = torch.rand(batch, references, HEIGHT, WIDTH, 4, generator=draw)
@@ -35,9 +35,7 @@ def inputs(references: int, batch: int = 1, seed: int = 0) -> tuple[Tensor, Tens
     return render, torch.ones(batch, HEIGHT, WIDTH, 1), sdmap, images
 
 
-def call(
-    net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, references: Tensor | None
-) -> tuple[Tensor, PixelState]:
+def call(net, render, opacity, sdmap, references):
     out: tuple[Tensor, PixelState] = net(
         render, opacity, sdmap, net.start(render), None, None, references
     )

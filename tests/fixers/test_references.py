@@ -4,7 +4,7 @@ is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +13,7 @@ import pytest
 from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.shutter import bands, rolling
 from alpasim_plugin.core.types import (
-    F32,
     F64,
-    U8,
     Actor,
     Box,
     CameraSpec,
@@ -45,23 +43,21 @@ FORWARD = np.array(
 NOBODY: Mapping[str, F64] = {}
 
 
-def at(x: float, y: float = 0.0, yaw: float = 0.0) -> F64:
+def at(x, y=0.0, yaw=0.0):
     return se2(x, y, yaw) @ FORWARD
 
 
-def wall(x_m: float, T_world_camera: F64) -> F32:
+def wall(x_m, T_world_camera):
     """Depth of a wall across the street at ``x_m``, seen along x."""
     return np.full((HEIGHT, WIDTH), x_m - T_world_camera[0, 3], np.float32)
 
 
-def picture(
-    T_world_camera: F64, depth: F32, rgb: U8 | None = None, actors: Mapping[str, F64] = NOBODY
-) -> RecordedImage:
+def picture(T_world_camera, depth, rgb=None, actors=NOBODY):
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     return RecordedImage(K, T_world_camera, noise if rgb is None else rgb, depth, actors)
 
 
-def columns() -> U8:
+def columns():
     """A picture whose red says the column, four grey levels each."""
     return np.repeat(
         np.broadcast_to(4 * np.arange(WIDTH, dtype=np.uint8), (HEIGHT, WIDTH))[..., None], 3, axis=2
@@ -129,7 +125,7 @@ def test_a_car_is_looked_up_where_it_was():
     assert (gone[rows, car, 3] == 0).all()
 
 
-def hard_case(seed: int) -> Lookup:
+def hard_case(seed):
     """Depths of zero, of centimetres and of kilometres, cameras that look away, boxes around the
     camera, actors that were absent.
     """
@@ -173,11 +169,11 @@ def test_the_kernel_agrees_with_the_plain_arithmetic(seed):
 
 
 def recorded(
-    places: Sequence[tuple[float, float]],
-    step_us: int = 500_000,
-    read: Callable[[], tuple[U8, F32]] | None = None,
-) -> list[RecordedFrame]:
-    def none() -> tuple[U8, F32]:
+    places,
+    step_us=500_000,
+    read=None,
+):
+    def none():
         return np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((HEIGHT, WIDTH), np.float32)
 
     return [
@@ -208,12 +204,10 @@ def test_only_earlier_frames_are_references_where_the_past_is_asked_for():
     assert index.choose(at(6.0), 0, 3, past=True) == ()
 
 
-def session(
-    which: str = "all", hysteresis: bool = True, road_m: float = 0.0
-) -> tuple[ReferenceSession, list[int]]:
+def session(which="all", hysteresis=True, road_m=0.0):
     reads: list[int] = []
 
-    def read() -> tuple[U8, F32]:
+    def read():
         reads.append(1)
         return np.random.default_rng(0).integers(
             0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8
@@ -234,7 +228,7 @@ def session(
     return ReferenceSession(frames, [car], ego_log, 2, which, hysteresis), reads  # type: ignore[arg-type]
 
 
-def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
+def request(x, t_us):
     spec = CameraSpec("front", WIDTH, HEIGHT, K, FORWARD)
     frame = Frame(
         t_us,

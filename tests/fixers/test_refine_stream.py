@@ -26,7 +26,7 @@ def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_
 def test_blocks_are_made_as_they_are_asked_for():
     taken = []
 
-    def frames() -> object:
+    def frames():
         for i in range(30):
             taken.append(i)
             yield Frame(i, "video", np.zeros((16, 16, 3), np.uint8)), None

@@ -20,12 +20,12 @@ from alpasim_plugin.fixers.trust import (
 from evaluators.viewer.pictures import seen_before, trust_by_time
 
 
-def trust(output: np.ndarray, render: np.ndarray, recorded: np.ndarray) -> dict[str, float | str]:
+def trust(output, render, recorded):
     images = (torch.from_numpy(x)[None] for x in (output, render, recorded[..., None]))
     return trust_facts(trust_sums(*images)[0].numpy(), *recorded.shape)
 
 
-def trust_cells(text: str) -> np.ndarray:
+def trust_cells(text):
     """Return the shares of every cell ``(rows, columns, 2)``, in fifteenths."""
     size, _, digits = text.partition(":")
     columns, rows = (int(part) for part in size.split("x"))

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import F64, LaneMap, Marking, Scenario
+from alpasim_plugin.core.types import LaneMap, Marking
 from alpasim_plugin.gaussians.scene.paint import (
     GAP_M,
     LINE_M,
     WHITE,
     YELLOW,
-    Strokes,
     paint_strokes,
 )
 from alpasim_plugin.gaussians.scene.site import make_site
@@ -21,18 +20,18 @@ from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 PATH = line((0, -1.8), (60, -1.8))
 
 
-def strokes_of(scenario: Scenario) -> tuple[Strokes, F64]:
+def strokes_of(scenario):
     """Return strokes and the world positions of their middles."""
     site = make_site(scenario, lambda xy: np.zeros(len(xy)))
     strokes = paint_strokes(site)
     return strokes, site.frame.to_world((strokes.start + strokes.end) / 2)
 
 
-def at(middle: F64, y_m: float, tolerance_m: float = 0.06) -> np.ndarray:
+def at(middle, y_m, tolerance_m=0.06):
     return np.abs(middle[:, 1] - y_m) < tolerance_m
 
 
-def length(strokes: Strokes, chosen: np.ndarray) -> float:
+def length(strokes, chosen):
     return float(np.linalg.norm(strokes.end - strokes.start, axis=1)[chosen].sum())
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
 
@@ -8,13 +7,12 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
-from alpasim_plugin.core.types import Environment, LaneMap, Scenario
+from alpasim_plugin.core.types import Environment, LaneMap
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import placed_cloud
 from alpasim_plugin.gaussians.scene import scene_graph
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.site import contours, make_site
 from alpasim_plugin.world.ground import height_at
 from tests.examples import first_of
@@ -32,20 +30,18 @@ from tests.gaussians.scene_maps import (
 pytestmark = pytest.mark.slow
 
 
-def built(scenario: Scenario) -> SceneGraph:
+def built(scenario):
     return build_scene(scenario, partial(height_at, scenario.ground))
 
 
-def view(
-    scenario: Scenario, index: int, left_m: float = 0.0, width: int = 256, height: int = 144
-) -> PinholeCamera:
+def view(scenario, index, left_m=0.0, width=256, height=144):
     T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
     T[:3, 3] += left_m * T[:3, 1]
     spec = camera_spec(width, height)
     return PinholeCamera.from_pose(width, height, spec.K, T @ spec.T_rig_camera)
 
 
-def digest(graph: SceneGraph) -> bytes:
+def digest(graph):
     nodes = (*graph.background, *graph.actors.values())
     return b"".join(
         a.tobytes()
@@ -66,7 +62,7 @@ def test_same_scenario_builds_bit_identical_gaussians(street):
 
 
 @lru_cache(maxsize=3)
-def empty_street(make: Callable[..., Scenario]) -> tuple[Scenario, SceneGraph]:
+def empty_street(make):
     scenario = make(actors=())
     return scenario, built(scenario)
 
@@ -90,7 +86,7 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
     image = graph.render(camera, {}).rgb
     eye = camera.centre_world
 
-    def seen(y_m: float, ahead_m: float) -> np.ndarray:
+    def seen(y_m, ahead_m):
         p = (
             camera.T_camera_world[:3, :3] @ np.array([eye[0] + ahead_m, y_m, 0.0])
             + camera.T_camera_world[:3, 3]

@@ -11,7 +11,7 @@ from alpasim_plugin.gaussians.cloud import all_rigid, require_rigid
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 
 
-def arrays(n: int = 8) -> dict[str, np.ndarray]:
+def arrays(n=8):
     cloud = random_cloud(n)
     return {f: getattr(cloud, f).copy() for f in ("means", "quats", "scales", "opacities", "sh")}
 

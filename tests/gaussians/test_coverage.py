@@ -21,7 +21,7 @@ timing: {duration_us: 1000000}
 """
 
 
-def street(n: int = 6000) -> GaussianCloud:
+def street(n=6000):
     """Return a street of 80 x 16 m along x: ground, and two rows of house fronts up to 12 m
     high.
     """

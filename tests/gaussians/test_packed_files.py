@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import gzip
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import read_ply
-from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
     _parity,
@@ -37,7 +35,7 @@ def biker(shared_data):
     return shared_data / "gaussians"
 
 
-def as_stored(arrays: GaussianArrays) -> GaussianArrays:
+def as_stored(arrays):
     """Turn a model that was read from SPZ back into the axes of its file."""
     return arrays._replace(
         means=arrays.means * np.array([1, -1, -1]),
@@ -100,13 +98,13 @@ BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y"
 
 
 def write_compressed(
-    path: Path,
-    n: int,
-    chunks: int,
-    packed: tuple[int, int, int, int],
-    sh: bytes = b"",
-    n_sh: int = 0,
-) -> Path:
+    path,
+    n,
+    chunks,
+    packed,
+    sh=b"",
+    n_sh=0,
+):
     head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n" + "".join(
         f"property float {b}\n" for b in BOUNDS
     )
@@ -195,15 +193,13 @@ def test_splat_of_broken_size_is_refused(tmp_path, size):
 # --- SPZ, worked by hand
 
 
-def body_streams(version: int, n: int, degree: int) -> list[bytes]:
+def body_streams(version, n, degree):
     rng = np.random.default_rng(7)
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version < 3 else 4) * n, 3 * n * ((degree + 1) ** 2 - 1)]
     return [rng.integers(0, 256, size, dtype=np.uint8).tobytes() for size in sizes]
 
 
-def write_spz(
-    path: Path, version: int, n: int, degree: int, streams: list[bytes], claim: int | None = None
-) -> Path:
+def write_spz(path, version, n, degree, streams, claim=None):
     head = struct.pack("<IIIBBB", 0x5053474E, version, n if claim is None else claim, degree, 12, 0)
     if version == 4:
         used = streams if degree else streams[:5]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,7 +20,7 @@ from alpasim_plugin.gaussians.files.ply import (
 from tests.examples import examples
 
 
-def make_cloud(n: int = 5, k: int = 16, seed: int = 3) -> GaussianCloud:
+def make_cloud(n=5, k=16, seed=3):
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(n, 4))
     return GaussianCloud(
@@ -34,14 +32,12 @@ def make_cloud(n: int = 5, k: int = 16, seed: int = 3) -> GaussianCloud:
     )
 
 
-def element(name: str, names: list[str], rows: np.ndarray) -> tuple[str, bytes]:
+def element(name, names, rows):
     header = f"element {name} {len(rows)}\n" + "".join(f"property float {p}\n" for p in names)
     return header, rows.astype("<f4").tobytes()
 
 
-def write_elements(
-    path: Path, *parts: tuple[str, bytes], fmt: str = "binary_little_endian"
-) -> Path:
+def write_elements(path, *parts: tuple[str, bytes], fmt="binary_little_endian"):
     head = (
         f"ply\nformat {fmt} 1.0\ncomment made by a test\n"
         + "".join(h for h, _ in parts)

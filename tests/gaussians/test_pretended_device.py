@@ -21,7 +21,7 @@ from tests.pretended_device import pretended_device
 HEIGHT, WIDTH = 64, 96
 
 
-def frames() -> list[Frame]:
+def frames():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 255, (4, HEIGHT, WIDTH, 4), dtype=np.uint8)
     opacity = rng.random((4, HEIGHT, WIDTH)).astype(np.float32)

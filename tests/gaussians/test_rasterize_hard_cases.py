@@ -28,9 +28,7 @@ from tests.gaussians.gaussian_scenes import (
 FAST = ("cpu", "torch")
 
 
-def wall(
-    z: float, n: int = 12, opacity: float = 0.9, rgb=(0.8, 0.3, 0.1), spread: float = 1.0
-) -> GaussianCloud:
+def wall(z, n=12, opacity=0.9, rgb=(0.8, 0.3, 0.1), spread=1.0):
     x, y = np.meshgrid(np.linspace(-spread, spread, n), np.linspace(-spread, spread, n))
     return splats(
         np.column_stack([x.ravel(), y.ravel(), np.full(n * n, z)]),

@@ -33,7 +33,7 @@ from tests.gaussians.gaussian_scenes import (
 )
 
 
-def small_object(seed: int, n: int = 150) -> GaussianCloud:
+def small_object(seed, n=150):
     cloud = random_cloud(n, seed)
     return GaussianCloud(
         (cloud.means - [0, 0, 6]) * 0.2, cloud.quats, cloud.scales * 0.3, cloud.opacities, cloud.sh
@@ -193,7 +193,7 @@ def test_any_number_of_threads_gives_the_same_bits(n):
             assert one.stats == other.stats
 
 
-def _render_in_child(queue) -> None:
+def _render_in_child(queue):
     scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
     queue.put(float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum()))
 

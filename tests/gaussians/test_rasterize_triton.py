@@ -36,7 +36,7 @@ def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0), near_m=0.1):
     return UploadedClouds([cloud], "cpu").draw([(0, None)], cam, behind, near_m)
 
 
-def moved(cloud: GaussianCloud, offset) -> GaussianCloud:
+def moved(cloud, offset):
     return GaussianCloud(
         cloud.means + np.asarray(offset), cloud.quats, cloud.scales, cloud.opacities, cloud.sh
     )

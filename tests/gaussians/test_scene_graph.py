@@ -24,9 +24,7 @@ from tests.gaussians.scene_maps import camera_spec
 SKY = make_sky("clear", stream("t", 0, "sky"))
 
 
-def camera(
-    width: int = 64, height: int = 48, T_world_rig: np.ndarray | None = None
-) -> PinholeCamera:
+def camera(width=64, height=48, T_world_rig=None):
     spec = camera_spec(width, height)
     return PinholeCamera.from_pose(
         width,
@@ -36,9 +34,7 @@ def camera(
     )
 
 
-def blobs(
-    centre: tuple[float, float, float], n: int = 40, seed: int = 0, sheen: bool = False
-) -> GaussianCloud:
+def blobs(centre, n=40, seed=0, sheen=False):
     rng = np.random.default_rng(seed)
     sh = np.zeros((n, 4, 3)) if sheen else np.zeros((n, 1, 3))
     sh[:, 0] = dc_from_rgb(rng.random((n, 3)))
@@ -48,13 +44,11 @@ def blobs(
     return GaussianCloud(means, quats, 0.3 * rng.random((n, 3)), np.full(n, 0.8), sh)
 
 
-def node(
-    name: str, cloud: GaussianCloud, kind: str = "background", far_m: float = 1e9
-) -> SceneNode:
+def node(name, cloud, kind="background", far_m=1e9):
     return SceneNode(name, kind, (Level(0.1, cloud),), far_m)
 
 
-def joined(chosen) -> GaussianCloud:
+def joined(chosen):
     clouds = [(node.levels[level].cloud, T) for node, level, T in chosen]
     return GaussianCloud.concatenate([c if T is None else c.transformed(T) for c, T in clouds])
 

@@ -19,7 +19,7 @@ from tests.examples import examples
 from tests.gaussians.gaussian_scenes import random_rigid
 
 
-def directions(n: int = 200, seed: int = 0) -> np.ndarray:
+def directions(n=200, seed=0):
     d = np.random.default_rng(seed).normal(size=(n, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 

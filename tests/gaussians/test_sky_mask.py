@@ -12,14 +12,14 @@ from alpasim_plugin.gaussians.scene.sky import STEP_PX, _upsample
 from tests.gaussians.scene_maps import parked, straight
 
 
-def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> PinholeCamera:
+def camera(width, height, yaw_rad=0.0, x_m=0.0):
     T_rig_camera = np.eye(4)
     T_rig_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
     return PinholeCamera.from_pose(width, height, K, se2(x_m, 0, yaw_rad) @ T_rig_camera)
 
 
-def view(alpha: np.ndarray, **pose: float) -> SkyView:
+def view(alpha, **pose: float):
     sky = (alpha <= 0.5).astype(np.float32)
     return SkyView(camera(alpha.shape[1], alpha.shape[0], **pose), sky)
 

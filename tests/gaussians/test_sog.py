@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from alpasim_plugin.gaussians.files import read_gaussians
 N, SIDE = 90, 10
 
 
-def write_sog(folder: Path) -> dict[str, np.ndarray]:
+def write_sog(folder):
     """Write random Gaussians, one by one as the format's page says it, and return them."""
     rng = stream("sog", 0, "model")
     folder.mkdir()
@@ -40,7 +39,7 @@ def write_sog(folder: Path) -> dict[str, np.ndarray]:
         rest = np.delete(q * np.sign(q[k]), k)
         turned[i] = [*np.rint((rest / np.sqrt(2) + 0.5) * 255), 252 + k]
 
-    def save(name: str, rgba: np.ndarray, shape: tuple[int, int] = (SIDE, SIDE)) -> None:
+    def save(name, rgba, shape=(SIDE, SIDE)):
         full = np.zeros((shape[0] * shape[1], 4), np.uint8)
         full[:, 3] = 255
         full[: len(rgba), : rgba.shape[1]] = rgba

@@ -6,14 +6,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import Observation, Plan
+from alpasim_plugin.core.types import Plan
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.cell import make_renderer
@@ -36,9 +35,7 @@ STRAIGHT = "road.segments=[{kind: straight, length_m: 220}]"
 STRAIGHT_ON = np.zeros(2, np.float32)
 
 
-def finish(
-    env: DriveEnv, action: Any = STRAIGHT_ON
-) -> tuple[float, bool, bool, dict[str, Any], int]:
+def finish(env, action=STRAIGHT_ON):
     """Repeat an action to the end of the episode; return the last reward, flags and info, and the
     number of steps.
     """
@@ -91,11 +88,11 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run():
 
         sensors = env._sensors
 
-        def reset(self, seed: int, route: Any) -> None:
+        def reset(self, seed, route):
             self.own = make_policy("pure-pursuit", env.scenario)
             self.own.reset(seed, route)
 
-        def act(self, observation: Observation) -> Plan:
+        def act(self, observation):
             if observation.t_us < env.scenario.start_us + env.scenario.warmup_us:
                 return forced(observation)
             plan = self.own.act(observation)
@@ -106,7 +103,7 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run():
                 np.r_[0.0, plan.yaw[1:]],
             )
 
-    def forced(observation: Observation) -> Plan:
+    def forced(observation):
         times = observation.t_us + np.arange(0, 2_000_001, 100_000)
         xy = np.column_stack(
             [observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))]
@@ -222,7 +219,7 @@ def test_what_makes_no_environment_is_refused():
     env.close()
 
 
-def blocks(name: str) -> list[str]:
+def blocks(name):
     page = Path(__file__).resolve().parents[2] / "docs" / name
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from alpasim_plugin.log import decode_image, read_asl
 read_log = lru_cache(maxsize=64)(read_asl)  # several tests look at the same logs
 
 
-def golden(shared_data: Path) -> list[Path]:
+def golden(shared_data):
     return sorted((shared_data / "alpasim-golden").rglob("*.asl"))
 
 

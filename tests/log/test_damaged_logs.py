@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
-from alpasim_plugin.log.wire import logging_pb2
 from tests.log.make_rollout import T0_US
 
 
@@ -40,7 +38,7 @@ def test_damage_in_the_middle_is_an_error_with_its_place(path):
     assert "entry 1 at byte" in caught.value.message
 
 
-def edited(path: Path, change: object) -> Path:
+def edited(path, change):
     """Rewrite a log entry by entry through `change`, which may return None to leave one out."""
     entries = [change(i, e) for i, e in enumerate(AslReader(path))]  # type: ignore[operator]
     with AslFile(path) as file:
@@ -70,7 +68,7 @@ def test_metadata_must_come_first(path):
 
 
 def test_ego_must_be_defined_first(path):
-    def swap(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+    def swap(i, e):
         if i == 0:
             boxes = e.rollout_metadata.actor_definitions.actor_aabb
             boxes[0].actor_id, boxes[1].actor_id = boxes[1].actor_id, boxes[0].actor_id
@@ -86,7 +84,7 @@ def test_log_without_ego_poses_is_refused(path):
 
 
 def test_time_running_backwards_is_refused(path):
-    def stop(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+    def stop(i, e):
         if e.HasField("actor_poses"):
             e.actor_poses.timestamp_us = T0_US
         return e
@@ -96,7 +94,7 @@ def test_time_running_backwards_is_refused(path):
 
 
 def test_unset_quaternion_is_refused(path):
-    def unset(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+    def unset(i, e):
         if e.HasField("actor_poses"):
             e.actor_poses.actor_poses[-1].actor_pose.ClearField("quat")
         return e
@@ -111,7 +109,7 @@ def test_answer_without_a_question_is_refused(path):
 
 
 def test_poses_of_undefined_actors_are_left_out_and_named(path):
-    def rename(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+    def rename(i, e):
         for pose in e.actor_poses.actor_poses:
             if pose.actor_id == "7":
                 pose.actor_id = "hidden"
@@ -133,12 +131,12 @@ def test_entry_of_a_future_kind_is_skipped_with_a_warning(path):
 class Bomb:
     """Raises when unpickled."""
 
-    def __reduce__(self) -> tuple[object, tuple[str, ...]]:
+    def __reduce__(self):
         return (pytest.fail, ("debug bytes were unpickled",))
 
 
 def test_debug_bytes_are_never_unpickled(path):
-    def arm(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+    def arm(i, e):
         if e.HasField("driver_return"):
             e.driver_return.debug_info.unstructured_debug_info = pickle.dumps(Bomb())
         return e

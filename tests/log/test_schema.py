@@ -8,7 +8,6 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -51,7 +50,7 @@ STEP = {
 }
 
 
-def changed(column: str, value: Any) -> pa.Table:
+def changed(column, value):
     """Return the rows with another value of a column in the last one, or with another column where
     ``value`` is a list.
     """

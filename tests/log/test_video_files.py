@@ -11,7 +11,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_mp4, write_mp4
 
 
-def frames(n: int, height: int = 144, width: int = 256) -> list[np.ndarray]:
+def frames(n, height=144, width=256):
     y, x = np.mgrid[:height, :width]
     return [
         np.stack([x * 200 // width, y * 200 // height, np.full_like(x, 7 * i)], axis=-1).astype(

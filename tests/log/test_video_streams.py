@@ -5,31 +5,27 @@ damaged, without pictures.
 from __future__ import annotations
 
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 
-def picture(value: int = 120, height: int = 32, width: int = 48) -> U8:
+def picture(value=120, height=32, width=48):
     return np.full((height, width, 3), value, np.uint8)
 
 
-def write(
-    path: Path, times: list[int], time_base: Fraction, durations: list[int] | None = None
-) -> Path:
+def write(path, times, time_base, durations=None):
     with VideoWriter(path, time_base, Fraction(10)) as video:
         for i, time in enumerate(times):
             video.write(picture(20 * i % 200), time, durations[i] if durations else 1)
     return path
 
 
-def times_s(path: Path) -> list[Fraction]:
+def times_s(path):
     with VideoReader(path) as video:
         return [frame.time * video.format.time_base for frame in video]
 
@@ -99,7 +95,7 @@ def test_pixel_aspect_is_kept(tmp_path):
         assert back.format.pixel_aspect == Fraction(4, 3)
 
 
-def cut_short(folder: Path) -> Path:
+def cut_short(folder):
     """Return a file whose index is whole and whose last pictures are gone."""
     path = folder / "cut.mp4"
     rng = np.random.default_rng(0)
@@ -117,7 +113,7 @@ def cut_short(folder: Path) -> Path:
     return path
 
 
-def damaged(folder: Path) -> Path:
+def damaged(folder):
     path = write(folder / "whole.mp4", list(range(60)), Fraction(1, 10))
     data = bytearray(path.read_bytes())
     middle = data.index(b"mdat") + 400
@@ -126,7 +122,7 @@ def damaged(folder: Path) -> Path:
     return folder / "damaged.mp4"
 
 
-def sound_only(folder: Path) -> Path:
+def sound_only(folder):
     path = folder / "sound.wav"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
@@ -139,7 +135,7 @@ def sound_only(folder: Path) -> Path:
     return path
 
 
-def without_frames(folder: Path) -> Path:
+def without_frames(folder):
     with av.open(str(folder / "none.avi"), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
@@ -147,7 +143,7 @@ def without_frames(folder: Path) -> Path:
     return folder / "none.avi"
 
 
-def empty(folder: Path) -> Path:
+def empty(folder):
     (folder / "empty.mp4").touch()
     return folder / "empty.mp4"
 
@@ -170,7 +166,7 @@ def test_broken_files_are_refused_with_what_was_found(tmp_path, make, found):
         list(video)
 
 
-def write_until(path: Path, times: list[int], stop: BaseException | None = None) -> None:
+def write_until(path, times, stop=None):
     with VideoWriter(path, Fraction(1, 10), Fraction(10)) as video:
         for time in times:
             video.write(picture(), time)

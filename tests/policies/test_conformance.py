@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2, yaw_of
-from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 from policies import check_policy
 from policies.conformance import canned_scenario
 from policies.simple import PurePursuit
@@ -23,82 +23,82 @@ SCENARIO = canned_scenario()
 class Honest(PurePursuit):
     """Drives well; the subclasses spoil its plans."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(SCENARIO)
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         return self.spoil(super().act(observation), observation)
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return plan
 
 
 class MirroredY(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy * [1, -1], yaw=-plan.yaw)
 
 
 class Centimetres(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy * 100)
 
 
 class Backwards(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=-plan.xy)
 
 
 class SwappedAxes(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy[:, ::-1].copy(), yaw=np.pi / 2 - plan.yaw)
 
 
 class Milliseconds(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us // 1000)
 
 
 class MillisecondSteps(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us[0] + (plan.times_us - plan.times_us[0]) // 1000)
 
 
 class RelativeTimes(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us - plan.times_us[0])
 
 
 class FloatTimes(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us.astype(np.float32))
 
 
 class Stale(Honest):
     kept: Plan | None = None
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         super().reset(seed, route)
         self.kept = None
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         self.kept = self.kept or plan
         return self.kept
 
 
 class NotANumber(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         xy = plan.xy.copy()
         xy[7, 1] = np.nan
         return replace(plan, xy=xy)
 
 
 class Degrees(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, yaw=np.degrees(plan.yaw))
 
 
 class WorldFrame(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         T = observation.ego.T_world_rig
         return replace(plan, xy=plan.xy @ T[:2, :2].T + T[:2, 3], yaw=plan.yaw + yaw_of(T))
 
@@ -106,42 +106,42 @@ class WorldFrame(Honest):
 class Rotated(Honest):
     """Answers in axes that are turned against the rig, the pose staying at the origin."""
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy @ se2(0, 0, 1.2)[:2, :2].T)
 
 
 class Short(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us[:11], xy=plan.xy[:11], yaw=plan.yaw[:11])
 
 
 class Sparse(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us[::10], xy=plan.xy[::10], yaw=plan.yaw[::10])
 
 
 class WrongShape(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, yaw=plan.yaw[:-1])
 
 
 class Transposed(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy.T.copy())
 
 
 class BareArray(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return plan.xy  # type: ignore[return-value]
 
 
 class Nothing(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return None  # type: ignore[return-value]
 
 
 class ListOfPoses(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy.tolist())
 
 
@@ -150,14 +150,14 @@ class CameraNames(Honest):
 
 
 class BadSample(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, samples=(np.zeros((3, 3)),))
 
 
 class Random(Honest):
     count = 0
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         self.count += 1  # survives the reset
         return replace(
             plan, xy=plan.xy + 0.01 * self.count * np.linspace(0, 1, len(plan.xy))[:, None]
@@ -169,21 +169,21 @@ class Remembers(Honest):
 
     slowest = np.inf
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         speed = observation.ego.speed_mps
         self.slowest = min(self.slowest, speed) if 0 < speed < 8 else self.slowest
         return replace(plan, xy=plan.xy * (0.9 if self.slowest < 8 else 1.0))
 
 
 class Raises(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         raise ZeroDivisionError("speed")
 
 
 class Scribbles(Honest):
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         observation.frames["front"].rgb[:] = 0
         return plan
 
@@ -191,14 +191,14 @@ class Scribbles(Honest):
 class NeedsFreshFrames(Honest):
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         if observation.frames["front"].t_us != observation.t_us:
             raise ValueError("the frame is old")
         return plan
 
 
 class Slow(Honest):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         time.sleep(0.01)
         return plan
 

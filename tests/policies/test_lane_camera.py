@@ -20,11 +20,11 @@ ROAD = PaintedRoad()
 SYMMETRIC = PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0))
 
 
-def policy() -> LaneCamera:
+def policy():
     return LaneCamera(scenario_with())
 
 
-def lateral(plan: object, index: int = 20) -> float:
+def lateral(plan, index=20):
     return float(plan.xy[index, 1])  # type: ignore[attr-defined]
 
 

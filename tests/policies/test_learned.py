@@ -74,9 +74,7 @@ def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view():
 # --- the command
 
 
-def route_with_turn(
-    after_m: float, radius_m: float, left: bool, lateral_m: float = 0.0
-) -> np.ndarray:
+def route_with_turn(after_m, radius_m, left, lateral_m=0.0):
     s = 80 / 19 * np.arange(20)
     arc = np.clip((s - after_m) / radius_m, 0.0, np.pi / 2)
     beyond = np.maximum(s - after_m - radius_m * np.pi / 2, 0.0)
@@ -128,12 +126,12 @@ def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path):
 # --- the policy
 
 
-def drive(policy: Learned, seed: int = 0) -> list[np.ndarray]:
+def drive(policy, seed=0):
     policy.reset(seed, policy_route())
     return [np.column_stack([p.xy, p.yaw]) for p in (policy.act(o) for o in seen())]
 
 
-def seen() -> list[Observation]:
+def seen():
     return list(observations(STRAIGHT, {CAMERA.name: CAMERA}))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.geometry import arc_lengths, inverse
 from policies.base import _targets
-from policies.lane_filter import LaneState, predict, search, start, update
+from policies.lane_filter import predict, search, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from policies.road_vision import (
@@ -51,12 +51,12 @@ def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera):
 # --- ridges
 
 
-def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
+def slow_ridge(value, row, column):
     """Plain means over the three windows of one cell."""
     half, gap, flank = (int(w[row]) for w in _windows(GRID))
     n = value.shape[1]
 
-    def mean(a: int, b: int) -> float:
+    def mean(a, b):
         cells = [float(value[row, c]) for c in range(column + a, column + b + 1) if 0 <= c < n]
         return sum(cells) / len(cells) if cells else 0.0
 
@@ -110,13 +110,13 @@ def test_bars_of_a_crosswalk_are_not_taken_for_lines():
 
 
 def paint_of(
-    offset: float,
-    heading: float,
-    curvature: float,
-    width: float,
-    seed: int = 0,
-    sides: tuple[int, ...] = (-1, 1),
-) -> PaintPoints:
+    offset,
+    heading,
+    curvature,
+    width,
+    seed=0,
+    sides=(-1, 1),
+):
     random = np.random.default_rng(seed)
     x = np.repeat(np.arange(6.0, 30.0, 1.0), len(sides))
     side = np.tile(sides, len(x) // len(sides))
@@ -131,7 +131,7 @@ def paint_of(
     return PaintPoints(x, y, np.full(len(x), 3.0), np.full(len(x), 0.06))
 
 
-def settled(points: PaintPoints, lane: LaneState) -> LaneState:
+def settled(points, lane):
     for _ in range(15):
         lane = update(predict(lane, 0.0, 0.0, 0.0), points, np.ones(len(points.x_m)))
     return lane
@@ -188,7 +188,7 @@ def test_prediction_sees_the_lane_that_a_moved_ego_would_see():
 # --- obstacles
 
 
-def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
+def foot_in(road, seed=0):
     centre = np.zeros(len(GRID.x_m))
     empty = cv2.cvtColor(
         GRID.warp(PaintedRoad().image(CAMERA, np.eye(4), seed=9)), cv2.COLOR_RGB2LAB

@@ -10,7 +10,7 @@ import pytest
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, inverse, se2, trajectory_from_poses, yaw_of
-from alpasim_plugin.core.types import EgoState, Observation, Plan, Route, Scenario, Vehicle
+from alpasim_plugin.core.types import EgoState, Observation, Plan, Route, Vehicle
 from policies import make_policy
 from policies.conformance import START_US, canned_scenario
 from tests.policies.policy_world import NO_ROUTE, to_world
@@ -18,13 +18,13 @@ from tests.policies.policy_world import NO_ROUTE, to_world
 SCENARIO = canned_scenario()
 
 
-def blind(ego: EgoState, route: np.ndarray = NO_ROUTE) -> Observation:
+def blind(ego, route=NO_ROUTE):
     return Observation(
         ego.t_us, {}, {}, ego, trajectory_from_poses([ego.t_us], ego.T_world_rig[None]), route
     )
 
 
-def curved_log() -> Scenario:
+def curved_log():
     t = START_US + 50_000 * np.arange(200)
     s = 0.4 * np.arange(200)
     poses = [se2(3e5 + 40 * np.sin(a / 40), 4e6 + 40 * (1 - np.cos(a / 40)), a / 40) for a in s]
@@ -68,14 +68,14 @@ def test_constant_velocity_goes_straight_on(speed):
     assert not plan.yaw.any()
 
 
-def arc_route(radius: float, offset: float = 0.0) -> np.ndarray:
+def arc_route(radius, offset=0.0):
     a = np.arange(20) * 80 / 19 / abs(radius)
     return np.column_stack(
         [abs(radius) * np.sin(a), np.sign(radius) * abs(radius) * (1 - np.cos(a)) + offset, 0 * a]
     )
 
 
-def pursue(route: np.ndarray, speed: float) -> Plan:
+def pursue(route, speed):
     policy = make_policy("pure-pursuit", SCENARIO)
     policy.reset(0, Route(np.zeros((2, 3))))
     return policy.act(blind(EgoState(START_US, np.eye(4), speed), route))
@@ -128,9 +128,9 @@ class Bare:
 
     sensors: tuple[()] = ()
 
-    def reset(self, seed: int, route: Route) -> None: ...
+    def reset(self, seed, route): ...
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         return Plan(
             observation.t_us,
             observation.t_us + 100_000 * np.arange(30),
@@ -140,12 +140,12 @@ class Bare:
 
 
 class WithScenario(Bare):
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario):
         self.scenario = scenario
 
 
 class NotAPolicy:
-    def act(self, observation: Observation) -> None: ...
+    def act(self, observation): ...
 
 
 def test_import_form_makes_a_class_with_or_without_the_scenario():

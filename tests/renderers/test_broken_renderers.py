@@ -8,7 +8,7 @@ import pytest
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import names as known
-from alpasim_plugin.core.types import RenderRequest, Scenario
+from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.broken import LATE_US, SHIFT_M
 from alpasim_plugin.renderers.gaussian import clear_cache
@@ -24,7 +24,7 @@ def scenario():
 LATE_FRAMES = 5  # a second of these requests, which follow the log's 5 Hz
 
 
-def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
+def requests(scenario, n):
     out = []
     for i in range(5, 5 + n):
         T = (

@@ -10,9 +10,7 @@ from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
     BackgroundFile,
     Behaviour,
-    Frame,
     RenderRequest,
-    Scenario,
     Trajectory,
 )
 from alpasim_plugin.gaussians import write_ply
@@ -37,9 +35,7 @@ def scenario():
     clear_cache()
 
 
-def request(
-    scenario: Scenario, index: int = 8, left_m: float = 0.0, t_us: int | None = None
-) -> RenderRequest:
+def request(scenario, index=8, left_m=0.0, t_us=None):
     T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
     T[:3, 3] += left_m * T[:3, 1]
     camera = scenario.cameras[0]
@@ -53,7 +49,7 @@ def request(
     )
 
 
-def psnr(a: Frame, b: Frame) -> float:
+def psnr(a, b):
     return float(10 * np.log10(255.0**2 / np.mean((a.rgb.astype(float) - b.rgb) ** 2)))
 
 

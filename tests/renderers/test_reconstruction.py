@@ -4,10 +4,8 @@ pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +15,9 @@ from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.types import (
     BackgroundFile,
     Behaviour,
-    CameraSpec,
     Degradation,
     Environment,
     Latency,
-    Scenario,
 )
 from alpasim_plugin.gaussians.fit.views import logged_views
 from alpasim_plugin.renderers import make_renderer, recorded
@@ -45,7 +41,7 @@ FITTED = Degradation("reconstruction", share=0.4)
 DAMAGE = {"views_per_s": 20.0, "depth_error": 0.3, "pose_error_m": 0.1}
 
 
-def street(degradation: Degradation = FITTED) -> Scenario:
+def street(degradation=FITTED):
     """Give 1.4 s along a straight street with one actor in view and one behind the camera."""
     around = Environment(buildings=0.0, trees_per_100m=5.0, poles_spacing_m=0.0)
     scenario = with_camera(
@@ -58,7 +54,7 @@ def street(degradation: Degradation = FITTED) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("cache")
         patch.setenv("SIMRUN_CACHE", str(folder))
@@ -67,22 +63,22 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def fitted(cache: Path) -> ReconstructionRenderer:
+def fitted(cache):
     del cache
     renderer = make_renderer("3dgs", street())
     assert isinstance(renderer, ReconstructionRenderer)
     return renderer
 
 
-def error_db(renderer: ReconstructionRenderer, left_m: float) -> float:
+def error_db(renderer, left_m):
     clean = make_renderer("clean", renderer.scenario)
     requests = [request(renderer.scenario, i, left_m) for i in (1, 3, 6)]
     return float(np.mean([psnr(clean.render(r), renderer.render(r)) for r in requests]))
 
 
 def test_frame_has_the_shapes_types_and_ranges_of_the_contract(
-    fitted: ReconstructionRenderer,
-) -> None:
+    fitted,
+):
     frame = fitted.render(request(fitted.scenario, 4))
     assert frame.rgb.shape == (36, 64, 3)
     assert frame.rgb.dtype == np.uint8
@@ -93,15 +89,15 @@ def test_frame_has_the_shapes_types_and_ranges_of_the_contract(
     assert 2.0 < frame.depth[-1, 32] < 9.0
 
 
-def test_a_larger_share_of_the_schedule_fits_better(fitted: ReconstructionRenderer) -> None:
+def test_a_larger_share_of_the_schedule_fits_better(fitted):
     hasty = make_renderer("3dgs", street(Degradation("reconstruction", share=0.02)))
     assert isinstance(hasty, ReconstructionRenderer)
     assert error_db(fitted, 0.0) > error_db(hasty, 0.0) + 1
 
 
 def test_frames_do_not_depend_on_what_came_before_nor_on_threads(
-    fitted: ReconstructionRenderer,
-) -> None:
+    fitted,
+):
     r = request(fitted.scenario, 4, 0.7)
     fitted.render(request(fitted.scenario, 7))
     first = fitted.render(r)
@@ -113,8 +109,8 @@ def test_frames_do_not_depend_on_what_came_before_nor_on_threads(
 
 
 def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(
-    fitted: ReconstructionRenderer,
-) -> None:
+    fitted,
+):
     (first, other), again = (
         make_renderer("3dgs", fitted.scenario).recorded()[:2] for _ in range(2)
     )
@@ -123,9 +119,7 @@ def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(
     assert other.read() is not first.read()
 
 
-def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(
-    fitted: ReconstructionRenderer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted, monkeypatch):
     monkeypatch.setattr(recorded, "KEPT_BYTES", 2 * 64 * 36 * recorded.BYTES_PER_PX)
     scene, model = scene_of(fitted.scenario), fitted.model.graph.render
     first, second, third = recorded.built_recording(
@@ -142,8 +136,8 @@ def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(
 
 
 def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(
-    fitted: ReconstructionRenderer,
-) -> None:
+    fitted,
+):
     actors = fitted.model.graph.actors
     assert len(actors["ahead"].levels) == 1
     own = make_renderer("clean", fitted.scenario)
@@ -162,8 +156,8 @@ def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(
 
 
 def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
-    fitted: ReconstructionRenderer, cache: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+    fitted, cache, capfd
+):
     scenario = fitted.scenario
     folder = cache / KIND / reconstruction_key(scenario, recipe_of(scenario))
     data = (folder / "background.ply").read_bytes()
@@ -175,7 +169,7 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
     assert (folder / "background.ply").read_bytes() == data
 
 
-def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cache: Path) -> None:
+def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cache):
     del cache
     scenario = street(Degradation("cycle", share=0.1, shift_m=1.0))
     renderer = make_renderer("3dgs", scenario)
@@ -186,7 +180,7 @@ def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cac
     np.testing.assert_allclose(y, -0.8, atol=1e-6)  # the log runs at y = -1.8
 
 
-def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else() -> None:
+def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else():
     scenario = street()
     key = reconstruction_key(scenario, recipe_of(scenario))
     same = [
@@ -214,7 +208,7 @@ def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else() -> Non
     assert len({key, *keys}) == len(other) + 1
 
 
-def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path: Path) -> None:
+def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path):
     keys = []
     for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
         (tmp_path / name).write_bytes(content)
@@ -223,7 +217,7 @@ def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path: Path
     assert keys[0] == keys[1] != keys[2]
 
 
-def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
+def test_longer_logs_and_more_cameras_get_more_views_points_and_steps():
     short, scenario = recipe_of(street()).splat, straight(degradation=FITTED)
     log = scenario.ego_log
     minutes = replace(scenario, ego_log=replace(log, t_us=log.t_us * 40))
@@ -235,7 +229,7 @@ def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
         assert getattr(six, name) == 3 * getattr(two, name)
 
 
-def turned_aside(name: str, yaw: float) -> CameraSpec:
+def turned_aside(name, yaw):
     """Give a small camera that looks to the left of the driving direction by an angle, radians."""
     spec = camera_spec(32, 18)
     T = spec.T_rig_camera.copy()
@@ -243,7 +237,7 @@ def turned_aside(name: str, yaw: float) -> CameraSpec:
     return replace(spec, name=name, T_rig_camera=T)
 
 
-def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(cache: Path) -> None:
+def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(cache):
     del cache
     damaged = replace(FITTED, share=0.05, pose_error_m=0.05)
     rig = [turned_aside("front", 0.0), turned_aside("left", 1.2), turned_aside("rear", np.pi)]
@@ -257,7 +251,7 @@ def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(cach
             np.testing.assert_array_equal(getattr(model, part), getattr(models[0], part))
 
 
-def test_every_camera_gives_points_to_start_from(cache: Path) -> None:
+def test_every_camera_gives_points_to_start_from(cache):
     del cache
     damaged = replace(FITTED, share=1e-9, depth_error=0.0)
     ahead, behind = turned_aside("front", 0.0), turned_aside("rear", np.pi)
@@ -268,7 +262,7 @@ def test_every_camera_gives_points_to_start_from(cache: Path) -> None:
     assert (model.background.means[:, 0] < first - 10).sum() > 50
 
 
-def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none() -> None:
+def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none():
     scenario = street()
     views = logged_views(scenario, scene_of(scenario), 8, 32)
     many = [replace(views[0], t_us=100_000 * i) for i in range(400)]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.types import Degradation, Scenario
+from alpasim_plugin.core.types import Degradation
 from alpasim_plugin.gaussians.fit.views import logged_views
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_build import misplaced
@@ -18,7 +18,7 @@ from alpasim_plugin.renderers.recorded import FIRST_US, INTERVAL_US, built_recor
 from tests.gaussians.scene_maps import straight, with_camera
 
 
-def street(degradation: Degradation) -> Scenario:
+def street(degradation):
     return with_camera(straight(degradation=degradation), 64, 36)
 
 

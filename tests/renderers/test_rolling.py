@@ -4,7 +4,6 @@ rig, a passing car.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -14,19 +13,19 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.shutter import at_share, bands_of, rolling
-from alpasim_plugin.core.types import F64, Behaviour, Exposure, RenderRequest, Scenario
+from alpasim_plugin.core.types import Behaviour, Exposure, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
-from alpasim_plugin.renderers.rolling import Draw, camera_at, draw_request
+from alpasim_plugin.renderers.rolling import camera_at, draw_request
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
 SHUTTER_S = 0.03
 STANDS = se2(20.0, -1.8, 0.0)
 
 
-def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
+def plain_draw_request(request, draw):
     """Return the same as `draw_request`, by the definition: for each time of exposure the whole
     picture, of which its pixels are taken.
     """
@@ -54,15 +53,13 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def draw(scenario):
-    def drawn(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+    def drawn(camera, actors):
         return scene_of(scenario).render(camera, actors, 1, sky_in_alpha=True)
 
     return drawn
 
 
-def case(
-    scenario: Scenario, speed_mps: float = 0.0, turn_rad_s: float = 0.0, car_mps: float = 0.0
-) -> RenderRequest:
+def case(scenario, speed_mps=0.0, turn_rad_s=0.0, car_mps=0.0):
     """A frame of a moving rig beside a car that drives along x."""
     spec, start = scenario.cameras[0], STANDS
     end = STANDS @ se2(speed_mps * SHUTTER_S, 0.0, turn_rad_s * SHUTTER_S)
@@ -72,7 +69,7 @@ def case(
     return RenderRequest(30_000, spec, T, {"car": car[1]}, exposure=exposure)
 
 
-def psnr(a: RasterOutput, b: RasterOutput) -> float:
+def psnr(a, b):
     return float(-10 * np.log10(max(float(np.mean((a.rgb.astype(float) - b.rgb) ** 2)), 1e-12)))
 
 

@@ -17,7 +17,7 @@ K = np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]])
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 
 
-def depth_of_wall(distance_m: float) -> np.ndarray:
+def depth_of_wall(distance_m):
     return np.full((60, 100), distance_m, np.float32)
 
 

@@ -6,13 +6,12 @@ import base64
 import dataclasses
 import gzip
 import json
-from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import pytest
 
-from evaluators.opening import Run, read_run
+from evaluators.opening import read_run
 from evaluators.report.rollouts import (
     COLLIDED,
     FAILED,
@@ -23,18 +22,18 @@ from evaluators.report.rollouts import (
 )
 
 
-def unpacked(data: str) -> dict[str, Any]:
+def unpacked(data):
     """Read a block as the page's script does."""
     document: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(data)))
     return document
 
 
 @pytest.fixture(scope="module")
-def run(usual_run: Path) -> Run:
+def run(usual_run):
     return read_run(usual_run)
 
 
-def test_every_row_and_number_of_the_table_is_in_the_block(run: Run) -> None:
+def test_every_row_and_number_of_the_table_is_in_the_block(run):
     found = unpacked(rollout_block(run).data)
     texts = found["texts"]
     assert len(found["state"]) == len(run.rollouts)
@@ -55,7 +54,7 @@ def test_every_row_and_number_of_the_table_is_in_the_block(run: Run) -> None:
             assert got is None if exact is None else got == pytest.approx(exact, rel=1e-3)
 
 
-def test_clips_are_linked_where_the_run_made_them(run: Run) -> None:
+def test_clips_are_linked_where_the_run_made_them(run):
     info = {**run.info, "config": {**run.info["config"], "video": "all"}}
     found = unpacked(rollout_block(dataclasses.replace(run, info=info)).data)
     for state, rollout in zip(found["state"], run.rollouts, strict=True):

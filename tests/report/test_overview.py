@@ -8,7 +8,6 @@ import base64
 import dataclasses
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +18,7 @@ import pytest
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
-from evaluators.opening import Run, read_run
+from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.report.ci import overview_md
 from evaluators.report.overview import decided, overview_of, tone_of
@@ -32,12 +31,12 @@ from tests.report.make_run import Plan, make_run
 PRIMARY = METRICS.primary
 
 
-def pair(diff: float, low: float, high: float, verdict: str, **more: Any) -> dict[str, Any]:
+def pair(diff, low, high, verdict, **more: Any):
     entry = {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01}
     return entry | {"verdict": verdict, "margin": 0.02, "n_scenes": 3} | more
 
 
-def with_pairs(folder: Path, **tables: Any) -> Run:
+def with_pairs(folder, **tables: Any):
     """Return a run of one policy with these tables of primary differences."""
     run = read_run(folder)
     shown = {
@@ -202,7 +201,7 @@ def test_an_evaluator_declares_no_second_primary_question():
         METRICS.adding({"mine": dataclasses.replace(METRICS.info(PRIMARY), name="mine")})
 
 
-def grey(value: int) -> bytes:
+def grey(value):
     return encode_image(np.full((9, 16, 3), value, np.uint8), "jpeg", 95)
 
 

@@ -15,14 +15,14 @@ from evaluators.report.birdseye import path_data, scene_view
 VARIANTS = {("a", "p"): (0, 0)}
 
 
-def decode(d: str) -> np.ndarray:
+def decode(d):
     """Read back relative path data, the slow way."""
     numbers = [int(n) for n in re.findall(r"-?\d+", d)]
     points = np.array(numbers).reshape(-1, 2)
     return np.cumsum(points, axis=0)
 
 
-def scene(x: list[float], y: list[float], **more: Any) -> dict[str, Any]:
+def scene(x, y, **more: Any):
     t_us = [k * 100_000 for k in range(len(x))]
     vehicle = {"length_m": 4.8, "width_m": 1.9, "rear_axle_to_centre_m": 1.4}
     return {
@@ -33,7 +33,7 @@ def scene(x: list[float], y: list[float], **more: Any) -> dict[str, Any]:
     } | more
 
 
-def series_of(x: list[float], y: list[float], **more: list[float]) -> dict[str, Any]:
+def series_of(x, y, **more: list[float]):
     t_us = np.arange(len(x)) * 100_000
     names = {"ego_x_m": x, "ego_y_m": y, "ego_yaw_rad": [0.0] * len(x)} | more
     return {name: (t_us, np.array(values, float)) for name, values in names.items()}

@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from evaluators.report import write_report
-from tests.report.browser import Browser
 
 pytestmark = pytest.mark.slow
 
 
-def column(browser: Browser, table: str, index: int) -> list[str]:
+def column(browser, table, index):
     rows = f"[...document.getElementById('{table}').tBodies[0].rows]"
     return list(
         browser.evaluate(

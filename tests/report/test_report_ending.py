@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 from evaluators.metrics.outcomes import outcomes_of
-from evaluators.opening import Run, read_run
+from evaluators.opening import read_run
 from evaluators.report.terminal import next_command
 from tests.docs.test_commands import parse
 from tests.report.make_run import Plan, make_run
 
 
-def words_of(run: Run) -> list[str]:
+def words_of(run):
     """Return the next command; it is one that the command line understands."""
     words, why = next_command(run)
     assert why

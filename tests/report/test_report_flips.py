@@ -12,11 +12,11 @@ from evaluators.report import write_report
 from evaluators.report.flips import find_flips, flip_rows
 
 
-def rollout(renderer: str, seed: int = 0, status: str = "ok", **metrics: float) -> Rollout:
+def rollout(renderer, seed=0, status="ok", **metrics: float):
     return Rollout(renderer, "p", "s", seed, status, metrics=metrics)
 
 
-def run_of(*rollouts: Rollout) -> Run:
+def run_of(*rollouts: Rollout):
     return Run(Path(), {"renderers": ["clean", "3dgs"]}, {}, rollouts, ())
 
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 import os
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,7 +20,7 @@ LOCAL = re.compile(r"^(#|data:|rollouts/|scenes/)")
 class Page(HTMLParser):
     """Checks nesting and collects tags, addresses, ids and handlers."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.open: list[str] = []
         self.tags: list[str] = []
@@ -32,7 +31,7 @@ class Page(HTMLParser):
         self.feed(text)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         for name, value in attrs:
             if name in ("href", "src", "xlink:href", "poster", "action", "data"):
@@ -44,21 +43,21 @@ class Page(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.handle_starttag(tag, attrs)
         if tag not in VOID:
             self.open.pop()
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open, f"</{tag}> closes nothing"
         assert self.open.pop() == tag, f"</{tag}> at {self.getpos()}"
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self.open and self.open[-1] not in ("style", "script"):
             self.text += data
 
 
-def page_of(folder: Path) -> Page:
+def page_of(folder):
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     assert page.open == []
     return page
@@ -151,7 +150,7 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path,
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     before = write_report(folder).read_bytes()
 
-    def refuse(fd: int) -> None:
+    def refuse(fd):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", refuse)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.writer import scene_as_json
 from evaluators.report.birdseye import road_users
 from scenarios.load import load_scenario
 
 
-def write(xy: np.ndarray, closed: bool) -> str:
+def write(xy, closed):
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in xy) + ("z" if closed else "")
 
 
-def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
+def users_of(scenario, at_us):
     log = scenario.ego_log.xyz[:, :2]
     found = road_users(scene_as_json(scenario), at_us, log, write)
     return {one["text"].split(",")[0]: (one["body"], one["way"]) for one in found}

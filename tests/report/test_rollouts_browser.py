@@ -5,21 +5,17 @@ installed Chromium.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from evaluators.report import write_report
-from tests.report.browser import Browser
 
 pytestmark = pytest.mark.slow
 
 ROWS = "[...document.querySelectorAll('#table-rollouts tr[data-row]')]"
 
 
-def opened(browser: Browser, page: Path, width: int = 1400) -> float:
+def opened(browser, page, width=1400):
     """Open a report, wait until its table is ready, and return the seconds that this took."""
     browser.complaints.clear()
     began = time.monotonic()
@@ -30,31 +26,31 @@ def opened(browser: Browser, page: Path, width: int = 1400) -> float:
     return time.monotonic() - began
 
 
-def until(done: Callable[[], Any]) -> None:
+def until(done):
     deadline = time.monotonic() + 60.0
     while not done():
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def column(browser: Browser, head: str) -> list[str]:
+def column(browser, head):
     index = f"[...document.querySelectorAll('#table-rollouts th[scope=col]')].findIndex(h => h.textContent === '{head}')"
     return list(browser.evaluate(f"{ROWS}.map(r => r.children[{index}].textContent)"))
 
 
-def sort(browser: Browser, head: str) -> None:
+def sort(browser, head):
     browser.evaluate(
         f"[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === '{head}').click()"
     )
 
 
-def choose(browser: Browser, element: str, value: str, event: str) -> None:
+def choose(browser, element, value, event):
     browser.evaluate(
         f"(e => {{ e.value = '{value}'; e.dispatchEvent(new Event('{event}')); }})(document.getElementById('{element}'))"
     )
 
 
-def count(browser: Browser) -> str:
+def count(browser):
     return str(browser.evaluate("document.getElementById('rollouts-count').textContent"))
 
 

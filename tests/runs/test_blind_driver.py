@@ -25,7 +25,7 @@ NEEDS_EYES = {
 
 
 @pytest.mark.parametrize(("suite", "scene"), NEEDS_EYES.items())
-def test_a_driver_that_follows_the_route_and_sees_nothing_collides(suite: str, scene: str) -> None:
+def test_a_driver_that_follows_the_route_and_sees_nothing_collides(suite, scene):
     folder, stem = scene.split("/")
     ref = next(
         one
@@ -42,7 +42,7 @@ def test_a_driver_that_follows_the_route_and_sees_nothing_collides(suite: str, s
     assert values["collision_at_fault"]["value"] == 1.0
 
 
-def test_every_shipped_suite_is_listed() -> None:
+def test_every_shipped_suite_is_listed():
     shipped = {
         path.stem for path in (Path(__file__).parents[2] / "scenarios" / "suites").glob("*.yaml")
     }

@@ -9,12 +9,12 @@ import pytest
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import Rates, Scenario, SensorSpec
+from alpasim_plugin.core.types import Rates, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig
 from alpasim_plugin.runs.loop_state import LoopState
 
 
-def rendered_steps(scenario: Scenario, rates: Rates, sensors: list[SensorSpec]) -> list[int]:
+def rendered_steps(scenario, rates, sensors):
     scenario = replace(scenario, rates=rates)
     clock = Clock(scenario.start_us, scenario.end_us, rates)
     rig = CameraRig(scenario, sensors, clock)
@@ -24,7 +24,7 @@ def rendered_steps(scenario: Scenario, rates: Rates, sensors: list[SensorSpec]) 
     ]
 
 
-def replace_end(state: LoopState, t_us: int):  # type: ignore[no-untyped-def]
+def replace_end(state, t_us):  # type: ignore[no-untyped-def]
     log = state.scenario.ego_log
     upto = int(np.searchsorted(log.t_us, t_us, side="right"))
     return type(log)(log.t_us[:upto], log.xyz[:upto], log.quat[:upto])

@@ -13,7 +13,7 @@ from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve_renderer, spec
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from scenarios.suite import expand
 
 
@@ -74,12 +74,12 @@ def test_resolving_a_renderer_or_a_fixer_does_not_load_torch():
     )
 
 
-def plan(renderers: tuple[str, ...], fixer: tuple[str, ...] = ()) -> RunPlan:
+def plan(renderers, fixer=()):
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
     return make_plan(refs, renderers, ("log-replay",), (0,), RunOptions(fixer=fixer))
 
 
-def keys(renderers: tuple[str, ...], fixer: tuple[str, ...] = ()) -> list[str]:
+def keys(renderers, fixer=()):
     return [cell.rollout_key for cell in plan(renderers, fixer).cells]
 
 

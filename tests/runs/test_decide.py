@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -15,8 +14,8 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.schema import MANIFEST, SUMMARY
 from alpasim_plugin.runs import decide as decide_module
-from alpasim_plugin.runs.decide import Decided, drawing_order, execute_decision, plan_of_two
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.decide import drawing_order, execute_decision, plan_of_two
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from evaluators.opening import read_run
 from evaluators.report.html import render_report
 from evaluators.statistics.decision import (
@@ -40,20 +39,20 @@ CLOSER = replace(SAME, alpha=0.001)
 class Looks(Announced):
     """Remembers looks, too."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.looks: list[tuple[int, str]] = []
 
-    def looked(self, state, rollouts: int, ceiling: int) -> None:
+    def looked(self, state, rollouts, ceiling):
         self.looks.append((state.n_scenes, state.answer))
 
 
 def plan_of(
-    scenes: int = 16,
-    renderers: tuple[str, str] = (GREY, DARKER),
-    policy: str = BY_GREY,
-    seeds: tuple[int, ...] = (0,),
-) -> RunPlan:
+    scenes=16,
+    renderers=(GREY, DARKER),
+    policy=BY_GREY,
+    seeds=(0,),
+):
     ref = expand("smoke/straight", SHORT)[0]
     refs = [ScenarioRef(ref.path, seed, ref.overrides) for seed in range(1, scenes + 1)]
     return make_plan(
@@ -61,9 +60,7 @@ def plan_of(
     )
 
 
-def decide(
-    root: Path, question: Question, plan: RunPlan, workers: int = 1
-) -> tuple[Decided, Looks]:
+def decide(root, question, plan, workers=1):
     announced = Looks()
     asked = plan_of_two(plan, question)
     decided = execute_decision(asked, question, root, workers, ["simrun"], announced, report=False)
@@ -86,7 +83,7 @@ def decided_run(tmp_path_factory, two_scenes_per_look):
     return root, *decide(root, SAME, plan_of())
 
 
-def told(root: Path) -> dict:
+def told(root):
     return {key: value for key, value in (read_decision(root) or {}).items()}
 
 

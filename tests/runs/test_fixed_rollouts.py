@@ -5,7 +5,7 @@ frames.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,11 +18,7 @@ from alpasim_plugin.core.types import (
     CameraSpec,
     Frame,
     Latency,
-    Observation,
-    Plan,
     RenderRequest,
-    Route,
-    Scenario,
     SensorSpec,
 )
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -51,11 +47,11 @@ class Watching(LogReplay):
 
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         self.seen: list[Frame] = []
         self.asked: list[int] = []
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         self.asked.append(observation.t_us)
         self.seen += observation.frames.values()
         return super().act(observation)
@@ -66,7 +62,7 @@ class Zigzag(Watching):
 
     controller = "bicycle"
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         side = 1.0 if (observation.t_us // 100_000) % 2 else -1.0
         along = np.linspace(0.0, 1.0, len(plan.xy))
@@ -87,14 +83,14 @@ class Drive:
 
 
 def drive(
-    scenario: Scenario,
-    policy: type[Watching] = Watching,
-    fixer: Callable[[], Blend] = Blend,
+    scenario,
+    policy=Watching,
+    fixer=Blend,
     **settings: object,
-) -> Drive:
+):
     fixers: list[Blend] = []
 
-    def make() -> Blend:
+    def make():
         fixers.append(fixer())
         return fixers[-1]
 
@@ -103,7 +99,7 @@ def drive(
     frames: list[Frame] = []
     inner = session.render_batch
 
-    def watched(requests: Sequence[RenderRequest]) -> list[Frame]:
+    def watched(requests):
         calls.append(list(requests))
         out = inner(requests)
         frames.extend(out)
@@ -115,17 +111,17 @@ def drive(
     return Drive(done, session, fixers, driver, [r for call in calls for r in call], frames, calls)
 
 
-def session_of(scenario: Scenario, make: Callable[[], Blend], **settings: object) -> Renderer:
+def session_of(scenario, make, **settings: object):
     base = make_renderer("clean", scenario, 0, threads=1)
     return fixed_renderer(base.render, make, FixerSettings(name="test", **settings), scenario, 1)  # type: ignore[arg-type]
 
 
-def rendered(scenario: Scenario, requests: Sequence[RenderRequest]) -> list[Frame]:
+def rendered(scenario, requests):
     base = make_renderer("clean", scenario, 0, threads=1)
     return [base.render(request) for request in requests]
 
 
-def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
+def assert_same_pictures(one, other):
     assert [(f.t_us, f.camera) for f in one] == [(f.t_us, f.camera) for f in other]
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(one, other, strict=True))
 
@@ -138,7 +134,7 @@ def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road,
     sizes = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32")
     small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
 
-    def network() -> Blend:
+    def network():
         return make_fixer(
             "onefixer-dit-tiny",
             fixer_settings("onefixer-dit-tiny", small),
@@ -186,13 +182,13 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road):
 def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(
     straight_road,
 ):
-    def digest(renderer: object) -> str:
+    def digest(renderer):
         recorder = Recorder(straight_road, 0)
         run_rollout(straight_road, renderer, make_policy("lane-camera", straight_road), 0, recorder)  # type: ignore[arg-type]
         return hashlib.sha256((recorder.folder / LOG_NAME).read_bytes()).hexdigest()
 
     class Nothing(Blend):
-        def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+        def _mix(self, block):
             return list(block)
 
     session = session_of(straight_road, Nothing, tolerance_m=0.0, tolerance_deg=0.0)
@@ -240,7 +236,7 @@ def test_a_slower_camera_has_its_own_blocks(straight_road):
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
 
 
-def with_rear_camera(scenario: Scenario) -> Scenario:
+def with_rear_camera(scenario):
     front = scenario.cameras[0]
     turned = front.T_rig_camera.copy()
     turned[:2, :3] *= -1
@@ -348,7 +344,7 @@ def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(straight_road,
 
 def test_maps_are_drawn_at_the_poses_of_the_frames(straight_road):
     class KeepsMaps(Blend):
-        def step(self, block: Sequence[Frame], maps: Sequence[np.ndarray]) -> Sequence[Frame]:
+        def step(self, block, maps):
             self.maps = [*getattr(self, "maps", []), *maps]
             return super().step(block, maps)
 

@@ -7,14 +7,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runs.cell import MANIFEST
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from alpasim_plugin.runs.summary import speed
 from scenarios.suite import expand
@@ -33,16 +32,14 @@ SMALL_NET = (
 SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
 
 
-def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
+def plan_of(fixer=SMALL_NET):
     refs = expand("smoke/straight", SCENE)
     return make_plan(
         refs, ("clean", "onefixer-dit-tiny+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer)
     )
 
 
-def run(
-    plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False
-) -> list[tuple[str, bool]]:
+def run(plan, root, workers=1, resume=False, report=False):
     announced = Announced()
     execute_run(plan, root, workers, ["simrun"], announced, resume, "none", report)
     return announced.results

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,10 +14,10 @@ from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.runs.fork import Change, fork_rollout
-from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
+from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import log_trace
-from alpasim_plugin.runs.run import RunResult, execute_run
+from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runs.test_runs import Announced
@@ -66,11 +65,11 @@ def changed(past, tmp_path_factory):
     return folder
 
 
-def go(past: LoggedRollout, root: Path, **change: object) -> RunResult:
+def go(past, root, **change: object):
     return fork_rollout(past, Change(AT_US, **change), root, ["simrun", "fork"])  # type: ignore[arg-type]
 
 
-def forked(root: Path) -> Path:
+def forked(root):
     return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
 
 

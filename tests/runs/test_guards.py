@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ import pytest
 from alpasim_plugin.core.errors import PolicyError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.plan_check import plan_problem
-from alpasim_plugin.core.types import Frame, Plan, RenderRequest
+from alpasim_plugin.core.types import Frame, Plan
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.guards import checked_frames
@@ -27,17 +25,17 @@ GOOD = Frame(REQUEST.t_us, REQUEST.camera.name, np.full((*SHAPE, 3), 90, np.uint
 
 
 class Returns(Renderer):
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         raise AssertionError("frames are asked for in batches")
 
-    def __init__(self, frame: Any) -> None:
+    def __init__(self, frame):
         self.frame = frame
 
-    def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
+    def render_batch(self, requests):
         return [self.frame for _ in requests]
 
 
-def plane(value: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+def plane(value):
     return np.full(SHAPE, value, np.float32)
 
 
@@ -69,7 +67,7 @@ def test_what_is_no_frame_is_the_renderers_failure(frame):
 
 
 class Far(ConstantVelocity):
-    def act(self, observation: Any) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         return replace(plan, xy=plan.xy * 1e30)
 

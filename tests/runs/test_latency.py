@@ -8,7 +8,7 @@ from alpasim_plugin.core.types import Latency, Trajectory
 from alpasim_plugin.runs.loop_state import PlanQueue
 
 
-def plan(t_us: int) -> Trajectory:
+def plan(t_us):
     return Trajectory(np.array([t_us]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
 
 

@@ -9,18 +9,18 @@ import numpy as np
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.lens import rays_of
 from alpasim_plugin.core.shutter import rolling_exposure
-from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest, Scenario
+from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest
 from alpasim_plugin.runs.lenses import through_lenses
 
 
 class Directions(Renderer):
     """Paints every pixel with the direction that it sees, and keeps the requests."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario):
         self.scenario = scenario
         self.asked: list[RenderRequest] = []
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         """Paint one frame."""
         self.asked.append(request)
         spec = request.camera
@@ -32,7 +32,7 @@ class Directions(Renderer):
         return Frame(request.t_us, spec.name, (127.5 + 127 * unit).round().astype(np.uint8))
 
 
-def fisheye(straight_road: Scenario) -> CameraSpec:
+def fisheye(straight_road):
     K = np.array([[60.0, 0.0, 100.0], [0.0, 60.0, 75.0], [0.0, 0.0, 1.0]])
     lens = LensModel("fisheye", (), max_angle_rad=np.deg2rad(95))
     return CameraSpec("fish", 200, 150, K, straight_road.cameras[0].T_rig_camera, 30_000, lens)
@@ -43,7 +43,7 @@ def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
     scenario = replace(straight_road, cameras=(camera, straight_road.cameras[0]))
     made = []
 
-    def make(pinholes: Scenario) -> Renderer:
+    def make(pinholes):
         made.append(Directions(pinholes))
         return made[0]
 

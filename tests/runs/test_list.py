@@ -47,7 +47,7 @@ def root(tmp_path_factory):
     return root
 
 
-def listed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, dict[str, object]]:
+def listed(capsys, *words: str):
     """Return name -> run of a list, in its order."""
     capsys.readouterr()
     assert run_command(["list", "runs", *words, "--json"]) == 0

@@ -17,7 +17,7 @@ from alpasim_plugin.runs.executors import local
 from alpasim_plugin.runs.executors.local import Lost, map_jobs, run_jobs
 
 
-def work(item: str) -> str:
+def work(item):
     """Do what the item says."""
     if item == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -70,7 +70,7 @@ def test_a_worker_has_its_threads_and_passes_no_safe_path_on(threads):
     assert "PYTHONSAFEPATH" not in os.environ
 
 
-def environment(name: str) -> tuple[str | None, str | None]:
+def environment(name):
     return os.environ.get(name), os.environ.get("PYTHONSAFEPATH")
 
 

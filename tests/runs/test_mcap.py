@@ -25,7 +25,7 @@ CELL = ("--scene", "urban-left_turn", "--policy", "lane-camera", "--seed", "0")
 Messages = dict[str, list[tuple[int, dict[str, Any]]]]  # topic -> time in nanoseconds, message
 
 
-def read(path: Path) -> tuple[Messages, dict[str, str], dict[str, str]]:
+def read(path):
     """Return messages, topic -> schema, and the metadata, after the reader has checked every
     CRC.
     """
@@ -54,11 +54,11 @@ def recorded(watched, tmp_path_factory):
     return read(path)
 
 
-def xyz(point: dict[str, float]) -> list[float]:
+def xyz(point):
     return [point["x"], point["y"], point["z"]]
 
 
-def nanoseconds(time: dict[str, int]) -> int:
+def nanoseconds(time):
     return time["sec"] * 10**9 + time["nsec"]
 
 
@@ -170,7 +170,7 @@ def test_a_failed_rollout_and_missing_frames_are_said(watched, tmp_path, capsys)
     }
 
 
-def without_images(log: Path) -> bytes:
+def without_images(log):
     """Return a log's bytes without its camera frames."""
     kept = [
         entry.SerializeToString()

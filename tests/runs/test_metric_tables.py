@@ -163,7 +163,7 @@ def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_pa
     assert alike == set(ALIKE), "give one quantity one name, or say here why it has two"
 
 
-def _is_same(one: dict[int, float], other: dict[int, float]) -> bool:
+def _is_same(one, other):
     """Tell whether two series are equal up to a constant or the sign, on the times that both
     have.
     """

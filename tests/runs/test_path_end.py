@@ -12,10 +12,10 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.geometry import quat_from_yaw
-from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.core.types import Plan, SensorSpec, Trajectory
 from alpasim_plugin.runs.cell import find_rollout_state
 from alpasim_plugin.runs.loop_state import PathEnd
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.run import execute_run
 from alpasim_plugin.runs.score_logs import check_complete
@@ -32,17 +32,17 @@ class Fast:
 
     sensors: tuple[SensorSpec, ...] = ()
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         self.speed_mps = 0.0
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         self.speed_mps = self.speed_mps or 2 * observation.ego.speed_mps
         times = observation.t_us + 100_000 * np.arange(41, dtype=np.int64)
         x = self.speed_mps * 1e-6 * (times - observation.t_us)
         return Plan(observation.t_us, times, np.stack([x, 0 * x], axis=1), 0 * x)
 
 
-def shortened(scenario: Scenario, keep_m: float, stands: bool) -> Scenario:
+def shortened(scenario, keep_m, stands):
     """Cut the recording after some metres; it ends there in motion, or stands there for the rest of
     the time.
     """
@@ -52,7 +52,7 @@ def shortened(scenario: Scenario, keep_m: float, stands: bool) -> Scenario:
     return replace(scenario, ego_log=Trajectory(log.t_us, xyz, quat_from_yaw(np.zeros(len(x)))))
 
 
-def last_us(scenario: Scenario) -> int:
+def last_us(scenario):
     return int(run_rollout(scenario, Grey(), Fast(), 0).log().ego.t_us[-1])
 
 
@@ -107,7 +107,7 @@ def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(
 def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
     tmp_path,
 ):
-    def plan(preset: str) -> RunPlan:
+    def plan(preset):
         refs = expand("smoke/straight", ("timing.duration_us=2000000", "degradation.kind=none"))
         return make_plan(refs, (GREY,), ("constant-velocity", FAST), (0,), RunOptions(preset))
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from alpasim_plugin import run_rollout
-from alpasim_plugin.core.types import F64, Frame, Latency
+from alpasim_plugin.core.types import Latency
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.loop import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
@@ -20,11 +20,11 @@ from tests.runs.test_fixed_rollouts import Zigzag, assert_same_pictures, drive, 
 SMALL = ("weights.bundle=null", "generator.widths=[8,8,8]", "untrained=random", "uses_map=false")
 
 
-def network() -> PixelFixer:
+def network():
     return PixelFixer(fixer_settings("onefixer", SMALL), "straight-road", threads=1)
 
 
-def offline(frames: list[Frame]) -> list[Frame]:
+def offline(frames):
     fixer = network()
     return [out for frame in frames for out in fixer.step([frame], ())]
 
@@ -52,7 +52,7 @@ def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road):
     class Slow(Grey):
         stage_ms = MappingProxyType({"fix": 150.0})  # longer than the camera's period
 
-    def path(latency: Latency) -> F64:
+    def path(latency):
         scenario = replace(straight_road, end_us=1_500_000, latency=latency)
         return run_rollout(scenario, Slow(), Zigzag(scenario)).log().ego.xyz
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,7 @@ from alpasim_plugin.runs.provenance import project
 WHO = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
 
 
-def git(folder: Path, *words: str) -> str:
+def git(folder, *words: str):
     return subprocess.run(
         ["git", *WHO, *words], cwd=folder, check=True, capture_output=True, text=True
     ).stdout.strip()

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -32,7 +31,7 @@ def cluster(repo):
             yield
 
 
-def drive(plan, root: Path, executor: Executor):
+def drive(plan, root, executor):
     announced = Announced()
     run = execute_run(plan, root, 2, ["simrun"], announced, report=False, executor=executor)
     return run, announced

@@ -17,7 +17,7 @@ T_US = (
 )  # epoch times: too long for a float's mantissa
 
 
-def circle(speed_mps: float, radius_m: float) -> Trajectory:
+def circle(speed_mps, radius_m):
     """Drive a left circle from the origin along x."""
     s = speed_mps * (T_US - T_US[0]) * 1e-6
     yaw = s / radius_m

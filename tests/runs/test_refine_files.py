@@ -4,17 +4,15 @@ memory that does not grow.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.core.types import Frame
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 from alpasim_plugin.runs.refine import RefineFiles, refine_video
 
@@ -28,18 +26,18 @@ class Inverting:
 
     trained, label = True, "inverting"
 
-    def __init__(self, rule: BlockRule = BlockRule(5, 8)) -> None:
+    def __init__(self, rule=BlockRule(5, 8)):
         self.blocks = rule
         self.sizes: list[int] = []
         self.seen: list[Frame] = []
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed):
         self.sizes, self.seen = [], []
 
-    def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+    def preview(self, block, maps):
         raise AssertionError("a video's blocks are final")
 
-    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+    def step(self, block, maps):
         self.sizes.append(len(block))
         self.seen += block
         out = []
@@ -53,7 +51,7 @@ class Inverting:
         return out
 
 
-def pictures(n: int, width: int = 64, height: int = 36) -> list[U8]:
+def pictures(n, width=64, height=36):
     x = np.linspace(0, 200, width, dtype=np.float32)
     return [
         np.repeat(np.tile(x + i, (height, 1))[..., None], 3, 2).astype(np.uint8) for i in range(n)
@@ -61,19 +59,19 @@ def pictures(n: int, width: int = 64, height: int = 36) -> list[U8]:
 
 
 def video(
-    path: Path,
-    frames: Sequence[U8],
-    rate: Fraction = RATE,
-    times: Sequence[int] | None = None,
-    base: Fraction | None = None,
-) -> Path:
+    path,
+    frames,
+    rate=RATE,
+    times=None,
+    base=None,
+):
     with VideoWriter(path, base or 1 / rate, rate, crf=2) as writer:
         for i, image in enumerate(frames):
             writer.write(image, i if times is None else times[i])
     return path
 
 
-def read(path: Path) -> tuple[list[Fraction], U8]:
+def read(path):
     with VideoReader(path) as reader:
         frames = list(reader)
         return [f.time * reader.format.time_base for f in frames], np.stack(
@@ -136,7 +134,7 @@ def test_odd_sizes_are_padded_in_the_file_only(tmp_path):
     assert read(tmp_path / "out.mp4")[1].shape == (3, 36, 62, 3)
 
 
-def write_odd(path: Path, frames: Sequence[U8]) -> None:
+def write_odd(path, frames):
     import av
 
     with av.open(str(path), "w") as container:
@@ -147,7 +145,7 @@ def write_odd(path: Path, frames: Sequence[U8]) -> None:
         container.mux(stream.encode())
 
 
-def misfits(folder: Path) -> dict[str, tuple[RefineFiles, str]]:
+def misfits(folder):
     """Return, by situation, files that cannot be refined and what the error must say."""
     source, out = video(folder / "in.mp4", pictures(9)), folder / "out.mp4"
     taken = video(folder / "taken.mp4", pictures(1))
@@ -249,7 +247,7 @@ def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_
         compare=tmp_path / "side.mp4",
     )
 
-    def stop(frames: int, claimed: int | None) -> None:
+    def stop(frames, claimed):
         if frames > 5:
             raise KeyboardInterrupt
 

@@ -19,7 +19,7 @@ FREEWAY = "udacity/solidWhiteRight.mp4"
 STREET = "cosmos-transfer/posttrain/{}/ftheta_camera_front_wide_120fov/av_002b815b-7595-4d54-a9f4-4c62c83d3009_0.mp4"
 
 
-def small(source: Path, to: Path, size: tuple[int, int], frames: int) -> Path:
+def small(source, to, size, frames):
     """Copy the first frames at a smaller size, times and colours kept."""
     with (
         VideoReader(source) as video,
@@ -34,7 +34,7 @@ def small(source: Path, to: Path, size: tuple[int, int], frames: int) -> Path:
     return to
 
 
-def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[str, object]:
+def refine(capsys, *arguments: Path | str):
     untrained = ["--set", "fixer.weights.bundle=null", "--set", "fixer.holes=render"]
     assert run_command(["refine", *map(str, arguments), *untrained, "--json"]) == 0
     document: dict[str, object] = json.loads(capsys.readouterr().out)

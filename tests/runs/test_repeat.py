@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
@@ -18,7 +17,7 @@ SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
 FORGETFUL = "tests.runs.broken_policies:RemembersEarlierRollouts"
 
 
-def plan_of(policies: str, *overrides: str) -> RunPlan:
+def plan_of(policies, *overrides: str):
     refs = [
         *expand("smoke/lead_car", (LONGER, *BARE, *overrides)),
         *expand("smoke/straight", (SHORT, *BARE, *overrides)),
@@ -26,7 +25,7 @@ def plan_of(policies: str, *overrides: str) -> RunPlan:
     return make_plan(refs, ("clean",), policies.split(","), (0,), RunOptions(images="none"))
 
 
-def repeated(plan: RunPlan, root: Path) -> dict:
+def repeated(plan, root):
     result = execute_run(plan, root, 1, ["simrun"], Announced(), repeat=True, report=False)
     found = json.loads((root / "run.json").read_text())["repeat"]
     assert result.summary["repeat"] == found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +14,7 @@ from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory
 from alpasim_plugin.core.types import (
     Frame,
     Latency,
-    Observation,
     Plan,
-    RenderRequest,
-    Route,
-    Scenario,
     SensorSpec,
 )
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
@@ -27,20 +22,18 @@ from alpasim_plugin.runs.recorder import Recorder
 from tests.examples import first_of
 
 
-def drive(
-    scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0
-) -> Recorder:
+def drive(scenario, policy, renderer="clean", threads=1, seed=0):
     session = make_renderer(renderer, scenario, seed, threads=threads)
     return run_rollout(
         scenario, session, make_policy(policy, scenario), seed, Recorder(scenario, seed)
     )
 
 
-def digest(recorder: Recorder) -> str:
+def digest(recorder):
     return hashlib.sha256((recorder.folder / LOG_NAME).read_bytes()).hexdigest()
 
 
-def test_log_replay_reproduces_the_recorded_poses(straight_road: Scenario) -> None:
+def test_log_replay_reproduces_the_recorded_poses(straight_road):
     log = drive(straight_road, "log-replay").log()
     rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
     recorded = interpolate(straight_road.ego_log, rig.t_us)
@@ -50,8 +43,8 @@ def test_log_replay_reproduces_the_recorded_poses(straight_road: Scenario) -> No
 
 
 def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(
-    straight_road: Scenario,
-) -> None:
+    straight_road,
+):
     recorder = drive(straight_road, "lane-camera")
     log = recorder.log()
     assert len(log.ego) == 31
@@ -60,7 +53,7 @@ def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(
     assert [plan.now_us for plan in log.plans] == list(range(0, 3_000_000, 100_000))
 
 
-def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road: Scenario) -> None:
+def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road):
     log = drive(straight_road, "constant-velocity").log()
     braking = run_rollout(
         straight_road, make_renderer("clean", straight_road), StandStill(), 0
@@ -72,13 +65,13 @@ def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road: Scen
 
 @pytest.mark.parametrize("renderer", first_of(["3dgs", "clean"]))
 def test_the_same_rollout_twice_is_equal_to_the_byte_for_any_number_of_threads(
-    straight_road: Scenario, renderer: str
-) -> None:
+    straight_road, renderer
+):
     once = digest(drive(straight_road, "lane-camera", renderer, threads=1))
     assert digest(drive(straight_road, "lane-camera", renderer, threads=2)) == once
 
 
-def test_seeds_change_a_sampling_policy_and_nothing_in_the_warm_up(straight_road: Scenario) -> None:
+def test_seeds_change_a_sampling_policy_and_nothing_in_the_warm_up(straight_road):
     zero, one = (drive(straight_road, "lane-camera", seed=seed).log() for seed in (0, 1))
     warm = zero.ego.t_us <= 1_000_000
     np.testing.assert_array_equal(zero.ego.xyz[warm], one.ego.xyz[warm])
@@ -90,10 +83,10 @@ class StandStill:
 
     sensors = (SensorSpec("front"),)
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         pass
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         times = observation.t_us + np.array([0, 1_000_000, 4_000_000])
         return Plan(observation.t_us, times, np.zeros((3, 2)), np.zeros(3))
 
@@ -101,7 +94,7 @@ class StandStill:
 class LateBrake(StandStill):
     """Drives on for a second of questions, then stands still: shows when a plan takes effect."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         if observation.t_us < 1_500_000:
             along = (plan.times_us - plan.t_us) * 1e-6 * 10.0
@@ -109,8 +102,8 @@ class LateBrake(StandStill):
         return plan
 
 
-def test_a_fixed_latency_delays_the_reaction_by_exactly_that_time(straight_road: Scenario) -> None:
-    def when_braking(latency: Latency) -> int:
+def test_a_fixed_latency_delays_the_reaction_by_exactly_that_time(straight_road):
+    def when_braking(latency):
         scenario = replace(straight_road, latency=latency)
         log = run_rollout(scenario, make_renderer("clean", scenario), LateBrake(), 0).log()
         speed = np.diff(log.ego.xyz[:, 0]) / 0.1
@@ -122,21 +115,21 @@ def test_a_fixed_latency_delays_the_reaction_by_exactly_that_time(straight_road:
 class Raises(StandStill):
     """Breaks."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         raise ValueError("the weights are gone")
 
 
 class NotFinite(StandStill):
     """Answers NaN."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         return replace(super().act(observation), yaw=np.full(3, np.nan))
 
 
 class Stale(StandStill):
     """Answers for an instant that has passed."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         return replace(plan, times_us=plan.times_us - 1)
 
@@ -144,7 +137,7 @@ class Stale(StandStill):
 class BareArray(StandStill):
     """Answers with positions alone."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         return super().act(observation).xy  # type: ignore[return-value]
 
 
@@ -157,9 +150,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("policy", "found"), BROKEN)
-def test_a_broken_policy_is_named_and_not_driven(
-    straight_road: Scenario, policy: type[StandStill], found: str
-) -> None:
+def test_a_broken_policy_is_named_and_not_driven(straight_road, policy, found):
     with pytest.raises(PolicyError, match=found):
         run_rollout(straight_road, make_renderer("clean", straight_road), policy(), 0)
 
@@ -167,14 +158,14 @@ def test_a_broken_policy_is_named_and_not_driven(
 class WrongSize:
     """Gives frames of another size."""
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         return Frame(request.t_us, request.camera.name, np.zeros((2, 2, 3), np.uint8))
 
 
 class Breaks:
     """Raises."""
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         raise RuntimeError("out of memory")
 
 
@@ -182,9 +173,7 @@ class Breaks:
     ("renderer", "found"),
     [(WrongSize, r"uint8 \(2, 2, 3\), not uint8 \(64, 96, 3\)"), (Breaks, "out of memory")],
 )
-def test_a_broken_renderer_is_named_and_its_frame_not_used(
-    straight_road: Scenario, renderer: type, found: str
-) -> None:
+def test_a_broken_renderer_is_named_and_its_frame_not_used(straight_road, renderer, found):
     with pytest.raises(RendererError, match=found):
         run_rollout(straight_road, renderer(), StandStill(), 0)
 
@@ -192,7 +181,7 @@ def test_a_broken_renderer_is_named_and_its_frame_not_used(
 class Black:
     """Gives black frames of the right form."""
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         return Frame(
             request.t_us,
             request.camera.name,
@@ -200,12 +189,12 @@ class Black:
         )
 
 
-def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
+def test_black_frames_are_counted_not_dropped(straight_road):
     recorder = run_rollout(straight_road, Black(), StandStill(), 0)
     assert recorder.facts()["frame_events"] == {"black": 30}
 
 
-def test_a_failed_rollout_leaves_no_finished_log(straight_road: Scenario, tmp_path: Path) -> None:
+def test_a_failed_rollout_leaves_no_finished_log(straight_road, tmp_path):
     recorder = Recorder(straight_road, 0, tmp_path)
     with pytest.raises(PolicyError), recorder:
         run_rollout(straight_road, make_renderer("clean", straight_road), Raises(), 0, recorder)

@@ -15,7 +15,7 @@ from policies.learned import Learned
 from scenarios.suite import expand
 
 
-def keys() -> list[str]:
+def keys():
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
     plan = make_plan(refs, ("clean",), ("pure-pursuit", "learned"), (0,), RunOptions(images="none"))
     return [cell.rollout_key for cell in plan.cells]
@@ -32,7 +32,7 @@ def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path, monkey
     assert keys()[1] != seeing
 
 
-def fixed_key(*overrides: str) -> str:
+def fixed_key(*overrides: str):
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
     return (
         make_plan(

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -19,9 +18,9 @@ import pytest
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.runs.cell import MANIFEST
-from alpasim_plugin.runs.execute import Threads, thread_budget
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.runs.run import RunResult, execute_run
+from alpasim_plugin.runs.execute import thread_budget
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 
@@ -31,28 +30,26 @@ SHORT = ("timing.duration_us=1200000", "degradation.kind=none")
 class Announced:
     """Remembers what a run announced."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.results: list[tuple[str, bool]] = []
         self.notices: list[str] = []
 
-    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+    def started(self, plan, root, threads):
         self.threads = threads
 
-    def rollout_done(self, manifest: dict, reused: bool) -> None:
+    def rollout_done(self, manifest, reused):
         self.results.append((manifest["status"], reused))
 
-    def noticed(self, text: str) -> None:
+    def noticed(self, text):
         self.notices.append(text)
 
 
-def plan_of(
-    policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...] = ("smoke/straight",)
-) -> RunPlan:
+def plan_of(policies=("lane-camera",), scenes=("smoke/straight",)):
     refs = [ref for name in scenes for ref in expand(name, SHORT)]
     return make_plan(refs, ("clean", "3dgs"), policies, (0,), RunOptions())
 
 
-def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
+def cheap_plan(seeds=(0,)):
     """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the
     renderer.
     """
@@ -60,14 +57,12 @@ def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
     return make_plan(refs, (GREY,), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
 
 
-def run(
-    plan: RunPlan, root: Path, workers: int = 1, resume: bool = False
-) -> tuple[RunResult, Announced]:
+def run(plan, root, workers=1, resume=False):
     announced = Announced()
     return execute_run(plan, root, workers, ["simrun"], announced, resume, report=False), announced
 
 
-def comparable(root: Path) -> dict[str, object]:
+def comparable(root):
     """Return everything of a run that must not depend on how it was run."""
     rows = pq.read_table(root / "rollouts.parquet").drop_columns(["wall_s"]).to_pylist()
     logs = {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("rollout.asl"))}

@@ -17,7 +17,7 @@ from evaluators.statistics.gate import GateSpec, MetricRule
 from tests.evaluators.test_gate import add, rows, table_of
 
 
-def trial(margin: float, is_broken: bool, change: float, limit: float | None = None) -> Trial:
+def trial(margin, is_broken, change, limit=None):
     rules = {"lateral_distance_m": MetricRule(margin=margin, max=limit)}
     name = "broken-black" if is_broken else CONTROL
     first, again = table_of(rows(REFERENCE)), table_of(add(change)(rows(name)))

@@ -7,14 +7,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core import parts
-from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.reports import divergences_of
@@ -43,9 +42,9 @@ class ByRoute:
 
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
-    def reset(self, seed: int, route: Route) -> None: ...
+    def reset(self, seed, route): ...
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         ahead = observation.route_rig[np.isfinite(observation.route_rig[:, 0]), :2]
         ahead = np.concatenate([np.zeros((1, 2)), ahead[ahead[:, 0] > 0.5]])
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ahead, axis=0).T))])
@@ -65,7 +64,7 @@ class ByRoute:
 class Blind(ByRoute):
     """Goes straight on."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         x = np.hypot(*plan.xy.T)
         return replace(plan, xy=np.stack([x, 0 * x], axis=1), yaw=0 * x)
@@ -74,7 +73,7 @@ class Blind(ByRoute):
 class Right(ByRoute):
     """Follows the route."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         return replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
 
@@ -82,14 +81,14 @@ class Right(ByRoute):
 class Raises(Right):
     """Raises at its first query."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         raise ValueError("seven")
 
 
 class RaisesLater(Right):
     """Raises after a second."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         if observation.t_us > observation.history.t_us[0] + 1_500_000:
             raise ValueError("eight")
         return super().act(observation)
@@ -98,7 +97,7 @@ class RaisesLater(Right):
 class ByContrast(Right):
     """Follows the route where a picture shows anything, and loses its way where it is grey."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         return (
             plan
@@ -123,7 +122,7 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
-def rollout(run: Path, policy: str) -> Path:
+def rollout(run, policy):
     """Return the folder of a policy's drive."""
     return next(
         path.parent
@@ -132,7 +131,7 @@ def rollout(run: Path, policy: str) -> Path:
     )
 
 
-def queries_of(page: str) -> list[dict[str, Any]]:
+def queries_of(page):
     """Return the queries that a page draws."""
     found = re.search(r'<script type="application/json" id="cause">(.*?)</script>', page)
     return list(json.loads(found[1])["queries"])

@@ -4,8 +4,6 @@ do.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from alpasim_plugin.core.errors import InputError
@@ -29,7 +27,7 @@ SWERVE = f"    - {{kind: straight, length_m: 40}}\n    - {{kind: narrow_gap, len
 LATE = "kind: crossing_pedestrian, id: p, s_m: 150"
 
 
-def fails(tmp_path: Path, text: str) -> InputError:
+def fails(tmp_path, text):
     path = tmp_path / "scene.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as e:
@@ -40,7 +38,7 @@ def fails(tmp_path: Path, text: str) -> InputError:
     return e.value
 
 
-def swap(old: str, new: str) -> str:
+def swap(old, new):
     assert old in GOOD
     return GOOD.replace(old, new)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,13 +14,13 @@ from scenarios.usdz_write import write_usdz
 ROAD = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\n"
 
 
-def written(folder: Path, cameras: str, more: str = "") -> Path:
+def written(folder, cameras, more=""):
     path = folder / "scene.yaml"
     path.write_text(f"{ROAD}{more}cameras: {cameras}\n")
     return path
 
 
-def test_lens_shutter_and_rate_of_a_section_are_the_cameras(tmp_path: Path) -> None:
+def test_lens_shutter_and_rate_of_a_section_are_the_cameras(tmp_path):
     text = "[{name: a, lens: fisheye, width: 200, height: 160, hfov_deg: 190, shutter_us: 30000, interval_us: 200000, max_angle_deg: 100}]"
     (camera,) = load_scenario(written(tmp_path, text)).cameras
     assert (camera.shutter_us, camera.interval_us) == (30_000, 200_000)
@@ -33,7 +31,7 @@ def test_lens_shutter_and_rate_of_a_section_are_the_cameras(tmp_path: Path) -> N
     assert len(sides_of(camera)) == 5
 
 
-def test_the_order_of_listing_changes_no_scenario(tmp_path: Path) -> None:
+def test_the_order_of_listing_changes_no_scenario(tmp_path):
     text = ["{name: b, yaw_deg: 90}", "{name: a}", "{name: c, hfov_deg: 100}"]
     one = load_scenario(written(tmp_path, f"[{', '.join(text)}]"))
     other = load_scenario(written(tmp_path, f"[{', '.join(text[::-1])}]"))
@@ -45,14 +43,14 @@ def test_the_order_of_listing_changes_no_scenario(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rig", "count"), [("front", 1), ("alpasim-4", 4), ("alpasim-6", 6), ("surround-6", 6)]
 )
-def test_a_shipped_rig_is_read_and_scaled(tmp_path: Path, rig: str, count: int) -> None:
+def test_a_shipped_rig_is_read_and_scaled(tmp_path, rig, count):
     cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras
     assert [camera.width for camera in cameras] == [192] * count
     assert cameras[0].T_rig_camera[0, 2] > 0.99
     assert len(sides_of(cameras[0])) == 1
 
 
-def test_cameras_of_a_usdz_have_its_lenses(tmp_path: Path) -> None:
+def test_cameras_of_a_usdz_have_its_lenses(tmp_path):
     write_usdz(tmp_path / "s.usdz", load_scenario(written(tmp_path, "{rig: surround-6}")))
     cameras = load_scenario(written(tmp_path, "{from: s.usdz, shutter_us: 20000}")).cameras
     assert len(cameras) == 6
@@ -62,7 +60,7 @@ def test_cameras_of_a_usdz_have_its_lenses(tmp_path: Path) -> None:
     np.testing.assert_allclose(across[:, 0] / across[:, 2], [-0.7, 0.7], atol=0.005)
 
 
-def test_cameras_of_an_argoverse_log_have_its_distortion(shared_data: Path, tmp_path: Path) -> None:
+def test_cameras_of_an_argoverse_log_have_its_distortion(shared_data, tmp_path):
     (log,) = (p.parent.parent for p in shared_data.glob("av2/*/calibration/intrinsics.feather"))
     text = f"{{from: {log}, width: 205, names: [ring_side_left, ring_front_center]}}"
     cameras = load_scenario(written(tmp_path, text)).cameras
@@ -75,7 +73,7 @@ RIG = """{"axes": "%s", "w": 640, "h": 480, "fl_x": 500, "fl_y": 510.0, "cx": 32
 {"camera": "%s", "camera_model": "OPENCV_FISHEYE", "transform_matrix": [[0, 0, %s, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]]}]}"""
 
 
-def test_cameras_of_a_transforms_json_stand_where_its_poses_say(tmp_path: Path) -> None:
+def test_cameras_of_a_transforms_json_stand_where_its_poses_say(tmp_path):
     (tmp_path / "rig.json").write_text(RIG % ("opencv", "round", 1))
     cameras = load_scenario(written(tmp_path, "{from: rig.json, width: 320}")).cameras
     left, fisheye = sorted(cameras, key=lambda camera: camera.name)
@@ -93,9 +91,7 @@ def test_cameras_of_a_transforms_json_stand_where_its_poses_say(tmp_path: Path) 
     ("axes", "name", "forward", "named"),
     [("nerf", "round", 1, "axes"), ("opencv", "left", 1, "'left'"), ("opencv", "a", 2, "rotation")],
 )
-def test_a_transforms_json_that_is_no_calibration_is_refused(
-    tmp_path: Path, axes: str, name: str, forward: int, named: str
-) -> None:
+def test_a_transforms_json_that_is_no_calibration_is_refused(tmp_path, axes, name, forward, named):
     (tmp_path / "rig.json").write_text(RIG % (axes, name, forward))
     with pytest.raises(InputError) as error:
         load_scenario(written(tmp_path, "{from: rig.json, width: 320}"))
@@ -124,8 +120,8 @@ def test_a_transforms_json_that_is_no_calibration_is_refused(
     ],
 )
 def test_cameras_that_cannot_be_drawn_are_refused_before_the_road_is_built(
-    tmp_path: Path, cameras: str, named: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, cameras, named, monkeypatch
+):
     if "body" not in named:
         monkeypatch.setattr("scenarios.load.built_drive", None)
     with pytest.raises(InputError) as error:

@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.geometry import interpolate, yaw_from_quat, yaw_of
-from alpasim_plugin.core.types import F64, Box, Scenario
+from alpasim_plugin.core.types import Box
 from scenarios.load import load_scenario
 from scenarios.suite import load_suite, shipped, shipped_names, suites
 from tests.examples import first_of
@@ -20,11 +20,11 @@ CAR = Box(4.855, 1.88, 1.6)
 
 
 @functools.cache
-def scenario(name: str) -> Scenario:
+def scenario(name):
     return load_scenario(name)
 
 
-def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
+def rectangle(pose, box, ahead_m=0.0):
     """One footprint by plain trigonometry: the slow reference of the array code in
     `scenarios.build`.
     """
@@ -38,7 +38,7 @@ def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
 
 
 def test_the_library_is_as_large_as_promised():
-    def count(folder: str) -> int:
+    def count(folder):
         return sum(name.startswith(f"{folder}/") for name in shipped_names())
 
     assert count("smoke") >= 3

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import csv
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.lane_areas import lane_polygon
 from scenarios.opendrive import T_enu_earth, T_local_map, geographic_origin, lane_map_of
-from scenarios.opendrive_road import Cubic, Geometry, OdrMap, cubics_at, parse_map, reference_line
+from scenarios.opendrive_road import Cubic, Geometry, cubics_at, parse_map, reference_line
 from scenarios.recorded import SourceFiles
 from scenarios.usdz import alpasim_map
 
@@ -26,24 +25,24 @@ FILES = SourceFiles()
 
 
 def lane(
-    i: int,
-    width: str = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>',
-    kind: str = "driving",
-    more: str = "",
-) -> str:
+    i,
+    width='<width sOffset="0" a="3.5" b="0" c="0" d="0"/>',
+    kind="driving",
+    more="",
+):
     return f'<lane id="{i}" type="{kind}" level="false">{more}{width}</lane>'
 
 
 def road(
-    left: str = "",
-    right: str = "",
-    view: str = "",
-    i: int = 1,
-    length: float = 40.0,
-    sections: str = "",
-    before: str = "",
-    more: str = "",
-) -> str:
+    left="",
+    right="",
+    view="",
+    i=1,
+    length=40.0,
+    sections="",
+    before="",
+    more="",
+):
     view = view or f'<geometry s="0" x="0" y="0" hdg="0" length="{length}"><line/></geometry>'
     sides = "".join(
         f"<{side}>{content}</{side}>"
@@ -54,7 +53,7 @@ def road(
     return f'<road id="{i}" length="{length}" junction="-1" {more}>{before}<planView>{view}</planView><lanes>{sections}</lanes></road>'
 
 
-def parsed(*roads: str, header: str = "") -> OdrMap:
+def parsed(*roads: str, header=""):
     return parse_map(
         FILES,
         "map.xodr",
@@ -316,7 +315,7 @@ REAL = {
 }
 
 
-def real(shared_data: Path, name: str) -> OdrMap:
+def real(shared_data, name):
     path = shared_data / name
     return parse_map(FILES, path, FILES.read_xml(path))
 

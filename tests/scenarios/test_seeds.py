@@ -5,14 +5,11 @@ declared ranges.
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Scenario
 from scenarios.load import load_scenario
 
 pytestmark = pytest.mark.slow
@@ -32,13 +29,13 @@ actors:
 """
 
 
-def write(folder: Path, more: str = "") -> Path:
+def write(folder, more=""):
     path = folder / "scene.yaml"
     path.write_text(BASE + more)
     return path
 
 
-def bits(value: Any) -> Any:
+def bits(value):
     """Return plain data in which every array is its bytes."""
     if isinstance(value, np.ndarray):
         return (value.dtype.str, value.shape, value.tobytes())
@@ -66,7 +63,7 @@ def test_other_seeds_change_road_actors_and_hash_and_name_the_scene(tmp_path):
     assert len({s.ego_log.xyz.tobytes() for s in scenes}) == 5
 
 
-def measures(s: Scenario) -> dict[str, float]:
+def measures(s):
     centre = s.lane_map.lanes["s0_f0"].centre
     left, right = s.lane_map.lanes["s0_f0"].left, s.lane_map.lanes["s0_f0"].right
     return {

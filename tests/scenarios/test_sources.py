@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.runs.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import make_actors
 from scenarios.load import load_scenario
@@ -20,7 +19,7 @@ FOLDERS = {
 }
 
 
-def drive_with_the_log(s: Scenario, step_us: int = 100_000) -> dict[str, float]:
+def drive_with_the_log(s, step_us=100_000):
     """Run the actors beside an ego on its log and return how far each reactive one strayed from its
     track.
     """

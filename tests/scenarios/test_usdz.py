@@ -31,7 +31,7 @@ from tests.scenarios.make_usdz import (
 )
 
 
-def changed(**parts: bytes | None) -> dict[str, bytes]:
+def changed(**parts: bytes | None):
     """The small scene with members replaced, added, or (None) left out; __ stands for the slash,
     _dot_ for the dot.
     """

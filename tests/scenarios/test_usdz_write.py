@@ -9,7 +9,6 @@ import itertools
 import json
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -42,7 +41,7 @@ def written(request, tmp_path_factory):
     return scenario, path
 
 
-def table(path: Path, name: str) -> list[dict]:
+def table(path, name):
     with zipfile.ZipFile(path) as archive:
         return pq.read_table(io.BytesIO(archive.read(f"clipgt/{name}.parquet"))).to_pylist()
 

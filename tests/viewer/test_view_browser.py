@@ -13,7 +13,6 @@ from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import write_page
-from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
 from tests.viewer.make_watched import BARS, make_watched
@@ -36,14 +35,14 @@ def page(watched_run, tmp_path_factory):
     return write_page(read_run(watched_run), path, Wanted()).path
 
 
-def settled(browser: Browser) -> None:
+def settled(browser):
     """Wait until the cell that was chosen is shown, with its frames."""
     browser.evaluate(
         "(async () => { await Promise.resolve(); await player.drawn; await new Promise(requestAnimationFrame); })()"
     )
 
 
-def seek(browser: Browser, ms: float) -> None:
+def seek(browser, ms):
     browser.evaluate(f"(async () => {{ player.seek({ms}); await player.drawn; }})()")
 
 

@@ -10,7 +10,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -41,13 +40,13 @@ from tests.viewer.make_watched import BARS, WATCHED, make_watched, picture
 SMALL = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=12)
 
 
-def documents(html: str) -> dict[str, Any]:
+def documents(html):
     """Return the JSON of a page by the id of its element."""
     found = re.findall(r'<script type="application/json" id="([\w-]+)">(.*?)</script>', html, re.S)
     return {name: json.loads(text) for name, text in found}
 
 
-def number_of(jpeg: str) -> int:
+def number_of(jpeg):
     """Read which frame a picture is."""
     grey = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_GRAYSCALE)
     wide = grey.shape[1] // BARS
@@ -63,7 +62,7 @@ def small_run(tmp_path_factory):
     return make_watched(tmp_path_factory.mktemp("small"), SMALL)
 
 
-def only_cell(root: Path, fine: Fineness | None = Fineness()) -> dict[str, Any]:
+def only_cell(root, fine=Fineness()):
     run = read_run(root)
     (cell,) = cells_of(run)
     return cell_data(run, cell, read_logs(run, cell), fine)

@@ -28,13 +28,13 @@ T0 = 1_600_000_000_000_000  # epoch microseconds: too large for float arithmetic
 
 
 def line_track(
-    x0: float,
-    speed: float,
-    seconds: float = 10.0,
-    y: float = 0.0,
-    t0: int = 0,
-    step_us: int = 100_000,
-) -> Trajectory:
+    x0,
+    speed,
+    seconds=10.0,
+    y=0.0,
+    t0=0,
+    step_us=100_000,
+):
     t = t0 + np.arange(0, round(seconds * 1e6) + 1, step_us, dtype=np.int64)
     x = x0 + speed * (t - t0) * 1e-6
     return Trajectory(
@@ -44,18 +44,16 @@ def line_track(
     )
 
 
-def idm(actor_id: str, x0: float, speed: float, **params: float) -> Actor:
+def idm(actor_id, x0, speed, **params: float):
     behaviour = Behaviour("idm", {"desired_speed_mps": max(speed, 1.0), **params})
     return Actor(actor_id, "car", BOX, line_track(x0, speed), behaviour=behaviour)
 
 
-def ego_at(x: float, speed: float = 0.0) -> EgoState:
+def ego_at(x, speed=0.0):
     return EgoState(0, se2(x, 0.0, 0.0), speed)
 
 
-def run(
-    actors: Actors, ego: EgoState, end_us: int, step_us: int = 100_000
-) -> dict[str, list[float]]:
+def run(actors, ego, end_us, step_us=100_000):
     out: dict[str, list[float]] = {}
     for t in range(0, end_us + 1, step_us):
         for name, pose in actors.step(t, ego).items():
@@ -63,7 +61,7 @@ def run(
     return out
 
 
-def winding_track(seed: int, t0: int) -> Trajectory:
+def winding_track(seed, t0):
     rng = np.random.default_rng(seed)
     t = t0 + np.cumsum(rng.integers(1_000, 200_000, 60)).astype(np.int64)
     yaw = np.cumsum(rng.normal(0, 0.6, 60))  # passes 180 degrees many times
@@ -130,7 +128,7 @@ def test_reactive_driver_follows_a_replayed_leader_that_stops():
 
 
 def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there():
-    def parked(last_us: int) -> Actor:
+    def parked(last_us):
         t = np.array([0, last_us])
         track = Trajectory(t, np.array([[50.0, 0.5, 0.75]] * 2), quat_from_yaw(np.zeros(2)))
         return Actor("parked", "car", BOX, track, is_static=True)

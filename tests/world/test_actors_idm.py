@@ -12,7 +12,6 @@ from alpasim_plugin.core.geometry import densify
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.idm import (
     NO_BODIES,
-    Bodies,
     IdmParams,
     bodies_from,
     concatenate,
@@ -20,7 +19,7 @@ from alpasim_plugin.world.idm import (
     find_leaders,
     idm_acceleration,
 )
-from alpasim_plugin.world.path import Lines, Path, polyline_path
+from alpasim_plugin.world.path import Lines, polyline_path
 
 P = IdmParams(desired_speed_mps=20.0, headway_s=1.5, min_gap_m=2.0, accel_mps2=1.0, brake_mps2=1.5)
 STRAIGHT = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros((201, 2))]))
@@ -28,29 +27,27 @@ ROAD = Lines([STRAIGHT])
 INF = float("inf")
 
 
-def car(
-    x: float, y: float, yaw: float = 0.0, speed: float = 0.0, box: Box = Box(4.6, 1.85, 1.5)
-) -> Bodies:
+def car(x, y, yaw=0.0, speed=0.0, box=Box(4.6, 1.85, 1.5)):
     return bodies_from(
         np.array([x, y]), np.array([yaw]), [box], speed * np.array([np.cos(yaw), np.sin(yaw)])
     )
 
 
-def test_free_road_follows_the_power_law() -> None:
+def test_free_road_follows_the_power_law():
     assert idm_acceleration(0.0, INF, 0.0, P) == 1.0
     assert idm_acceleration(10.0, INF, 0.0, P) == pytest.approx(1.0 - 0.5**4)
     assert idm_acceleration(20.0, INF, 0.0, P) == pytest.approx(0.0)
     assert idm_acceleration(25.0, INF, 0.0, P) < 0.0
 
 
-def test_equilibrium_gap_of_the_equation_gives_no_acceleration() -> None:
+def test_equilibrium_gap_of_the_equation_gives_no_acceleration():
     # Treiber et al. (2000): s_e = (s0 + v T) / sqrt(1 - (v / v0)^4)
     for v in (0.0, 5.0, 15.0, 19.0):
         gap = (P.min_gap_m + v * P.headway_s) / np.sqrt(1 - (v / P.desired_speed_mps) ** 4)
         assert idm_acceleration(v, gap, 0.0, P) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do() -> None:
+def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do():
     assert idm_acceleration(15.0, 30.0, 10.0, P) < idm_acceleration(15.0, 30.0, 0.0, P)
     assert idm_acceleration(20.0, 1.0, 20.0, P) == -P.hard_brake_mps2
     assert idm_acceleration(10.0, -3.0, 0.0, P) == -P.hard_brake_mps2
@@ -58,9 +55,7 @@ def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do() ->
 
 @settings(deadline=None)
 @given(st.floats(0, 40), st.floats(0.1, 200), st.floats(-20, 40), st.floats(0.5, 100))
-def test_a_larger_gap_never_brakes_harder(
-    speed: float, gap: float, closing: float, more: float
-) -> None:
+def test_a_larger_gap_never_brakes_harder(speed, gap, closing, more):
     assert idm_acceleration(speed, gap + more, closing, P) >= idm_acceleration(
         speed, gap, closing, P
     )
@@ -69,12 +64,12 @@ def test_a_larger_gap_never_brakes_harder(
 @pytest.mark.parametrize(
     "params", [{"headway": 1.0}, {"headway_s": 0.0}, {"accel_mps2": float("nan")}]
 )
-def test_unknown_or_senseless_parameters_are_refused(params: dict[str, float]) -> None:
+def test_unknown_or_senseless_parameters_are_refused(params):
     with pytest.raises(InputError):
         IdmParams.from_mapping(params)
 
 
-def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
+def test_a_platoon_behind_a_stopped_car_stops_without_contact():
     x, v = np.array([80.0, 40.0, 0.0]), np.array([0.0, 15.0, 15.0])
     for _ in range(6000):
         a = [
@@ -89,7 +84,7 @@ def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
     assert (v < 0.1).all()
 
 
-def test_the_nearest_body_in_the_corridor_leads() -> None:
+def test_the_nearest_body_in_the_corridor_leads():
     leader = find_leader(
         ROAD, 10.0, 0.95, concatenate([car(60, 0, speed=5), car(40, 0, speed=7), car(30, 3.5)])
     )
@@ -99,20 +94,20 @@ def test_the_nearest_body_in_the_corridor_leads() -> None:
 
 
 @pytest.mark.parametrize(("y", "leads"), [(0.0, True), (2.0, True), (2.2, False), (-2.2, False)])
-def test_corridor_is_as_wide_as_the_car_and_a_margin(y: float, leads: bool) -> None:
+def test_corridor_is_as_wide_as_the_car_and_a_margin(y, leads):
     assert (
         find_leader(ROAD, 10.0, 0.95, car(40, y)).index == 0
     ) == leads  # 0.95 + 0.2 + 1.85 / 2 = 2.075
 
 
-def test_a_body_behind_is_no_leader_and_a_touching_one_is() -> None:
+def test_a_body_behind_is_no_leader_and_a_touching_one_is():
     assert find_leader(ROAD, 50.0, 0.95, car(45, 0)).index == -1
     touching = find_leader(ROAD, 50.0, 0.95, car(51.5, 0))
     assert touching.index == 0
     assert touching.gap_m < 0
 
 
-def test_a_crossing_truck_blocks_with_its_length() -> None:
+def test_a_crossing_truck_blocks_with_its_length():
     truck = Box(10.0, 2.5, 3.0)
     assert find_leader(
         ROAD, 10.0, 0.95, car(40, 5.0, np.pi / 2, 3.0, truck)
@@ -120,9 +115,7 @@ def test_a_crossing_truck_blocks_with_its_length() -> None:
     assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, 0.0, 3.0, truck)).index == -1
 
 
-def nearest(
-    path: Path, front_m: float, half_m: float, bodies: Bodies, horizon_m: float, own: int
-) -> tuple[float, int]:
+def nearest(path, front_m, half_m, bodies, horizon_m, own):
     """Return gap and row of the leader, body by body."""
     found = [(INF, -1)]
     shape = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [0, 1], [0, -1]])
@@ -140,7 +133,7 @@ def nearest(
     return min(found)
 
 
-def test_the_leaders_of_many_drivers_are_those_of_each() -> None:
+def test_the_leaders_of_many_drivers_are_those_of_each():
     random = np.random.default_rng(0)
     angle = np.linspace(0, 0.9 * np.pi, 400)
     bend = polyline_path(np.stack([60 * np.cos(angle), 60 * np.sin(angle)], axis=1))

@@ -21,7 +21,7 @@ from scenarios.ego_path import (
 BOX = Box(4.0, 1.8, 1.5)
 
 
-def straight(y: float) -> object:
+def straight(y):
     return polyline_path(
         np.column_stack([np.linspace(0, 150, 151), np.full(151, y), np.zeros(151)])
     )

@@ -20,7 +20,7 @@ from alpasim_plugin.world.path import (
 from tests.examples import examples
 
 
-def clothoid_by_fresnel(s: np.ndarray, rate: float) -> np.ndarray:
+def clothoid_by_fresnel(s, rate):
     """Points of a clothoid from the origin with zero start curvature: x + iy = sqrt(pi/rate) (C +
     iS)(s sqrt(rate/pi)).
     """
@@ -31,7 +31,7 @@ def clothoid_by_fresnel(s: np.ndarray, rate: float) -> np.ndarray:
 
 @pytest.mark.parametrize("end_curvature", [0.2, 0.02, -0.05, 1e-4])
 @pytest.mark.parametrize("step_m", [0.5, 1.0])
-def test_clothoid_agrees_with_fresnel_integrals(end_curvature: float, step_m: float) -> None:
+def test_clothoid_agrees_with_fresnel_integrals(end_curvature, step_m):
     length = 60.0
     curve = sample_clothoid((0.0, 0.0, 0.0), length, 0.0, end_curvature, step_m)
     s = np.linspace(0.0, length, len(curve))
@@ -40,28 +40,26 @@ def test_clothoid_agrees_with_fresnel_integrals(end_curvature: float, step_m: fl
     )
 
 
-def test_arc_with_positive_curvature_turns_left_on_its_circle() -> None:
+def test_arc_with_positive_curvature_turns_left_on_its_circle():
     curve = sample_clothoid((3.0, 4.0, 0.0), 30.0, 0.05, 0.05)
     np.testing.assert_allclose(np.hypot(curve[:, 0] - 3.0, curve[:, 1] - 24.0), 20.0, atol=1e-12)
     assert curve[-1, 1] > 4.0
     np.testing.assert_allclose(curve[-1, 2], 1.5)
 
 
-def test_straight_keeps_its_heading_far_from_the_origin() -> None:
+def test_straight_keeps_its_heading_far_from_the_origin():
     curve = sample_clothoid((5e5, 4e6, np.pi / 2), 100.0, 0.0, 0.0)
     np.testing.assert_allclose(curve[-1, :2], [5e5, 4e6 + 100.0], atol=1e-8)
 
 
-def test_no_length_is_refused() -> None:
+def test_no_length_is_refused():
     with pytest.raises(InputError):
         sample_clothoid((0, 0, 0), 0.0, 0.0, 0.0)
 
 
 @settings(deadline=None, max_examples=examples(40))
 @given(st.floats(8, 40), st.floats(8, 40), st.sampled_from([np.pi / 2, -np.pi / 2, 0.0]))
-def test_connector_meets_both_poses_exactly_and_never_bends_backwards(
-    ahead: float, aside: float, turn: float
-) -> None:
+def test_connector_meets_both_poses_exactly_and_never_bends_backwards(ahead, aside, turn):
     p0 = np.array([1.0, 2.0, 0.0])
     p1 = p0 + np.array([ahead, np.sign(turn) * aside, 0.0])
     curve = connect(p0, 0.0, p1, turn)
@@ -73,12 +71,12 @@ def test_connector_meets_both_poses_exactly_and_never_bends_backwards(
     np.testing.assert_allclose(heading[[0, -1]], [0.0, turn], atol=0.05)
 
 
-def test_offset_line_lies_left_of_the_curve() -> None:
+def test_offset_line_lies_left_of_the_curve():
     line = offset_line(sample_clothoid((0, 0, 0), 10, 0, 0), 2.0)
     np.testing.assert_allclose(line[:, 1], 2.0)
 
 
-def test_smoothstep_is_flat_at_both_ends() -> None:
+def test_smoothstep_is_flat_at_both_ends():
     h = 1e-4
     assert smoothstep(h) < 1e-10
     assert smoothstep(1 - h) > 1 - 1e-10
@@ -88,7 +86,7 @@ def test_smoothstep_is_flat_at_both_ends() -> None:
 
 @settings(deadline=None, max_examples=examples(60))
 @given(st.floats(1, 58), st.floats(-6, 6), st.sampled_from([0.0, 0.03, -0.06]))
-def test_projection_finds_arc_length_and_offset_again(s: float, d: float, curvature: float) -> None:
+def test_projection_finds_arc_length_and_offset_again(s, d, curvature):
     curve = sample_clothoid((10.0, -3.0, 0.7), 60.0, curvature, curvature)
     path = smooth_path(np.column_stack([curve[:, :2], np.zeros(len(curve))]), step_m=0.5)
     point, _ = path.at(s, d)
@@ -97,13 +95,13 @@ def test_projection_finds_arc_length_and_offset_again(s: float, d: float, curvat
     assert abs(d_found[0] - d) < 0.01
 
 
-def test_projection_beyond_the_ends_follows_the_tangent() -> None:
+def test_projection_beyond_the_ends_follows_the_tangent():
     path = polyline_path(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
     s, d = path.project(np.array([[-3.0, 1.0], [7.0, -2.0]]))
     np.testing.assert_allclose(s, [-3.0, 7.0], atol=1e-6)
     np.testing.assert_allclose(d, [1.0, -2.0], atol=1e-6)
 
 
-def test_path_of_one_point_is_refused() -> None:
+def test_path_of_one_point_is_refused():
     with pytest.raises(InputError):
         polyline_path(np.zeros((3, 3)))

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import LaneMap
 from alpasim_plugin.world.road_strip import Curve, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import build_road, polyline
 from tests.examples import examples
@@ -36,11 +35,11 @@ PROFILES = {
 }
 
 
-def polygon(lane) -> shapely.Polygon:  # type: ignore[no-untyped-def]
+def polygon(lane):  # type: ignore[no-untyped-def]
     return shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2])
 
 
-def assert_sound(lane_map: LaneMap) -> None:
+def assert_sound(lane_map):
     for lane in lane_map.lanes.values():
         assert polygon(lane).is_valid, lane.lane_id
         assert polygon(lane).area > 1.0

@@ -42,14 +42,14 @@ actors: [{kind: parked, id: a, s_m: 40, count: 2}, {kind: idm, id: b, s_m: 50, s
 """
 
 
-def npy() -> bytes:
+def npy():
     stream = io.BytesIO()
     np.save(stream, np.arange(12.0).reshape(3, 4))
     return stream.getvalue()
 
 
-def by(write: Callable[[Path], Any], name: str) -> Callable[[Path], bytes]:
-    def make(folder: Path) -> bytes:
+def by(write, name):
+    def make(folder):
         write(folder / name)
         return (folder / name).read_bytes()
 

@@ -5,7 +5,6 @@ built.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +13,13 @@ from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core import limits as bounds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART
-from alpasim_plugin.core.types import Scenario
 from scenarios.budget import check_scenario
 from scenarios.load import load_scenario
 from tests.core.reading import past_failures as seen
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.3, 0.3])
-def test_values_outside_a_bound_are_refused_with_number_range_and_reason(value: float) -> None:
+def test_values_outside_a_bound_are_refused_with_number_range_and_reason(value):
     with pytest.raises(InputError) as error:
         bounds.CURVATURE_PER_M.check(value, "a.xml, road 3")
     assert "-0.2 to 0.2 1/m" in error.value.message
@@ -29,7 +27,7 @@ def test_values_outside_a_bound_are_refused_with_number_range_and_reason(value: 
 
 
 @pytest.mark.parametrize("name", seen.SEEN)
-def test_what_once_gave_way_is_refused(tmp_path: Path, name: str) -> None:
+def test_what_once_gave_way_is_refused(tmp_path, name):
     path = seen.SEEN[name](tmp_path)
     with pytest.raises(InputError) as error:
         load_scenario(str(path))
@@ -38,12 +36,12 @@ def test_what_once_gave_way_is_refused(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["1000000000000", "0", "-3", "nan", "9223372036854775808,1"])
-def test_counts_of_seeds_are_bounded(text: str) -> None:
+def test_counts_of_seeds_are_bounded(text):
     with pytest.raises(InputError):
         parse_seeds(text)
 
 
-def test_a_long_map_costs_what_the_drive_can_see(tmp_path: Path) -> None:
+def test_a_long_map_costs_what_the_drive_can_see(tmp_path):
     short, long = (
         load_scenario(str(seen.xodr(length)(folder(tmp_path, length))))
         for length in ("900", "9000")
@@ -54,18 +52,18 @@ def test_a_long_map_costs_what_the_drive_can_see(tmp_path: Path) -> None:
     )  # the map itself is whole
 
 
-def folder(root: Path, name: str) -> Path:
+def folder(root, name):
     (root / name).mkdir()
     return root / name
 
 
-def drive_of(length_m: float, scenario: Scenario) -> Scenario:
+def drive_of(length_m, scenario):
     n = len(scenario.ego_log)
     xyz = np.column_stack([np.linspace(0, length_m, n), np.zeros((n, 2))])
     return replace(scenario, ego_log=replace(scenario.ego_log, xyz=xyz))
 
 
-def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built() -> None:
+def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built():
     scenario = load_scenario("smoke/straight")
     check_scenario(drive_of(3000.0, scenario), "a log")
     with pytest.raises(InputError):

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import socket
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,14 +31,14 @@ from alpasim_plugin.core.reading.tables import read_parquet
 from tests.core.reading.past_failures import png_header
 
 
-def refused(call: Callable[[], object]) -> str:
+def refused(call):
     with pytest.raises(InputError) as error:
         call()
     assert all(len(part) <= MAX_PART for part in error.value.as_dict().values())
     return error.value.message
 
 
-def special(kind: str, path: Path) -> None:
+def special(kind, path):
     if kind == "pipe":
         os.mkfifo(path)
     elif kind == "socket":
@@ -102,7 +101,7 @@ def test_json_has_limits_and_a_shape(tmp_path, text, found):
     assert found in refused(lambda: read_json_as(Shape, tmp_path / "a.json"))
 
 
-def npy(shape: str, body: bytes = b"", descr: str = "'<f8'") -> bytes:
+def npy(shape, body=b"", descr="'<f8'"):
     head = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + body
 

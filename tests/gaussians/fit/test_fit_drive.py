@@ -78,7 +78,7 @@ def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views, tmp_pa
     class CutOffError(Exception):
         pass
 
-    def cut(stage: str, at: int, all: int, numbers: object) -> None:
+    def cut(stage, at, all, numbers):
         if stage == "fitting" and at == 6:
             raise CutOffError
 
@@ -115,7 +115,7 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views):
     points = np.column_stack([np.full(400, 12.0), rng.uniform(-4, 4, 400), rng.uniform(0, 4, 400)])
     cloud = cloud_from_points(points, np.full((400, 3), 0.5))
 
-    def fitted_to(weight: float) -> float:
+    def fitted_to(weight):
         recipe = SplatRecipe(
             steps=60, densify_every=0, depth_weight=weight, lr_means=0.05, lr_means_end=0.05
         )

@@ -34,22 +34,20 @@ from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import cloud_of
 
 
-def images() -> tuple[torch.Tensor, torch.Tensor]:
+def images():
     rng = stream("fit-tests", 0, "images")
     a, b = (torch.as_tensor(rng.random((20, 31, 3), dtype=np.float32)) for _ in range(2))
     return a, (a + 0.3 * b) / 1.3
 
 
-def model_of(
-    cloud: GaussianCloud, actors: dict[str, GaussianCloud] | None = None, degree: int = 1
-) -> SplatModel:
+def model_of(cloud, actors=None, degree=1):
     return SplatModel.from_start(Start(cloud, actors or {}), np.zeros(3), degree)
 
 
 # --- loss
 
 
-def plain_ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def plain_ssim(a, b):
     """Return the mean structural similarity of images ``(H, W, 3)`` through convolutions that
     autograd can follow.
     """
@@ -165,7 +163,7 @@ def test_clouds_come_back_as_they_went_in_far_from_the_origin():
 # --- density
 
 
-def density_case(cap: int = 100) -> tuple[SplatModel, RowAdam, ScreenGradients, SplatRecipe]:
+def density_case(cap=100):
     """Three background Gaussians (small and pulled, large and pulled, calm), one of a car
     (pulled).
     """

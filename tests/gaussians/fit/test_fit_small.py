@@ -13,8 +13,6 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import (
-    PosedView,
-    Reconstruction,
     SplatRecipe,
     Start,
     loop,
@@ -25,7 +23,7 @@ from tests.gaussians.fit.conftest import BOX, actor_pose, at, camera_at
 QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
 
 
-def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
+def mean_psnr(model, views):
     graph = model.graph()
     values = []
     for view in views:
@@ -34,7 +32,7 @@ def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
     return float(np.mean(values))
 
 
-def bits(model: Reconstruction) -> list[bytes]:
+def bits(model):
     clouds = [model.background, *(model.actors[name] for name in sorted(model.actors))]
     return [
         np.ascontiguousarray(getattr(c, name)).tobytes()
@@ -64,7 +62,7 @@ def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed, tmp_path):
     class CutOffError(Exception):
         pass
 
-    def cut(step: int, numbers: object) -> None:
+    def cut(step, numbers):
         if step == 27:  # between checkpoints, between densifications
             raise CutOffError
 

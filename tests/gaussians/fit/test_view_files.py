@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from alpasim_plugin.gaussians.fit.photographs import FILE, read_points, read_vie
 from tests.gaussians.fit.view_files import write_views
 
 
-def change(folder: Path, **keys: object) -> None:
+def change(folder, **keys: object):
     """Set keys of the document; None removes one, ``frame`` changes the first frame."""
     path = folder / FILE
     document = json.loads(path.read_text())
@@ -24,7 +23,7 @@ def change(folder: Path, **keys: object) -> None:
     path.write_text(json.dumps(document))
 
 
-def write_points(path: Path, names: str, rows: np.ndarray) -> None:
+def write_points(path, names, rows):
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
     header += "".join(
         f"property {'uchar' if n in ('red', 'green', 'blue') else 'float'} {n}\n"

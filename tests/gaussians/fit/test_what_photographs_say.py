@@ -58,7 +58,7 @@ def test_poses_that_are_off_come_back_to_the_truth(views):
     assert found.before_px > 3 * found.after_px
     assert found.after_px < 0.3
 
-    def errors(cameras: list) -> np.ndarray:
+    def errors(cameras):
         """Return turns between neighbours against the truth, degrees: what all have in common does
         not count.
         """

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, compare_paint, paint_of, road_of
 from alpasim_plugin.world.ground import flat
@@ -30,7 +29,7 @@ def camera():
     )
 
 
-def drawn(camera: PinholeCamera, lines: list[tuple[float, float, tuple[int, int, int]]]) -> U8:
+def drawn(camera, lines):
     """Draw lines along the road: (metres to the left, width, colour); the road is grey, the sky
     bright.
     """

@@ -9,12 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from torch import Tensor
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import Frame, RenderRequest
+from alpasim_plugin.core.types import Frame
 from alpasim_plugin.lab.bench import colour_video_vdp
 from alpasim_plugin.lab.bench.real import METRICS, Judges, intervals, measure_drive, shots_of
 from alpasim_plugin.lab.cli import bench_real
@@ -28,17 +27,17 @@ KEYS = ["drive", "renderer", "camera", "set", "distance_m", "n_frames", *METRICS
 class Difference:
     """Mean absolute difference, in place of a network."""
 
-    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+    def distance(self, a, b):
         return (a - b).abs().mean(dim=(1, 2, 3))
 
 
 class Truth(Renderer):
     """Show what the photographs of the drive show, and note the order of requests."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.asked: list[int] = []
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         self.asked.append(request.t_us)
         picture = np.full((request.camera.height, request.camera.width, 3), 122, np.uint8)
         picture[: request.camera.height // 2] = round(SKY_LEVEL * EXPOSURE)
@@ -155,7 +154,7 @@ def test_the_command_prints_one_document(drive, monkeypatch, capsys):
 
 
 def test_without_the_package_the_reason_is_said(monkeypatch):
-    def gone(name: str) -> object:
+    def gone(name):
         raise ModuleNotFoundError("no", name=name)
 
     monkeypatch.setattr(colour_video_vdp.importlib, "import_module", gone)

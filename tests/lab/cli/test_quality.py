@@ -168,7 +168,7 @@ def test_unknown_baseline_is_refused(data, tmp_path, capsys):
     assert "--baseline 3dgs" in capsys.readouterr().err
 
 
-def row(variant: str, clip: str, psnr: float, frames: int = 200) -> dict[str, object]:
+def row(variant, clip, psnr, frames=200):
     values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
     return {
         "arm": variant,

@@ -7,7 +7,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -48,9 +47,7 @@ def bundle(tmp_path_factory):
     return path
 
 
-def run_train(
-    capsys: pytest.CaptureFixture[str], *command: str | Path
-) -> tuple[dict[str, Any], str]:
+def run_train(capsys, *command: str | Path):
     """Run ``simrun train`` and return its document and what it said beside it."""
     assert run_command(["train", *map(str, command), "--json"]) == 0
     out, err = capsys.readouterr()

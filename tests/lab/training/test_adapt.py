@@ -13,14 +13,13 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.cli import adapt as command
 from alpasim_plugin.lab.training.adapt import adapt, compared
 from tests.renderers.recorded_drive import recorded_drive
 
 
-def drive(folder: Path, count: int) -> Scenario:
+def drive(folder, count):
     made = recorded_drive(folder, count)
     front = [one for one in made.recording if one.camera == "front"]
     return replace(
@@ -31,7 +30,7 @@ def drive(folder: Path, count: int) -> Scenario:
     )
 
 
-def shipped() -> Path:
+def shipped():
     return Path(str(fixer_settings("onefixer", []).weights.bundle))  # type: ignore[attr-defined]
 
 

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.networks import load_networks
-from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.fixers import fixer_settings
@@ -37,14 +36,14 @@ pytestmark = pytest.mark.slow
 STEPS = 2  # U
 
 
-def arm_settings(name: str, *overrides: str) -> OneFixerSettings:
+def arm_settings(name, *overrides: str):
     sizes = [text for text in SMALL_DIT if text.startswith("dit.")]
     settings = fixer_settings(name, (*sizes, *overrides))
     assert isinstance(settings, OneFixerSettings)
     return settings
 
 
-def run_of(data: Path, recipe: Recipe, **weights: Path) -> FixerRun:
+def run_of(data, recipe, **weights: Path):
     schedule = Schedule(STEPS, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     batches = BatchForm(clips=2, columns=4)
     return FixerRun(
@@ -59,7 +58,7 @@ def run_of(data: Path, recipe: Recipe, **weights: Path) -> FixerRun:
     )
 
 
-def deployed(path: Path, steps: int = 1) -> OneFixer:
+def deployed(path, steps=1):
     name, overrides = bundle_fixer(path)
     settings = fixer_settings(name, (*overrides, f"steps={steps}"))
     assert isinstance(settings, OneFixerSettings)

@@ -16,7 +16,7 @@ from tests.fixers.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_
 LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other": "dog"}
 
 
-def drawn(label: str) -> np.ndarray:
+def drawn(label):
     edges = replace(
         EMPTY,
         road_edges=(line((2, 3, 0), (60, 3, 0)),),

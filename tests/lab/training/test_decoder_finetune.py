@@ -5,7 +5,6 @@ pictures get nearer to the truth.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,11 +33,11 @@ def bundle(data, tmp_path_factory):
     )
 
 
-def vae_of(bundle: Path) -> TinyVAE:
+def vae_of(bundle):
     return load_tiny_vae(bundle)
 
 
-def net_of(bundle: Path) -> CosmosCausalDiT:
+def net_of(bundle):
     tensors = {key: value.float() for key, value in load_weights(bundle).items()}
     return CosmosCausalDiT.from_state_dict(
         {key[4:]: value for key, value in tensors.items() if key.startswith("dit.")}

@@ -112,7 +112,7 @@ def test_drives_leave_the_path_and_meet_others(scenario):
 def test_sigma_sends_no_gradient_into_the_plan(root):
     """The likelihood term must train sigma alone."""
 
-    def gradients(sigma: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def gradients(sigma):
         net = LearnedNet(0)
         torch.nn.init.normal_(net.out.weight, std=0.02, generator=torch.Generator().manual_seed(0))
         torch.nn.init.constant_(net.out.bias[-2:], sigma)

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
@@ -33,7 +32,7 @@ N = 4
 TEXT = torch.zeros(1, 1, 8)
 
 
-def noise(name: str, *shape: int) -> Tensor:
+def noise(name, *shape: int):
     return torch.from_numpy(stream("dmd", 0, name).standard_normal(shape)).float()
 
 
@@ -50,21 +49,21 @@ def net():
 class Gaussian:
     """A normal distribution of clean latents and the exact velocity of its noised samples."""
 
-    def __init__(self, mean: float, std: float) -> None:
+    def __init__(self, mean, std):
         self.mean, self.std = mean, std
 
-    def __call__(self, x: Tensor, sigma: Tensor) -> Tensor:
+    def __call__(self, x, sigma):
         s = sigma[:, None, None, None, None].double()
         variance = (1 - s) ** 2 * self.std**2 + s**2
         z_0 = self.mean + (1 - s) * self.std**2 / variance * (x - (1 - s) * self.mean)  # E[z | x]
         return (x - z_0) / s
 
-    def noised(self, sigma: float) -> tuple[float, float]:
+    def noised(self, sigma):
         """Return mean and deviation of the noised samples."""
         return (1 - sigma) * self.mean, math.hypot((1 - sigma) * self.std, sigma)
 
 
-def divergence(a: Gaussian, b: Gaussian, sigma: float) -> float:
+def divergence(a, b, sigma):
     """Return KL(a, b) of the noised distributions."""
     (ma, sa), (mb, sb) = a.noised(sigma), b.noised(sigma)
     return math.log(sb / sa) + (sa**2 + (ma - mb) ** 2) / (2 * sb**2) - 0.5
@@ -103,7 +102,7 @@ def test_scaling_latents_and_predictions_leaves_the_direction():
     sigma = score_levels(torch.tensor([0.1, 0.5, 0.9])).double()
     real, fake = noise("real", *z.shape).double(), noise("fake", *z.shape).double()
 
-    def seeing(z_0: Tensor, scale: float) -> Tensor:
+    def seeing(z_0, scale):
         """Return g where the scores see ``z_0`` behind whatever is given, all at a scale."""
         s = sigma[:, None, None, None, None]
         scores = [lambda x, _, z_0=z_0: (x - scale * z_0) / s for z_0 in (real, fake)]
@@ -121,7 +120,7 @@ def test_scaling_latents_and_predictions_leaves_the_direction():
 def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student():
     seen = []
 
-    def score(x: Tensor, sigma: Tensor) -> Tensor:
+    def score(x, sigma):
         seen.append(x)
         return torch.zeros_like(x)
 
@@ -200,7 +199,7 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     assert float(x.grad.abs().max()) > 0
     assert all(p.grad is None for p in net.parameters())
 
-    def logits(x: Tensor) -> Tensor:
+    def logits(x):
         score(x, sigma, condition)
         return head(score.features)
 

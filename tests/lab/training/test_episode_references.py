@@ -5,12 +5,11 @@ where they are drawn so.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import U8, Actor, Box, RecordedFrame, Trajectory
+from alpasim_plugin.core.types import Actor, Box, RecordedFrame, Trajectory
 from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.lab.training.episode_references import (
     SLOTS,
@@ -47,7 +46,7 @@ def sequence(tmp_path_factory):
         Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
     )
 
-    def recorded(i: int) -> RecordedFrame:
+    def recorded(i):
         T = np.eye(4)
         T[0, 3] = 2.0 * i
         return RecordedFrame(
@@ -59,7 +58,7 @@ def sequence(tmp_path_factory):
             lambda: (pair(10 * i).rgb_gt, wall.astype(np.float32)),
         )
 
-    def beside(partial: Path) -> None:
+    def beside(partial):
         write_references(
             partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car]
         )
@@ -75,11 +74,11 @@ def sequence(tmp_path_factory):
 
 
 def shown(
-    sequence: PairSequence,
-    draw: ReferenceDraw,
-    rows: slice = slice(0, HEIGHT),
-    columns: slice = slice(0, WIDTH),
-) -> U8:
+    sequence,
+    draw,
+    rows=slice(0, HEIGHT),
+    columns=slice(0, WIDTH),
+):
     return pair_references(sequence, draw, INDEX, rows, columns)
 
 

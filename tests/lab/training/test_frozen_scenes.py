@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from alpasim_plugin.lab.training.frozen_scenes import (
 from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS, write_scenes
 
 
-def freeze(scenes: Path, record: Path) -> None:
+def freeze(scenes, record):
     frozen = {split: asdict(hash_scenes(scenes / split)) for split in TEST_SPLITS}
     write_json(record, frozen)
 

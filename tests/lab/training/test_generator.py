@@ -6,13 +6,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.networks import load_networks
@@ -28,7 +25,6 @@ from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
-from alpasim_plugin.lab.training.recipes.recipe import Recipe
 from alpasim_plugin.lab.training.recipes.registry import (
     recipe_of,
     with_attention,
@@ -43,7 +39,7 @@ from tests.lab.training.pair_files import make
 FORM = ClipForm(latents=4, stride=7)
 
 
-def brightness(a: Tensor, b: Tensor) -> Tensor:
+def brightness(a, b):
     """Stand for a perceptual network."""
     return (a.mean(dim=(1, 2, 3)) - b.mean(dim=(1, 2, 3))).abs()
 
@@ -57,7 +53,7 @@ def data(tmp_path_factory):
     return root
 
 
-def run_of(data: Path, recipe: str, *, steps: int = 2, init: Path | None = None) -> FixerRun:
+def run_of(data, recipe, *, steps=2, init=None):
     schedule = Schedule(steps, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     settings = small_settings("window=4", "history=finalise", "holes=noise")
     weights = {} if init is None else {"init": init}
@@ -74,17 +70,17 @@ def run_of(data: Path, recipe: str, *, steps: int = 2, init: Path | None = None)
     )
 
 
-def task_of(run: FixerRun, clips: LatentClips, distance: object = ("b", brightness)) -> Any:
+def task_of(run, clips, distance=("b", brightness)):
     stage = run.recipe.stages[0]
     return stage.objective.task(stage_inputs(run, stage, clips, run.weights, distance))
 
 
-def objectives_of(recipe: Recipe) -> tuple[Objectives, ...]:
+def objectives_of(recipe):
     objective = recipe.stages[0].objective
     return objective.objectives
 
 
-def clips_of(data: Path, folder: Path) -> LatentClips:
+def clips_of(data, folder):
     return LatentClips(
         PairDataset(data, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, folder
     )

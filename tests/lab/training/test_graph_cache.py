@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from alpasim_plugin.lab.training.graph_cache import GraphCache
 from tests.block_fixers.cache_history import history
@@ -13,7 +12,7 @@ from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
 from tests.examples import examples
 
 
-def kept(cache: GraphCache, layer: int) -> tuple[Tensor, Tensor]:
+def kept(cache, layer):
     """Return a layer's visible keys and values, oldest first."""
     pairs = cache._kept.get(layer, [])
     newest = len(pairs) - (cache.window - cache.sink) if cache.window is not None else 0

@@ -5,7 +5,6 @@ falls by its own gradient.
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import functional
 
 from alpasim_plugin.lab.training.grid_term import grid_term
@@ -13,7 +12,7 @@ from alpasim_plugin.lab.training.grid_term import grid_term
 SIDE = 96
 
 
-def picture(seed: int = 0) -> Tensor:
+def picture(seed=0):
     """A smooth picture with an edge, ``(2, 2, 96, 96, 3)``."""
     rng = np.random.default_rng(seed)
     coarse = torch.from_numpy(rng.uniform(-0.1, 0.1, (4, 3, 12, 12)).astype(np.float32))
@@ -23,7 +22,7 @@ def picture(seed: int = 0) -> Tensor:
     return (smooth + fine).permute(0, 2, 3, 1).unflatten(0, (2, 2))
 
 
-def pattern(period: int, size: float) -> Tensor:
+def pattern(period, size):
     """A line at every border of a cell, in columns and rows."""
     line = (torch.arange(SIDE) % period == 0).float() * size
     return (line[:, None] + line[None, :])[None, None, :, :, None]

@@ -4,7 +4,6 @@ windows cover a clip.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,8 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.interfaces import BlockRule, Fixer
+from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.parts import resolve_renderer
-from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.refine import refine_frames
@@ -42,13 +40,13 @@ def settings_of(weights):
 
 @pytest.fixture
 def session(settings_of):
-    def make(name: str, *overrides: str, seed: int = 0) -> Fixer:
+    def make(name, *overrides: str, seed=0):
         return make_fixer(name, settings_of(name, *overrides), scene_id="scene", seed=seed)
 
     return make
 
 
-def run(fixer: Fixer, frames: Sequence[Frame]) -> list[Frame]:
+def run(fixer, frames):
     return [
         out
         for block in refine_frames([(frame, None) for frame in frames], fixer)
@@ -56,7 +54,7 @@ def run(fixer: Fixer, frames: Sequence[Frame]) -> list[Frame]:
     ]
 
 
-def levels(a: np.ndarray, b: np.ndarray) -> int:
+def levels(a, b):
     return int(np.abs(a.astype(int) - b).max())
 
 

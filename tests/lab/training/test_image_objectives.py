@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.networks import Parts
@@ -53,11 +52,11 @@ def one_thread():
     )  # matrices this small are slower on several; tests/conftest.py sets the number back
 
 
-def normal(*shape: int, key: str = "z") -> Tensor:
+def normal(*shape: int, key="z"):
     return torch.from_numpy(stream("tests", 0, key).standard_normal(shape, dtype=np.float32))
 
 
-def ddpm(steps: int = 1000) -> tuple[np.ndarray, np.ndarray]:
+def ddpm(steps=1000):
     """Return alpha and sigma of Stable Diffusion's schedule, as its scheduler's configuration
     defines them.
     """
@@ -118,7 +117,7 @@ def test_the_training_sees_the_outputs_that_the_session_shows(weights, name):
     assert np.abs((made[0].permute(1, 2, 3, 0).numpy() + 1) * 127.5 - wanted).max() < 1.01
 
 
-def step_of(settings: RenderStepSettings) -> RenderStep:
+def step_of(settings):
     parts = Parts(settings)
     vae = parts.vae()
     return RenderStep(
@@ -139,7 +138,7 @@ def test_a_distance_beyond_the_clamp_has_no_gradient_and_gradients_reach_encoder
         torch.zeros(2, 3, 1, 16, 16),
     )
 
-    def distance(a: Tensor, b: Tensor) -> Tensor:
+    def distance(a, b):
         return (a - b).abs().mean((1, 2, 3))
 
     near, far = (

@@ -27,7 +27,7 @@ def test_sequence_comes_back_as_memory_maps_with_every_value(tmp_path):
 def test_failure_in_the_middle_leaves_nothing_and_keeps_what_was_there(tmp_path):
     before = make(tmp_path)
 
-    def breaks() -> object:
+    def breaks():
         yield pair(0)
         raise RuntimeError("renderer fell over")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Degradation, Environment, Scenario
+from alpasim_plugin.core.types import Degradation, Environment
 from alpasim_plugin.fixers.warp import VALID
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pairs import PairRecipe, lateral_offsets, make_sequence
@@ -33,7 +33,7 @@ def street(tmp_path, monkeypatch):
 def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_render(
     street,
 ):
-    def largest(scenario: Scenario) -> list[float]:
+    def largest(scenario):
         return [
             float(np.abs(lateral_offsets(scenario, PairRecipe(), seed)).max()) for seed in range(60)
         ]

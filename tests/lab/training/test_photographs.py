@@ -5,7 +5,6 @@ the facts of a real set.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,18 +29,18 @@ LENS = {
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def pose(x: float) -> np.ndarray:
+def pose(x):
     T = np.eye(4)
     T[0, 3] = x
     return T @ OPENGL  # the file's axes are OpenGL's: this camera looks along the world's z, y down
 
 
 def write(
-    folder: Path,
-    dots: np.ndarray,
-    places: tuple[float, ...] = (-0.5, 0.5),
-    lens: dict[str, float] = LENS,
-) -> Path:
+    folder,
+    dots,
+    places=(-0.5, 0.5),
+    lens=LENS,
+):
     """Photograph white dots ``(N, 3)`` from places along x; one more photograph is listed and
     missing.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.fixers.network.pixel_generator import noise_key, pixel_noise
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
@@ -14,7 +13,7 @@ from tests.fixers.clip_cases import SIZE, pixels
 from tests.fixers.test_pixel_fixer import FRAMES, MAPS, generator, run, session, write_bundle
 
 
-def scaled(images: np.ndarray) -> Tensor:
+def scaled(images):
     return torch.from_numpy(images).float() / 127.5 - 1
 
 

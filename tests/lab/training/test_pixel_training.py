@@ -3,7 +3,6 @@ frames, resumed runs are equal.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,7 +57,7 @@ class Streams:
 
     batch = 2
 
-    def update(self, i: int) -> Batch:
+    def update(self, i):
         source = torch.Generator().manual_seed(i)
         target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
         opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
@@ -72,11 +71,11 @@ class Streams:
             users,
         )
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self):
         return {"streams": "dark"}
 
 
-def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
+def sample(seed=0, t=0.4):
     got = Streams().update(seed)
     render, truth, sdmap, opacity = (
         x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity)
@@ -97,7 +96,7 @@ def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
     )
 
 
-def generator() -> PixelGenerator:
+def generator():
     torch.manual_seed(3)
     return PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=4))
 
@@ -190,7 +189,7 @@ def test_switches_of_the_ablation():
     net, s = generator(), sample()
     start = net.start(s.render[:, 0])
 
-    def made(**changes: Any) -> Tensor:
+    def made(**changes: Any):
         return pixel_losses(
             net, s, start, PixelObjectives(perceptual=0, **changes), None
         ).predictions
@@ -219,7 +218,7 @@ def test_a_redenoised_history_is_the_truth_noised_and_denoised():
         _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
 
 
-def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
+def run_of(steps=4, decay_from=3, variant="V9", **changes: Any):
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
     schedule = Schedule(
@@ -234,7 +233,7 @@ def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: 
     )
 
 
-def weights(path: Path) -> dict[str, Tensor]:
+def weights(path):
     return load_weights(path / STATE_FILE)
 
 

@@ -27,11 +27,11 @@ STYLE = DrivingStyle(10.0)
 
 
 def speeds(
-    speed_mps: float,
-    leader: Leader = NO_LEADER,
-    line: ReferenceLine | None = None,
-    s_m: float = 20.0,
-) -> np.ndarray:
+    speed_mps,
+    leader=NO_LEADER,
+    line=None,
+    s_m=20.0,
+):
     return speed_mps + expert_speeds(
         line or ReferenceLine.along(STRAIGHT, 20.0), s_m, speed_mps, leader, STYLE
     )

@@ -10,14 +10,14 @@ import pytest
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES
 from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
 from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, UNSEEN_DAMAGE
-from alpasim_plugin.lab.training.scenes import DRAWS, SPLITS, Split, draw_spec, write_scenes
+from alpasim_plugin.lab.training.scenes import DRAWS, SPLITS, draw_spec, write_scenes
 from scenarios.load import load_scenario
 
 DRAWN = 60
 ALL = [(split, family) for split in ("train", "test-unseen") for family in SPLITS[split].families]  # type: ignore[index]
 
 
-def drawn(split: Split) -> list[dict]:
+def drawn(split):
     families = list(SPLITS[split].families)
     return [draw_spec(split, families[i % len(families)], f"s{i}", i, 6.0) for i in range(DRAWN)]
 
@@ -43,7 +43,7 @@ def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training():
 
 
 def test_every_unseen_scene_is_damaged_beyond_some_range_of_training():
-    def beyond(damage: dict) -> bool:
+    def beyond(damage):
         names = [f.name for f in fields(KNOWN_DAMAGE) if f.name in damage and f.name != "shift_m"]
         return any(
             not low <= damage[name] <= high

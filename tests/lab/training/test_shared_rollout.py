@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sampling import CONTEXT_STEP, context_level, mixed_source
@@ -25,11 +24,11 @@ H = 4
 W = 4
 
 
-def noise(name: str, *shape: int) -> Tensor:
+def noise(name, *shape: int):
     return torch.from_numpy(stream("rollout", 0, name).standard_normal(shape)).float()
 
 
-def uniform(name: str, *shape: int) -> Tensor:
+def uniform(name, *shape: int):
     return torch.from_numpy(stream("rollout", 0, name).uniform(size=shape)).float()
 
 
@@ -38,7 +37,7 @@ def net():
     return make_net(16)
 
 
-def make_net(map_channels: int) -> CosmosCausalDiT:
+def make_net(map_channels):
     sizes = DiTSizes(
         width=48,
         blocks=2,
@@ -58,7 +57,7 @@ def make_net(map_channels: int) -> CosmosCausalDiT:
 TEXT = noise("text", 1, 1, 8)
 
 
-def sample(w: int = 5) -> Sample:
+def sample(w=5):
     shape = (1, 16, N, H, W)
     return Sample(
         noise("z_r", *shape),
@@ -73,14 +72,12 @@ def sample(w: int = 5) -> Sample:
     )
 
 
-def at_w(predicted: Tensor, w: int) -> Tensor:
+def at_w(predicted, w):
     """Stand in for a perceptual term: any smooth function of position w alone."""
     return (predicted[:, :, w] * noise("probe", *predicted[:, :, w].shape)).sum()
 
 
-def velocity(
-    net: CosmosCausalDiT, s: Sample, b: slice, history: Tensor, x: Tensor, t: Tensor
-) -> Tensor:
+def velocity(net, s, b, history, x, t):
     """Return a block's velocity by one whole-clip forward: noised history before it, block-causal
     mask, one time a latent.
     """
@@ -92,7 +89,7 @@ def velocity(
     )[:, :, b]
 
 
-def slow_rollout(net: CosmosCausalDiT, s: Sample) -> Tensor:
+def slow_rollout(net, s):
     z_1 = mixed_source(s.z_r, s.m, s.eps)
     made = torch.zeros_like(z_1[:, :, :0])
     for start in range(0, N, 2):

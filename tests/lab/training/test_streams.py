@@ -3,7 +3,6 @@ identity where it is promised.
 """
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import torch
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.streams import (
     KINDS,
-    StreamBatch,
     StreamShares,
     TrainingStreams,
     there_and_back,
@@ -32,7 +30,7 @@ def root(tmp_path_factory):
     return folder
 
 
-def streams(root: Path, **settings: object) -> TrainingStreams:
+def streams(root, **settings: object):
     chosen = {
         "batch": 3,
         "frames": 2,
@@ -43,7 +41,7 @@ def streams(root: Path, **settings: object) -> TrainingStreams:
     return TrainingStreams(root / "pairs", root / "video", **chosen)  # type: ignore[arg-type]
 
 
-def equal(a: StreamBatch, b: StreamBatch) -> bool:
+def equal(a, b):
     return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
 
 

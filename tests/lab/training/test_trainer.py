@@ -4,11 +4,10 @@ nothing.
 
 import json
 import os
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.seeding import stream
@@ -16,26 +15,24 @@ from alpasim_plugin.lab.training.trainer import BAD_FILE, PartSchedule, Schedule
 
 
 class Linear(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(3, 4))
         self.bias = nn.Parameter(torch.zeros(3))
         self.fixed = nn.Parameter(torch.ones(3), requires_grad=False)
 
 
-def batch(index: int) -> Tensor:
+def batch(index):
     return torch.from_numpy(stream("t", 0, "x", index).standard_normal((8, 4))).float()
 
 
 TRUTH = torch.arange(12.0).reshape(3, 4) / 12
 
 
-def trainer(
-    folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1
-) -> Trainer[Tensor]:
+def trainer(folder, schedule, facts="a", bad_at=-1):
     model = Linear()
 
-    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+    def loss(x, index):
         error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
         return (error * float("nan") if index == bad_at else error), {
             "error": float(error.detach())
@@ -112,7 +109,7 @@ def test_full_disk_under_the_checkpoint_is_an_error_and_keeps_the_old_one(tmp_pa
     t = trainer(tmp_path, Schedule(steps=4, save_every=2))
     t.run(until=2)
 
-    def refuse(fd: int) -> None:
+    def refuse(fd):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", refuse)
@@ -125,15 +122,15 @@ def test_full_disk_under_the_checkpoint_is_an_error_and_keeps_the_old_one(tmp_pa
 class Two(nn.Module):
     """Two parts, of which one is trained in every third update."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.student, self.critic = Linear(), Linear()
 
 
-def two_parts(folder: Path, schedule: Schedule, parts: dict[str, PartSchedule]) -> Trainer[Tensor]:
+def two_parts(folder, schedule, parts):
     model = Two()
 
-    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+    def loss(x, index):
         trained = (model.critic, model.student) if index % 3 == 0 else (model.critic,)
         return torch.stack(
             [((x @ part.weight.T + part.bias - x @ TRUTH.T) ** 2).mean() for part in trained]

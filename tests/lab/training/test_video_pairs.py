@@ -25,7 +25,7 @@ from alpasim_plugin.log.video import read_mp4, write_mp4
 MILD = SplatDamage(2.5, 0.75, 0.3, 0.0, 0.0, 0.0, 0, 60.0, 0.0)
 
 
-def moving(frames: int, step_px: int = 2, height: int = 48, width: int = 80) -> np.ndarray:
+def moving(frames, step_px=2, height=48, width=80):
     """Return a smooth pattern that moves to the left."""
     rng = np.random.default_rng(0)
     wide = cv2.resize(
@@ -37,9 +37,7 @@ def moving(frames: int, step_px: int = 2, height: int = 48, width: int = 80) -> 
     return np.stack([wide[:, i * step_px : i * step_px + width] for i in range(frames)])
 
 
-def damaged(
-    frames: np.ndarray, damage: SplatDamage, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def damaged(frames, damage, seed=0):
     images, opacities = zip(*damage_video(frames, damage, np.random.default_rng(seed)), strict=True)
     return np.stack(images), np.stack(opacities)
 

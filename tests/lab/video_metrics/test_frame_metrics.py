@@ -20,7 +20,7 @@ SMOOTH: U8 = np.stack([np.add.outer(np.arange(24) * 4, np.arange(31) * 3)] * 3, 
 ].astype(np.uint8)
 
 
-def slow_ssim(a: U8, b: U8) -> float:
+def slow_ssim(a, b):
     """One frame, float64, one channel and one 2-D convolution after the other."""
     x = np.arange(-5, 6)
     row = np.exp(-(x**2) / (2 * 1.5**2))
@@ -29,7 +29,7 @@ def slow_ssim(a: U8, b: U8) -> float:
     for c in range(3):
         p, q = a[..., c] / 255.0, b[..., c] / 255.0
 
-        def mean(image: np.ndarray) -> np.ndarray:
+        def mean(image):
             return convolve2d(image, window, mode="same", boundary="fill", fillvalue=0)
 
         mp, mq = mean(p), mean(q)

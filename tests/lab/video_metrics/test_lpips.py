@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,7 +26,7 @@ from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, Kind, load_lpi
 KINDS: tuple[Kind, ...] = ("alex", "vgg")
 
 
-def pictures(seed: int, count: int = 2, side: int = 64) -> torch.Tensor:
+def pictures(seed, count=2, side=64):
     return torch.from_numpy(
         stream("nets", seed, "lpips").uniform(-1, 1, (count, 3, side, side))
     ).float()
@@ -59,7 +58,7 @@ def test_identity_symmetry_and_independence_of_the_batch(net):
     torch.testing.assert_close(net.distance(a.flip(0), b.flip(0)), there.flip(0))
 
 
-def write(folder: Path, kind: Kind) -> None:
+def write(folder, kind):
     """Write random weights under the published names; their digests are wrong unless a test says
     otherwise.
     """

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
@@ -20,14 +19,14 @@ from alpasim_plugin.lab.video_metrics.perceptual_net import (
 )
 
 
-def pictures(count: int = 2, height: int = 40, width: int = 56, seed: int = 0) -> Tensor:
+def pictures(count=2, height=40, width=56, seed=0):
     """Draw soft coloured blobs ``(count, 3, height, width)`` in [-1, 1]."""
     noise = stream("nets", seed, "perceptual").standard_normal((count, height, width, 3))
     soft = np.stack([cv2.GaussianBlur(x, (0, 0), 2.0) for x in noise])
     return torch.from_numpy(np.clip(soft / soft.std() / 2.5, -1, 1)).permute(0, 3, 1, 2).float()
 
 
-def blurred(image: Tensor, sigma: float) -> Tensor:
+def blurred(image, sigma):
     arrays = image.permute(0, 2, 3, 1).numpy()
     return torch.from_numpy(np.stack([cv2.GaussianBlur(x, (0, 0), sigma) for x in arrays])).permute(
         0, 3, 1, 2
@@ -99,7 +98,7 @@ def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_d
     LPIPS); by SSIM it is farther.
     """
 
-    def read(name: str) -> Tensor:
+    def read(name):
         image = cv2.imread(str(shared_data / "lpips" / f"{name}.png"))[..., ::-1]
         return (
             torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float() / 127.5 - 1

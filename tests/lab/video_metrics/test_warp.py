@@ -8,13 +8,12 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, warp_l1
 
 RNG = stream("video", 0, "warp")
 
 
-def texture(height: int, width: int) -> U8:
+def texture(height, width):
     noise = cv2.GaussianBlur(RNG.standard_normal((height, width, 3)), (0, 0), 3.0)
     return np.clip(127 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
 
