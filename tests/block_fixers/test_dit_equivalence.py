@@ -9,9 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.block_fixers.attention import block_causal_attention
 from alpasim_plugin.block_fixers.sizes import DiTSizes
-from tests.block_fixers.attention_reference import block_causal_reference
 from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
 from tests.block_fixers.dit_reference import latent_mask, random_weights, velocity
 from tests.examples import examples
@@ -68,22 +66,6 @@ def test_blocks_through_a_cache_are_the_whole_clip_under_the_same_window(
         )
         if window >= frames:
             assert furthest(blocks, net(x, t, text, hdmap, None, block)) < 1e-5
-
-
-@settings(max_examples=examples(60), deadline=None)
-@given(
-    frames=st.integers(1, 8),
-    block=st.integers(1, 5),
-    window=st.none() | st.integers(1, 9),
-    sink=st.integers(0, 3),
-    tokens=st.integers(1, 3),
-)
-def test_attention_without_a_mask_is_attention_with_one(frames, block, window, sink, tokens):
-    sink = min(sink, window) if window is not None else 0
-    g = torch.Generator().manual_seed(frames)
-    q, k, v = (torch.randn(2, frames * tokens, 2, 4, generator=g) for _ in range(3))
-    fast = block_causal_attention(q, k, v, tokens, block, window, sink)
-    assert furthest(fast, block_causal_reference(q, k, v, tokens, block, window, sink)) < 1e-6
 
 
 def test_past_beyond_the_window_is_forgotten_and_the_sink_is_not():

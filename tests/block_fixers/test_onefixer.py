@@ -152,20 +152,6 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy):
         assert np.abs(mine.astype(int) - images[name]).max() <= 1
 
 
-def test_map_is_seen_only_where_the_settings_use_it(weights):
-    seen, unseen = busy_settings(weights), busy_settings(weights, "uses_map=false")
-    black = [np.zeros_like(m) for m in MAPS[:5]]
-
-    def first_block(settings, maps):
-        return pixels(list(fixer(settings).step(FRAMES[:5], maps)))
-
-    assert not np.array_equal(first_block(seen, MAPS[:5]), first_block(seen, black))
-    assert not np.array_equal(
-        first_block(seen, black), first_block(seen, [])
-    )  # a black map says "no road", none says nothing
-    assert np.array_equal(first_block(unseen, MAPS[:5]), first_block(unseen, []))
-
-
 # --- untrained
 
 

@@ -137,15 +137,6 @@ def test_sky_is_not_in_alpha_unless_asked_for():
     assert graph.render(camera(), {}, sky_in_alpha=True).alpha.min() == 1
 
 
-def test_sky_has_no_seam_where_the_azimuth_wraps():
-    for yaw in (
-        0.0,
-        np.pi,
-    ):  # the panorama's first column, and the jump of arctan2, lie at the image's centre
-        step = np.abs(np.diff(SKY.image(camera(256, 96, se2(0, 0, yaw))), axis=1)).max(axis=(0, 2))
-        assert step[124:131].max() < 1.5 * np.delete(step, slice(124, 131)).max() + 0.01
-
-
 def test_splitting_by_tile_loses_nothing():
     cloud = blobs((0, 0, 0), n=101)
     tile = np.floor(cloud.means[:, 0]).astype(np.int64)

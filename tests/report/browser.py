@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import shutil
@@ -11,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -144,17 +142,6 @@ class Browser:
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
-
-    def screenshot(self, path: Path, clip: Sequence[float] | None = None) -> None:
-        """Save the whole page, or ``clip`` = x, y, width, height in CSS pixels, as PNG."""
-        if clip is None:
-            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            clip = (0, 0, size["width"], size["height"])
-        box = dict(zip(("x", "y", "width", "height"), clip, strict=True)) | {"scale": 1}
-        data = self.call(
-            "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=box
-        )["data"]
-        path.write_bytes(base64.b64decode(data))
 
     def _call(self, method: str, session: str | None, **params: Any) -> dict[str, Any]:
         self._next += 1

@@ -4,14 +4,13 @@ frames.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from alpasim_plugin import make_policy, run_rollout
+from alpasim_plugin import run_rollout
 from alpasim_plugin.core.errors import FixerError, InputError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
@@ -24,7 +23,6 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
 from policies.simple import LogReplay
@@ -179,24 +177,6 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road):
 
 
 @pytest.mark.slow
-def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(
-    straight_road,
-):
-    def digest(renderer):
-        recorder = Recorder(straight_road, 0)
-        run_rollout(straight_road, renderer, make_policy("lane-camera", straight_road), 0, recorder)  # type: ignore[arg-type]
-        return hashlib.sha256((recorder.folder / LOG_NAME).read_bytes()).hexdigest()
-
-    class Nothing(Blend):
-        def _mix(self, block):
-            return list(block)
-
-    session = session_of(straight_road, Nothing, tolerance_m=0.0, tolerance_deg=0.0)
-    assert digest(session) == digest(make_renderer("clean", straight_road, 0, threads=1))
-    assert session.facts()["redrafts"] > 0
-
-
-@pytest.mark.slow
 def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road):
     ahead, parked = straight_road.actors
     idm = replace(
@@ -223,17 +203,6 @@ def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(
     # The block from 0.5 s on knows the plans of 0.1 to 0.4 s, the last of which takes effect at 0.8
     # s.
     assert max(errors[6:10]) < 1e-9 < min(errors[10:13])
-
-
-def test_a_slower_camera_has_its_own_blocks(straight_road):
-    class Slow(Watching):
-        sensors = (SensorSpec("front", 200_000),)
-
-    run = drive(straight_road, Slow)
-    assert [request.t_us for request in run.requests] == list(range(0, 3_000_000, 200_000))
-    assert run.session.facts()["blocks"] == 2  # 5 + 8 of 15 frames
-    assert run.session.facts()["hits"] == run.session.facts()["predicted"] == 15 - 3
-    assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
 
 
 def with_rear_camera(scenario):
@@ -286,14 +255,6 @@ def test_whole_blocks_of_true_frames_equal_the_offline_result(straight_road, pol
 def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road):
     with pytest.raises(InputError):
         drive(replace(straight_road, warmup_us=300_000), mode="chunk")
-
-
-def test_cameras_of_different_periods_make_no_common_block(straight_road):
-    class Uneven(Watching):
-        sensors = (SensorSpec("front"), SensorSpec("rear", 200_000))
-
-    with pytest.raises(InputError):
-        drive(with_rear_camera(straight_road), Uneven, mode="chunk")
 
 
 # --- faults and facts

@@ -6,20 +6,16 @@ import json
 
 import numpy as np
 import pytest
-import shapely
 
 from alpasim_plugin.core.geometry import (
-    interpolate,
     wrap_angle,
     yaw_from_quat,
 )
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.world.ground import height_at
-from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.argoverse import read_argoverse, read_calibration, read_ego_poses
 from scenarios.recorded import SourceFiles
 from tests.examples import first_of
-from tests.scenarios.real_drive import footprint
 
 FACTS = {
     "7fab2350": {
@@ -154,34 +150,6 @@ def test_real_map(real):
         if s in raw
     )
     assert mirrored == facts["mirrored"]
-
-
-def test_real_human_is_inside_the_drivable_areas_in_every_frame(real):
-    _, _, _, log = real
-    surface = shapely.union_all([shapely.Polygon(a[:, :2]) for a in log.lane_map.drivable_areas])
-    poses_ = interpolate(log.ego_log, sweeps_us(log))
-    assert shapely.contains(surface, footprint(poses_, log.vehicle)).sum() == 156
-    assert shapely.contains_xy(surface, poses_[:, :2, 3]).sum() == 156
-
-
-def test_real_ego_is_in_a_lane_in_every_frame_and_in_at_most_four(real):
-    _, _, _, log = real
-    inside = LaneIndex(log.lane_map).containing_many(
-        interpolate(log.ego_log, sweeps_us(log))[:, :3, 3]
-    )
-    assert min(map(len, inside)) >= 1
-    assert max(map(len, inside)) <= 4
-
-
-def test_real_route_names_the_lanes_passed(real):
-    facts, _, _, log = real
-    route = route_from_log(log.lane_map, log.ego_log)
-    assert route.lane_ids[:3] == facts["lane_ids"]
-    lanes = log.lane_map.lanes
-    assert all(
-        b in lanes[a].successors
-        for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True)
-    )
 
 
 def test_real_wheels_stand_on_the_ground(real):

@@ -28,7 +28,6 @@ from evaluators.viewer.cells import (
     cell_data,
     cells_of,
     check_wanted,
-    index_data,
     read_logs,
     shown_by_default,
 )
@@ -296,23 +295,6 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run, tmp_path)
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), root / "rollouts.parquet")
     assert write_flips_page(root) == {}
     assert not (root / FLIPS_PAGE).exists()
-
-
-def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path):
-    plan = Plan(
-        renderers=("clean",),
-        policies=("one", "two"),
-        scenes=("urban-left_turn",),
-        seeds=(0,),
-        steps=12,
-    )
-    run = read_run(make_watched(tmp_path / "run", plan, actors=0))
-    (cell,) = cells_of(run, arms=True)
-    assert [cell.side(one) for one in cell.rollouts] == ["one", "two"] == list(cell.outcomes())
-    document = cell_data(run, cell, read_logs(run, cell), Fineness())
-    assert [drive["renderer"] for drive in document["drives"]] == ["one", "two"]
-    assert index_data(run, [cell], [cell], [], "")["renderers"] == ["one", "two"]
-    assert len(cells_of(run)) == 2  # a recording for other tools holds one policy
 
 
 def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run):

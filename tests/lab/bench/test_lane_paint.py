@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.lab.bench.lane_paint import PaintCounts, compare_paint, paint_of, road_of
+from alpasim_plugin.lab.bench.lane_paint import compare_paint, paint_of, road_of
 from alpasim_plugin.world.ground import flat
 
 WIDTH = 320
@@ -104,9 +104,3 @@ def test_a_line_off_by_less_than_two_pixels_counts_as_the_same(camera, road):
     assert compare_paint(np.roll(truth, 1, axis=1), truth, road).precision == pytest.approx(1.0)
     away = compare_paint(np.roll(truth, 8, axis=1), truth, road).precision
     assert away < 0.3
-
-
-def test_counts_of_pictures_are_added():
-    both = PaintCounts(10, 5, 8, 8) + PaintCounts(10, 10, 2, 0)
-    assert (both.precision, both.recall) == (0.75, 0.8)
-    assert PaintCounts().precision is None

@@ -23,8 +23,7 @@ from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation
 from alpasim_plugin.lab.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.lab.training.recipes.causal_arms import CAUSAL_ARMS
-from alpasim_plugin.lab.training.recipes.recipe import Recipe, Stage
-from alpasim_plugin.lab.training.recipes.registry import by_name, recipe_of, with_objective
+from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_objective
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
@@ -109,22 +108,6 @@ def test_an_arm_trains_resumes_and_drives(data, tmp_path, recipe):
     assert deployed(whole, steps=4).label.startswith(f"{recipe.fixer}@4")
 
 
-def test_the_bundle_carries_what_the_network_sees(data, tmp_path):
-    recipe = replace(
-        recipe_of("artifixer-pre"),
-        stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),),
-    )
-    session = deployed(train_fixer(run_of(data, recipe), tmp_path / "run"))
-    settings = session.settings
-    assert (settings.uses_map, settings.no_map, settings.opacity_input) == (False, "nothing", True)
-    assert (settings.block_latents, settings.window, settings.history) == (4, 4, "last-forward")
-    assert session.networks.dit.sizes.opacity_channels == 16
-    frames = moving_picture(13)
-    opaque = [replace(frame, alpha=np.ones_like(frame.alpha)) for frame in frames]
-    a, b = (pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, opaque))
-    assert (a != b).any()
-
-
 @pytest.mark.slow
 def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(
     data, student, tmp_path
@@ -196,12 +179,3 @@ def test_objectives_can_be_changed_by_field():
             with_objective(recipe_of("self-forcing"), [text])
     with pytest.raises(InputError):
         with_objective(recipe_of("self-forcing"), ["steps=many"])
-
-
-def test_recipes_that_do_not_fit_together_are_refused():
-    stage = recipe_of("omnidreams").stages[0]
-    with pytest.raises(InputError):
-        Recipe("odd", "", (replace(stage, start={"dit": "nowhere.dit"}),))
-    with pytest.raises(InputError):
-        by_name([recipe_of("V9"), recipe_of("V9")])
-    assert Stage("half", stage.objective, share=0.5).updates(5) == 2

@@ -12,10 +12,8 @@ import torch
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.networks import load_tiny_vae
-from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
+from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, Rollouts
 from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.trainer import Schedule
@@ -86,36 +84,3 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(data, bundle, tmp_path)
     )
     assert "decoder 30 updates" in session.label
     assert pixels(run_blocks(session, frames, maps_of(frames))).shape[0] == 13
-
-
-def test_batches_are_functions_of_their_number_and_crops_fit(data, bundle, tmp_path):
-    rollouts = Rollouts(
-        clips_of(data, tmp_path / "z"),
-        vae_of(bundle),
-        net_of(bundle),
-        2,
-        4,
-        "drawn",
-        tmp_path / "r",
-    )
-    one, two = (
-        DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2)
-    )
-    two.batch(0)
-    a, b = one.batch(3), two.batch(3)
-    assert torch.equal(a.z, b.z)
-    assert torch.equal(a.clean, b.clean)
-    assert a.clean.shape == (2, 3, 13, 32, 32)
-    clip, _ = rollouts[1]
-    wanted = clip.sequence.clip.rgb_gt[0, :, ::-1].astype(np.float32) / 127.5 - 1
-    np.testing.assert_allclose(clip.clean(1)[:, 0].permute(1, 2, 0), wanted, atol=1e-6)
-    with pytest.raises(InputError):
-        DecoderTask(
-            TinyVAE.load(data / "vae.safetensors"), rollouts, DecoderRecipe(rows=9, columns=4)
-        )
-
-
-def test_a_fixer_without_history_is_refused(data, tmp_path):
-    image = train_fixer(run_of(data, "image"), tmp_path / "image", ("brightness", brightness))
-    with pytest.raises(InputError):
-        finetune_decoder(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))

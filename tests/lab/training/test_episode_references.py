@@ -138,20 +138,6 @@ def test_as_many_references_as_drawn_and_none_without_a_recording(sequence, tmp_
     assert not shown(make(tmp_path), EXACT).any()
 
 
-def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_else(
-    sequence,
-):
-    exact = shown(sequence, EXACT)[:, 0]
-    errors = np.zeros((SLOTS, 6))
-    errors[0, 0] = 0.5
-    for other in (
-        replace(EXACT, skipped=1),
-        replace(EXACT, errors=errors),
-        replace(EXACT, wrong=0),
-    ):
-        assert not np.array_equal(shown(sequence, other)[:, 0], exact)
-
-
 def test_errors_of_the_map_do_what_their_names_say():
     sdmap = np.zeros((1, 20, 30, 3), np.uint8)
     sdmap[:, 10, :] = COLOURS["line_white"]

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.networks import load_networks
-from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
@@ -29,7 +27,6 @@ from alpasim_plugin.lab.training.recipes.registry import (
     recipe_of,
     with_attention,
 )
-from alpasim_plugin.lab.training.recipes.start import widen_map
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
@@ -107,30 +104,6 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(d
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
     clips_of(data, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")} == times
-
-
-def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(
-    data, tmp_path
-):
-    run = run_of(data, "base")
-    alone = train_fixer(run, tmp_path / "alone", ("brightness", brightness))
-    make(tmp_path / "mixed", name="a", frames=21)
-    make(tmp_path / "mixed", name="b", frames=14)
-    make(tmp_path / "mixed", name="c", frames=14, width=64)
-    mixed = replace(run, data=tmp_path / "mixed")
-    with pytest.raises(InputError):
-        train_fixer(mixed, tmp_path / "of-mixed", ("brightness", brightness))
-    with pytest.raises(InputError):
-        train_fixer(
-            replace(mixed, size=(32, 48)), tmp_path / "of-mixed", ("brightness", brightness)
-        )
-    chosen = train_fixer(
-        replace(mixed, size=(48, 32)), tmp_path / "of-mixed", ("brightness", brightness)
-    )
-    assert all(
-        torch.equal(value, load_weights(alone)[key]) for key, value in load_weights(chosen).items()
-    )
-    assert json.loads(chosen.with_suffix(".card.json").read_text())["data"]["sequences"] == 2
 
 
 QUICK = ("base", "V5", "V8")  # the branches that V9, which is trained below, does not take
@@ -221,22 +194,6 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     assert (fixed != nothing).any()
 
 
-def test_without_history_a_frame_does_not_depend_on_those_before(data, tmp_path):
-    path = train_fixer(run_of(data, "image"), tmp_path / "run", ("brightness", brightness))
-    settings = small_settings(
-        "window=4", "holes=noise", "history=none", "block_latents=1", f"weights.bundle={path}"
-    )
-    frames = moving_picture(6)
-    changed = [replace(frames[0], rgb=255 - frames[0].rgb), *frames[1:]]
-    one, other = (
-        pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, changed)
-    )
-    np.testing.assert_array_equal(one[1:], other[1:])
-    assert (one[0] != other[0]).any()
-    with pytest.raises(InputError):
-        small_settings("history=none")
-
-
 def test_draws_are_functions_of_their_number(data, tmp_path):
     run, clips = run_of(data, "V9"), clips_of(data, tmp_path)
     one, two = task_of(run, clips), task_of(run, clips)
@@ -253,22 +210,3 @@ def test_draws_are_functions_of_their_number(data, tmp_path):
         BatchForm(columns=3)
     with pytest.raises(InputError):
         task_of(run, clips, None)
-
-
-def test_a_widened_map_input_changes_nothing_at_first():
-    weights = initial_weights(DiTSizes(**small_settings().dit.model_dump()), 0, zero_velocity=True)
-    wide = widen_map(weights, 32)
-    narrow_net, wide_net = (CosmosCausalDiT.from_state_dict(w) for w in (weights, wide))
-    generator = torch.Generator().manual_seed(0)
-    x, z_map, z_r = (torch.randn(1, 16, 2, 4, 4, generator=generator) for _ in range(3))
-    text = torch.zeros(1, 1, 7)
-    for net in (narrow_net, wide_net):
-        torch.nn.init.normal_(
-            net.final_layer.linear.weight, generator=torch.Generator().manual_seed(1)
-        )
-    with torch.no_grad():
-        torch.testing.assert_close(
-            wide_net(x, 500.0, text, torch.cat([z_map, z_r], 1)), narrow_net(x, 500.0, text, z_map)
-        )
-    with pytest.raises(InputError):
-        widen_map(wide, 16)

@@ -5,7 +5,6 @@ drives as a fixer.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.atomic import write_safetensors
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.refine import refine_frames
@@ -36,7 +34,6 @@ TRAINED = {
     "harmonizer-temporal": {"dit", "vae.encoder", "vae.decoder"},
     "harmonizer-temporal-teacher": {"dit", "vae.encoder", "vae.decoder"},
 }
-Train = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
@@ -168,14 +165,3 @@ def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both
         (trained("difix").parent / "log.jsonl").read_text().splitlines()[0]
     )
     assert RenderStepLoss(weight=0.3, clamp=0.9, references="own").single == 0.5
-
-
-def test_what_an_arm_cannot_train_on_is_refused(train):
-    with pytest.raises(InputError):
-        train("difix", 1, "refused", "--block", "4")
-    with pytest.raises(InputError):
-        train("difix", 1, "refused", "--fixer", "gsfix3d")
-    with pytest.raises(InputError):
-        train("gsfix3d", 1, "refused", "--fixer", "onefixer-dit-tiny")
-    with pytest.raises(InputError):
-        train("3dgs-enhancer", 1, "refused", "--latents", "6")

@@ -13,12 +13,10 @@ import torch
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.parts import resolve_renderer
-from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.bundle import read_bundle
+from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
-from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
 from tests.lab.training.whole_clip_images import whole_clip_images
@@ -203,15 +201,3 @@ def test_labels_blocks_and_refused_settings(session):
             image_settings(name, override)
     with pytest.raises(InputError):
         make_fixer("difix", scene_id="scene")
-
-
-def test_a_bundle_loads_only_at_the_level_it_was_trained_for(weights, settings_of):
-    settings_of("harmonizer")
-    path = weights / "harmonizer_render.safetensors"
-    name, overrides = bundle_fixer(path)
-    fixer = make_fixer(name, fixer_settings(name, overrides), scene_id="scene")
-    assert (fixer.trained, fixer.label) == (True, "harmonizer, 3 updates")
-    with pytest.raises(InputError):
-        read_bundle(path, image_settings("difix"))
-    with pytest.raises(InputError):
-        read_bundle(path, image_settings("gsfix3d"))

@@ -24,7 +24,7 @@ from alpasim_plugin.lab.training.pixel_rollout import (
     choice_term,
     pixel_losses,
 )
-from alpasim_plugin.lab.training.pixel_run import PixelRun, initial_generator, train_per_frame
+from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 
@@ -259,20 +259,6 @@ def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path):
     assert isinstance(wide, PixelFixerSettings)
     with pytest.raises(InputError):
         train_per_frame(replace(run_of(init=begin), settings=wide), tmp_path / "wide", None)
-
-
-def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path):
-    shallow = train_per_frame(run_of(), tmp_path / "shallow", None)
-    deeper = fixer_settings("onefixer", (*SMALL, "generator.blocks=[1,2,2,2,2]"))
-    assert isinstance(deeper, PixelFixerSettings)
-    net = initial_generator(replace(run_of(init=shallow), settings=deeper))
-    before = PixelGenerator.from_state_dict(
-        parts_of({key: value.float() for key, value in load_weights(shallow).items()})["generator"]
-    )
-    picture = torch.rand(1, 32, 48, 3, generator=torch.Generator().manual_seed(0))
-    inputs = picture, picture[..., :1], picture, net.start(picture)
-    assert sum(p.numel() for p in net.parameters()) > sum(p.numel() for p in before.parameters())
-    assert torch.equal(net(*inputs)[0], before(*inputs)[0])
 
 
 def test_it_learns(tmp_path):
