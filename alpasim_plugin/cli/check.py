@@ -74,7 +74,7 @@ Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
 
 
 def check_run(run: Run = None, as_json: Json = False) -> None:
-    """Read every file of a run, compare it with its digest, and list what is damaged.
+    """Compare every file of a run with its digest.
 
     Nothing is written. The command of the run drives damaged and unfinished rollouts again.
     """
@@ -111,8 +111,7 @@ def check_policy(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Call a policy in fixed situations and name every breach of its contract: shapes, frames,
-    units, time, determinism.
+    """Call a policy in fixed situations and name every breach of its contract.
 
     Nothing is rendered or scored; it takes seconds. Run it before the first rollout.
     """
@@ -138,7 +137,7 @@ def check_renderer(
     scenario: Annotated[str, Flag("Scenario that it renders.")] = "smoke/curve",
     as_json: Json = False,
 ) -> None:
-    """Render a few frames along the recorded path and check them: shape, type, camera and time."""
+    """Check a few frames along the recorded path: shape, type, camera and time."""
     scene = load_scenario(scenario)
     with parts_print_to_stderr():
         session = make_renderer(renderer, scene)
@@ -166,9 +165,7 @@ def check_driver(
     ] = LIMIT_S * 1000,
     as_json: Json = False,
 ) -> None:
-    """Check an AlpaSim driver: rollouts in AlpaSim's order of calls, its times, its plans, and what
-    it must tolerate.
-    """
+    """Check an AlpaSim driver: order of calls, times, plans, and what it must tolerate."""
     times = DriveTimes()
     drives: list[Drive] = []
     policy: AlpasimPolicy | None = None

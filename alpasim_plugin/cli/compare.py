@@ -39,9 +39,7 @@ SHOWN = 10  # lines about missing pairs
 def compare(
     runs: Annotated[
         tuple[Path, ...],
-        Positional(
-            "One run, two of which the second is compared with the first, or the shards of one."
-        ),
+        Positional("One run, its shards, or two: the second is compared with the first."),
     ] = (),
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")

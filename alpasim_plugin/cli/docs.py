@@ -31,12 +31,10 @@ Examples:
 
 
 def docs(
-    page: Annotated[
-        str | None, Positional("A page, such as `policies` or `ci`; without it all are listed.")
-    ] = None,
+    page: Annotated[str | None, Positional("A page, such as `policies`; without it, all.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Read a page of the documentation in the terminal, or list all."""
+    """Read a page of the documentation, or list all."""
     folder = next((path for path in FOLDERS if os.path.isfile(path / "index.md")), None)
     if folder is None:
         raise InputError(

@@ -29,7 +29,7 @@ def doctor(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Test each part on a small case and report what works, what does not, and what to do."""
+    """Test each part on a small case and report what fails."""
     if gpu:
         _check_gpu(as_json)
     rows = []

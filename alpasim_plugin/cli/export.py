@@ -46,7 +46,7 @@ def export(
     items: Annotated[
         tuple[str, ...],
         Positional(
-            "A run folder, the folder of a rollout, or scenarios (--alpasim); by default the newest run.",
+            "A run, a rollout, or scenarios (--alpasim); by default the newest run.",
             metavar="RUN|ROLLOUT|SCENARIO...",
         ),
     ] = (),
@@ -60,8 +60,8 @@ def export(
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as
-    a recording for Foxglove and Rerun.
+    """Write a run as AlpaSim run folders and scenes, or one cell as a recording for Foxglove and
+    Rerun.
 
     With `--alpasim`, one run folder for each renderer and policy: logs, `_complete` marks, metadata
     and settings, so that `alpasim-eval`, `alpasim-aggregation` and `alpasim-reeval` take them as

@@ -40,16 +40,14 @@ def fork(
     seed: Annotated[int | None, Flag("Seed of the new parts.", min=0)] = None,
     own: Annotated[
         tuple[str, ...],
-        Flag(
-            "A part of your own that drove the rollout: what run.json names does not run unless you name it too. Repeatable."
-        ),
+        Flag("A part of your own that drove the rollout; it runs only if named here. Repeatable."),
     ] = (),
     out: Annotated[
         Path | None, Flag("Run folder to write; by default one below RUN/forks/.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Continue a logged rollout from an instant on with another renderer, policy or seed.
+    """Continue a logged rollout from an instant with another renderer, policy or seed.
 
     Writes a run folder with the original and the continuation, scored and reported like any run.
     """

@@ -65,7 +65,7 @@ def gate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check a run against a gate, or test the gate itself on deliberately broken renderers."""
+    """Check a run against a gate, or test the gate on broken renderers."""
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError(

@@ -23,15 +23,13 @@ Examples:
 """
 SPLAT_EPILOG = "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
 
-Out = Annotated[
-    Path, Flag("Folder of the scenario; the same command goes on where it stopped.", also="-o")
-]
+Out = Annotated[Path, Flag("Folder of the scenario; the same command continues.", also="-o")]
 
 
 def drive(
     folder: Annotated[
         Path,
-        Positional("Folder of photographs with poses (docs/real-drives.md).", metavar="FOLDER"),
+        Positional("Folder of photographs with poses.", metavar="FOLDER"),
     ],
     out: Out,
     camera_height: Annotated[
@@ -41,15 +39,13 @@ def drive(
     road: Annotated[
         Path | None,
         Flag(
-            "OpenDRIVE map in the coordinates of the poses; by default the driven path is the road.",
+            "OpenDRIVE map in the poses' coordinates; by default the road is the driven path.",
             "--map",
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a scenario of a recorded drive: photographs with poses become a street in which policies
-    drive.
-    """
+    """Make a scenario of a recorded drive: photographs with poses."""
     _import(lambda tell: import_drive(folder, out, camera_height, road, tell), out, as_json)
 
 
@@ -63,14 +59,12 @@ def splat(
     ],
     poses: Annotated[
         Path,
-        Flag(
-            "How it was driven through, in its own frame: transforms.json, COLMAP model, KITTI folder."
-        ),
+        Flag("Its drive, in its own frame: transforms.json, COLMAP model, KITTI folder."),
     ],
     out: Out,
     as_json: Json = False,
 ) -> None:
-    """Make a scenario of a trained model of Gaussians and the poses of a drive through it."""
+    """Make a scenario of a Gaussian model and the poses of its drive."""
     _import(lambda tell: import_splat(file, poses, out, tell), out, as_json)
 
 

@@ -30,9 +30,7 @@ Kind = Literal["renderers", "fixers", "policies", "scenarios", "metrics", "prese
 
 
 def list_names(
-    kind: Annotated[
-        Kind | None, Positional("What to list; without it the kinds are listed.")
-    ] = None,
+    kind: Annotated[Kind | None, Positional("What to list; without it, the kinds.")] = None,
     roots: Annotated[
         tuple[Path, ...],
         Positional("Of runs: folders that are searched; by default runs.", metavar="[FOLDER]..."),
@@ -49,7 +47,7 @@ def list_names(
     metric: Annotated[tuple[str, ...], Flag("Show this metric of each run. Repeatable.")] = (),
     as_json: Json = False,
 ) -> None:
-    """List renderers, fixers, policies, scenarios, metrics, presets or runs, one a line."""
+    """List renderers, fixers, policies, scenarios, metrics, presets or runs."""
     if kind == "runs":
         from alpasim_plugin.cli.list_runs import list_runs
 

@@ -45,11 +45,11 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
     "Drive": {
         "run": (
             "run:run",
-            "Drive scenarios behind one or more renderers, score the rollouts and write a report.",
+            "Drive scenarios behind renderers, score the rollouts and write a report.",
         ),
         "fork": (
             "fork:fork",
-            "Continue a logged rollout from an instant on with another renderer, policy or seed.",
+            "Continue a logged rollout from an instant with another renderer, policy or seed.",
         ),
     },
     "Read results": {
@@ -71,7 +71,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "view": (
             "view:view",
-            "Replay rollouts on an offline page, or draw a scenario before it is driven.",
+            "Replay rollouts on an offline page, or draw a scenario.",
         ),
         "why": ("why:why", "Show how a rollout failed, on one offline page."),
     },
@@ -88,7 +88,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
     "Extend and check": {
         "list": (
             "list:list_names",
-            "List renderers, fixers, policies, scenarios, metrics, presets or runs, one a line.",
+            "List renderers, fixers, policies, scenarios, metrics, presets or runs.",
         ),
         "new": (
             "new:new",

@@ -41,7 +41,7 @@ def new(
     folder: Annotated[Path, Flag("Where it goes.")] = Path("."),
     as_json: Json = False,
 ) -> None:
-    """Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."""
+    """Write a working policy, scenario, renderer, fixer or metric, with a test."""
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise InputError(
             f"name {name!r}: not a name of a Python file",

@@ -33,9 +33,7 @@ def refine(
     source: Annotated[
         Path, Positional("A video of any size, rate and length, or a folder of PNG.", metavar="IN")
     ],
-    out: Annotated[
-        Path, Flag("The refined video (MP4); a folder of PNG without a suffix.", also="-o")
-    ],
+    out: Annotated[Path, Flag("The refined video (MP4), or a folder of PNG.", also="-o")],
     opacity: Annotated[
         Path | None, Flag("Grey, white where the input is reliable; in the input's form.")
     ] = None,
@@ -49,13 +47,11 @@ def refine(
     seed: Annotated[int, Flag("Seed of the fixer's noise.", min=0)] = 0,
     device: Annotated[str, Flag("Where the fixer computes: cpu, cuda or cuda:N.")] = "cpu",
     compare: Annotated[Path | None, Flag("Also write input and result side by side.")] = None,
-    anyway: Annotated[
-        bool, Flag("Take whatever the fixer makes, however much it changes.")
-    ] = False,
+    anyway: Annotated[bool, Flag("Take the result, however much it changes.")] = False,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Refine a video with a fixer, block by block, at any length in constant memory.
+    """Refine a video with a fixer, at any length in constant memory.
 
     Frame times, size and colours are kept; sound is dropped. The result gets its name once
     complete: an interrupted command leaves no file.

@@ -73,7 +73,7 @@ def run(
     scenarios: Annotated[
         tuple[str, ...],
         Positional(
-            "Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.",
+            "Scenario or suite, a folder of them, a shipped name, or a recorded log.",
             metavar="SCENARIO...",
             names="scenario",
         ),
@@ -107,9 +107,7 @@ def run(
     ] = None,
     workers: Annotated[
         int | None,
-        Flag(
-            "Worker processes; by default one per core. The result does not depend on them.", min=1
-        ),
+        Flag("Worker processes; by default one per core.", min=1),
     ] = None,
     executor: Annotated[
         str,
@@ -121,13 +119,11 @@ def run(
     ] = True,
     time_limit: Annotated[
         float | None,
-        Flag("Seconds after which a rollout that hangs is ended and reported.", min=0.001),
+        Flag("Seconds after which a rollout is ended and reported.", min=0.001),
     ] = None,
-    out: Annotated[
-        Path | None, Flag("Run folder; by default one below runs/ named after the command.")
-    ] = None,
+    out: Annotated[Path | None, Flag("Run folder; by default one below runs/.")] = None,
     shard: Annotated[
-        str | None, Flag("Drive only this part of the scenes, for job arrays.", metavar="I/N")
+        str | None, Flag("Drive this part of the scenes alone.", metavar="I/N")
     ] = None,
     resume: Annotated[
         bool, Flag("Continue in a folder that another command has written.", "--resume")
@@ -135,26 +131,26 @@ def run(
     until_decided: Annotated[
         bool,
         Flag(
-            "Sequential test: drive scenes in random order and stop as soon as A versus B is decided.",
+            "Drive scenes in random order and stop as soon as the comparison is decided.",
             "--until-decided",
         ),
     ] = False,
     metric: Annotated[
         tuple[str, ...],
         Flag(
-            "With --until-decided: test this metric instead of the default gate's. Repeatable.",
+            "With --until-decided: this metric instead of the default gate's. Repeatable.",
             metavar="NAME[=MARGIN]",
         ),
     ] = (),
     repeat: Annotated[
         bool,
-        Flag("Drive a rollout of each policy twice and say whether it is repeatable.", "--repeat"),
+        Flag("Drive a rollout of each policy twice and compare the logs.", "--repeat"),
     ] = False,
     dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,
     quiet: Annotated[bool, Flag("Print only the result.", "--quiet", also="-q")] = False,
 ) -> None:
-    """Drive scenarios behind one or more renderers, score the rollouts and write a report.
+    """Drive scenarios behind renderers, score the rollouts and write a report.
 
     An interrupted run continues when the same command is given again.
     """

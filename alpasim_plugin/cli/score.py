@@ -59,11 +59,11 @@ def score(
     ] = True,
     evaluators: Evaluators = (),
     out: Annotated[
-        Path | None, Flag("Run folder; by default one below runs/ named by logs and preset.")
+        Path | None, Flag("Run folder; by default one below runs/, by logs and preset.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.
+    """Score rollout logs, AlpaSim's or ours, without rendering.
 
     Rows name the log by its folder in the column `rollout`. With `--preset alpasim` AlpaSim's own
     aggregation and scene score are written to `aggregate/` as well. Nothing in a log is ever

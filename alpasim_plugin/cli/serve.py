@@ -73,7 +73,7 @@ def serve(
     device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu",
     history_mb: Annotated[
         int,
-        Flag("Most memory of what callers leave: histories, or images of sessions, MiB.", min=16),
+        Flag("Most memory for histories or images of callers, MiB.", min=16),
     ] = 2048,
     mask: Annotated[
         tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")

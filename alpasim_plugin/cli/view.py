@@ -54,7 +54,7 @@ def view(
     what: Annotated[
         str | None,
         Positional(
-            "A run, one of its rollouts, or a scenario; by default the newest run.",
+            "A run, a rollout or a scenario; by default the newest run.",
             metavar="RUN|ROLLOUT|SCENARIO",
         ),
     ] = None,
@@ -66,7 +66,7 @@ def view(
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
     as_json: Json = False,
 ) -> None:
-    """Replay rollouts on an offline page, or draw a scenario before it is driven.
+    """Replay rollouts on an offline page, or draw a scenario.
 
     The page shows cameras side by side, a map from above, metrics over time and events. The image of
     a scenario shows its map, road users over time, and the camera along the recorded path.
@@ -157,7 +157,7 @@ def report(
     every: Annotated[bool, Flag("Print every metric too.", "--all")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write report.html, summary.md and junit.xml of a run again and print its table."""
+    """Write the reports of a run again and print its table."""
     folder = run_or_newest(run)
     ensure_tables(folder, warn)
     info = read_run_json(folder)

@@ -30,7 +30,7 @@ def why(
     cell: Annotated[
         Path | None,
         Positional(
-            "A rollout, or a run whose worst failure is shown; by default the newest run.",
+            "A rollout, or a run, whose worst failure is shown.",
             metavar="RUN|RUN/CELL",
         ),
     ] = None,

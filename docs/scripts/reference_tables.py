@@ -58,7 +58,10 @@ def verb_section(name: str, command: Any) -> str:
         )
         if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB):
             continue
-        rows.append((", ".join(f"`{name}`" for name in names), option.help or ""))
+        shown = ", ".join(f"`{name}`" for name in names)
+        again = " Repeatable."
+        is_repeatable = (option.help or "").endswith(again)
+        rows.append((shown + "..." * is_repeatable, (option.help or "").removesuffix(again)))
     text = " ".join((command.help or "").partition("\n\n")[0].split())
     options = "\n" + table(("option", "meaning"), rows) if rows else ""
     return f"## {name}\n{text}\n{options}"
