@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
@@ -72,9 +74,17 @@ def compare(
             policies=joined["paired_arms"],
         )
         means = joined
+        whole = [rollout for run in opened for rollout in run.rollouts]
+        asked = list(dict.fromkeys(name for run in opened for name in run.info.get("asked") or ()))
+        info = {**opened[0].info, "asked": asked}
+        info["scenes"] = {
+            name: facts for run in opened for name, facts in run.info["scenes"].items()
+        }
+        shown = replace(opened[0], summary=joined, rollouts=whole, info=info)
     else:
         result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
         means = dict(opened[0].summary)
+        shown = opened[0]
     facts: dict[str, Any] = {
         "runs": [str(run) for run in folders],
         "notes": list(result.notes),
@@ -85,10 +95,9 @@ def compare(
     lines: list[Any] = []
     if means is not None:
         facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
-        if len(folders) == 1:
-            lines += first_screen(opened[0])
-        if every or len(folders) > 1:
-            lines += metric_lines(means, not every, result.metrics)
+        lines += first_screen(shown)
+        if every:
+            lines += metric_lines(means, known=result.metrics)
         failures = means["failures"]
         if failures["n_failed"]:
             causes = ", ".join(f"{name} {count}" for name, count in failures["by_class"].items())
@@ -102,10 +111,14 @@ def compare(
             rows = [
                 row
                 for row in pair_rows({"paired": {variant: entries}}, result.metrics)
-                if every or row.metric in result.metrics.headline
+                if entries[row.metric]["n_cells"]
+                and (every or row.metric in result.metrics.headline)
             ]
-            lines += _table(rows, entries, result.metrics)
-            lines += _missing(entries)
+            lines += _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
+            missing = _missing(entries, len(entries) if every else SHOWN)
+            lines += missing if every else missing[:SHOWN]
+            if len(missing) > SHOWN and not every:
+                lines.append(f"  {len(missing) - SHOWN} more lines: --all")
     show(as_json, facts, *lines)
 
 
@@ -132,16 +145,15 @@ def _table(
     return texts
 
 
-def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """List missing pairs: metrics without any, cells without any, and metrics that lack some
-    cells.
+def _missing(entries: Mapping[str, Mapping[str, Any]], most: int) -> list[str]:
+    """List missing pairs: metrics without any, cells without any, and metrics that lack some cells;
+    ``most`` names a line.
     """
     paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}
-    lines = [
-        f"  no pair: {metric}: {entry.get('reason')}"
-        for metric, entry in entries.items()
-        if metric not in paired
-    ]
+    unpaired: dict[str, list[str]] = {}  # reason -> metrics
+    for metric in sorted(entries.keys() - paired.keys()):
+        unpaired.setdefault(str(entries[metric].get("reason")), []).append(metric)
+    lines = [f"  no pair: {some_of(metrics, most)}: {why}" for why, metrics in unpaired.items()]
     lacking: dict[tuple[str, str], list[str]] = {}  # (cell, reason) -> metrics
     for metric, entry in paired.items():
         for cell in entry["missing"]:
@@ -150,6 +162,4 @@ def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for (name, reason), metrics in lacking.items():
         which = "every metric" if len(metrics) == len(paired) else ", ".join(metrics)
         lines.append(f"  no pair: {name}: {which}: {reason}")
-    if len(lines) > SHOWN:
-        lines = [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
     return lines

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
 from evaluators.numbers import (
@@ -420,7 +421,8 @@ def _context(run: Run) -> str:
     """Say in one line what was driven: suite, preset, size, and what all variants share."""
     asked = run.info.get("asked") or ()
     size = (plural(len(run.scenes), "scene"), plural(len(run.info.get("seeds") or ()), "seed"))
-    parts = [*asked[:1], str(run.summary.get("preset")), " \u00d7 ".join(size)]
+    named = some_of(asked, 2)
+    parts = [*([named] if named else []), str(run.summary.get("preset")), " \u00d7 ".join(size)]
     if len(run.policies) == 1:
         parts.append(f"policy {run.policies[0]}")
     elif len(run.renderers) == 1:

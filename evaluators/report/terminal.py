@@ -78,19 +78,14 @@ def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent:
     return Text(f"{number} ").append(escape(note), style="dim")
 
 
-def metric_lines(
-    summary: Mapping[str, Any], headline_only: bool = False, known: MetricTable = METRICS
-) -> list[str]:
+def metric_lines(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[str]:
     """Print the mean and 95 % interval of each metric, a line a variant.
 
     Args:
         summary: Content of ``summary.json``.
-        headline_only: Leave out all but the headline metrics, where any of them is there.
         known: What the metrics are.
     """
     rows = metric_rows(summary, known=known)
-    if headline_only and any(row.is_headline for row in rows):
-        rows = [row for row in rows if row.is_headline]
     names = [escape(name) for name in summary.get("metrics") or {}]
     width = max(map(len, names), default=0)
     lines = []

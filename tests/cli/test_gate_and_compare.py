@@ -247,6 +247,17 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
     assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
 
 
+def test_joined_shards_print_the_one_table(tmp_path, capsys):
+    shards = [
+        vouch_for(make_run(tmp_path / name, plan(scenes=scenes, seeds=(0,))))
+        for name, scenes in (("a", SCENES[:2]), ("b", SCENES[2:5]))
+    ]
+    assert run_command(["compare", *map(str, shards)]) == 0
+    said = capsys.readouterr().out
+    assert "5 scenes" in said
+    assert "primary rate" in said
+
+
 def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
     small = {"renderers": ("clean",), "scenes": SCENES[:4], "seeds": (0,)}
     first = vouch_for(make_run(tmp_path / "a", plan(**small)))
