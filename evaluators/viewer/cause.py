@@ -42,7 +42,7 @@ from evaluators.viewer.drive_data import (
     Place,
     half_seconds,
     map_data,
-    recorded_drive,
+    scene_of,
     user_data,
 )
 from evaluators.viewer.evidence import plan_facts
@@ -356,13 +356,7 @@ def _document(run: Run, cause: Cause) -> dict[str, Any]:
     rollout, log = cause.rollout, cause.log
     if log is None:
         return {"queries": [], "lens": None, "failed": None}
-    content = run.scene_data(rollout.scene)
-    if content is None:
-        raise InputError(
-            f"{rollout.path}: no file of scene {rollout.scene} in {run.folder / 'scenes'}",
-            "Make the run again; runs of earlier versions kept no maps.",
-        )
-    recorded = recorded_drive(content, rollout.scene)
+    content, recorded = scene_of(run, rollout.scene)
     place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
     lens, scale = None, 1.0
     if log.info["cameras"]:

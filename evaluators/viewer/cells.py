@@ -32,7 +32,7 @@ from evaluators.viewer.drive_data import (
     drive_data,
     map_data,
     plans_part,
-    recorded_drive,
+    scene_of,
 )
 from evaluators.viewer.pictures import (
     NO_FRAMES,
@@ -288,13 +288,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
     Raises:
         InputError: A file is damaged, or the run has no map of the scene.
     """
-    content = run.scene_data(cell.scene)
-    if content is None:
-        raise InputError(
-            f"{cell.name}: no file of scene {cell.scene} in {run.folder / 'scenes'}",
-            "Make the run again; runs of earlier versions kept no maps.",
-        )
-    recorded = recorded_drive(content, cell.scene)
+    content, recorded = scene_of(run, cell.scene)
     firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
     place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
     tracks = Tracks()

@@ -91,16 +91,22 @@ def rounded(values: F64) -> list[float | None]:
     return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
 
 
-def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
-    """Return the recorded drive of ``scenes/SCENE.json``, ``(N, 2)`` metres, world.
+def scene_of(run: Run, scene: str) -> tuple[Mapping[str, Any], F64]:
+    """Return ``scenes/SCENE.json`` of a run, and the recorded drive in it, ``(N, 2)`` metres, world.
 
     Raises:
-        InputError: It has fewer than two points.
+        InputError: The run has no such file, or its recorded drive has fewer than two points.
     """
+    content = run.scene_data(scene)
+    if content is None:
+        raise InputError(
+            f"{run.folder / 'scenes'}: no file of scene {scene}",
+            "Make the run again; runs of earlier versions kept no maps.",
+        )
     log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(np.float64)
     if len(log) < 2:
-        raise InputError(f"{scene}: a recorded drive of {len(log)} points", "make the run again")
-    return log
+        raise InputError(f"{scene}: a recorded drive of {len(log)} points", "Make the run again.")
+    return content, log
 
 
 def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
@@ -108,7 +114,7 @@ def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, An
 
     Args:
         content: ``scenes/SCENE.json``.
-        log: As `recorded_drive` returns it.
+        log: As `scene_of` returns it.
         place: Where numbers count from.
     """
     window = shapely.box(*(log.min(axis=0) - AROUND_M), *(log.max(axis=0) + AROUND_M))
