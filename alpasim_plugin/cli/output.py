@@ -122,7 +122,7 @@ class Progress(progress.Progress):
         """
         while not self.ended.wait(1.0):
             for stage in stages_in(folder)[:1]:
-                text = stage.text(time.time())
+                text = stage.text(time.monotonic())
                 self.update(self.tasks[-1].id, description=f"rollouts; {terminal(text)}")
                 now_s = time.monotonic()
                 if self.disable and now_s - self.printed_s > LINE_EVERY_S:

@@ -22,7 +22,7 @@ class Stage:
     """A part of some work.
 
     Attributes:
-        began_s: When it began, in seconds of the clock on the wall.
+        began_s: When it began, in seconds of the monotonic clock, which processes of a machine share.
         done, total: How far it is; a total of 0 is unknown.
     """
 
@@ -58,7 +58,7 @@ def announce(name: str, done: int = 0, total: int = 0) -> None:
     if not _here:
         return
     path, last = _here[0]
-    now_s = time.time()
+    now_s = time.monotonic()
     if last.name == name and now_s - last.written_s < WRITE_EVERY_S:
         return
     began_s = last.began_s if last.name == name else now_s
