@@ -6,10 +6,10 @@ import os
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.reading import parsing, real
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
@@ -51,7 +51,7 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     from alpasim_plugin.runs.run import summary_of_run  # a run that is whole loads no loop
 
     say(f"note: {root}: {tables[0]}; the tables are made from the rollouts")
-    folder = TemporaryDirectory(prefix="simrun-tables-")
+    folder = temporary_folder("simrun-tables-")
     with parsing(root, AGAIN, "manifests from which no table can be made"):
         summary_of_run(root, info, run.manifests, Path(folder.name))
     REMADE[real(root)] = folder

@@ -129,6 +129,15 @@ def no_regular_files(root: Path, victim: Path) -> None:
         (root / name).symlink_to(target)
 
 
+def linked_folders(root: Path, victim: Path) -> None:
+    cell = next(root.glob("rollouts/*/*/*/*"))
+    for number, folder in enumerate((cell, root / "scenes")):
+        outside = victim.parent / f"outside/{number}"
+        outside.parent.mkdir(exist_ok=True)
+        folder.rename(outside)
+        folder.symlink_to(outside)
+
+
 def paths_that_leave(root: Path, victim: Path) -> None:
     cells = [{"frames": {"clean": str(victim)}, "t_us": 0}, {"frames": {"clean": "../../mine.txt"}}]
     (root / "flips.json").write_text(json.dumps({"cells": cells}))
@@ -191,6 +200,7 @@ CASES: dict[str, tuple[bool, Change]] = {
     "some names, no tables": (False, without_tables),
     "no regular files": (False, no_regular_files),
     "paths that leave": (True, paths_that_leave),
+    "linked folders": (False, linked_folders),
 }
 
 
@@ -215,6 +225,8 @@ def test_nothing_in_a_run_folder_runs_and_reading_writes_nothing(
     monkeypatch.chdir(folder)
     others = other_commands(root) if case == "every name" else ()
     walked = set()
+    outside = tmp_path / "outside"
+    outside_before = state_of(outside)
     for command in [*commands(root), *others]:
         before = state_of(root)
         code = run_command(command)
@@ -222,6 +234,7 @@ def test_nothing_in_a_run_folder_runs_and_reading_writes_nothing(
         assert not (tmp_path / "ran").exists(), f"{command} ran it"
         assert listener.callers == 0, f"{command} called an address"
         assert victim.read_text() == "mine", f"{command} wrote through a link"
+        assert state_of(outside) == outside_before, f"{command} wrote outside of the run folder"
         assert code in (0, 1, 2, 3, 4, 5), (command, shown.err)
         for line in (shown.out + shown.err).split("\n"):
             assert terminal(line) == line, (command, line)

@@ -15,7 +15,7 @@ from typing import Any, Literal, cast
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_as
+from alpasim_plugin.core.reading import read_json_as, real
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
     check_seal,
@@ -116,8 +116,16 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
         root: The run folder.
         cell: The rollout's folder below it.
         full: Read every file, even where size and time are as stated.
+
+    Raises:
+        InputError: A link leads out of the run folder, so nothing is read or written there.
     """
     folder = root / cell
+    if not real(folder).is_relative_to(real(root)):
+        raise InputError(
+            f"{folder}: a link leads out of the run folder",
+            "move what it leads to into the run folder, or drive it again into another one",
+        )
     if not os.path.exists(folder / MANIFEST):
         return RolloutState(None)
     try:

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.reading.tables import read_parquet
@@ -54,9 +55,15 @@ def writing(root: Path) -> Iterator[None]:
         root: The run folder; made if it does not exist.
 
     Raises:
+        InputError: A folder in it is a link, through which others would be written.
         InfrastructureError: Another process writes the folder, or it is read-only.
     """
     with one_writer(root / LOCK, f"folder {root}") as held:
+        for path in root.iterdir():
+            if os.path.islink(path) and os.path.isdir(path):
+                raise InputError(
+                    f"{path}: a link to a folder", "move that folder to the place of the link"
+                )
         remove_left_overs(root, held.since_ns)
         yield
 
