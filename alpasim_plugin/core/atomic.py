@@ -17,19 +17,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 
 if TYPE_CHECKING:
     import numpy.typing as npt
     from torch import Tensor
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+NO_PATH = (errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
 
-def disk_error(path: Path, error: OSError, do_this: str | None = None) -> InfrastructureError:
-    """Return the error of a failed write; the hint follows from the cause unless ``do_this`` is
-    given.
+def disk_error(path: Path, error: OSError, do_this: str | None = None) -> SimrunError:
+    """Return the error of a failed write: of the input where no machine could write such a path,
+    else of the machine. The hint follows from the cause unless ``do_this`` is given.
     """
+    if error.errno in NO_PATH:
+        return InputError(f"{path}: {error.strerror}", do_this or "name another path")
     if error.errno in DISK_FULL:
         hint = "free disk space and run the same command again"
     else:

@@ -142,7 +142,7 @@ class AslFile:
         try:
             self._stream: BinaryIO | None = self.partial.open("wb")
         except OSError as error:
-            raise self._failure(error) from error
+            raise disk_error(self.path, error) from error
 
     def write(self, entry: logging_pb2.LogEntry) -> None:
         """Append one entry.
@@ -160,7 +160,7 @@ class AslFile:
             self._stream.write(_LENGTH.pack(len(body)))
             self._stream.write(body)
         except OSError as error:
-            raise self._failure(error) from error
+            raise disk_error(self.path, error) from error
         self.entries += 1
 
     def finish(self) -> None:
@@ -178,7 +178,7 @@ class AslFile:
             self._stream = None
             self.partial.replace(self.path)
         except OSError as error:
-            raise self._failure(error) from error
+            raise disk_error(self.path, error) from error
 
     def abandon(self) -> None:
         """Close without renaming."""
@@ -202,9 +202,6 @@ class AslFile:
             self.finish()
         else:
             self.abandon()
-
-    def _failure(self, error: OSError) -> InfrastructureError:
-        return disk_error(self.path, error)
 
 
 def _may_begin_entry(head: bytes, announced: int) -> bool:

@@ -25,7 +25,7 @@ from alpasim_plugin.core.atomic import (
     write_safetensors,
     write_text,
 )
-from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 
 WRITERS: dict[str, Callable[[Path, int], None]] = {
     "bytes": lambda path, n: write_bytes(path, bytes([n]) * 4),
@@ -138,10 +138,14 @@ def test_a_missing_folder_is_named_with_advice(name, tmp_path):
     assert "exists" in caught.value.hint
 
 
-def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path):
-    write_bytes(tmp_path / "new" / "a", b"x")
-    with pytest.raises(InfrastructureError, match="writable, or name another"):
-        write_bytes(tmp_path / "new" / "a" / "b", b"x")
+@pytest.mark.parametrize("name", ["loop/a", "file/a", "x" * 300])
+def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_path, name):
+    write_bytes(tmp_path / "new/folder/a", b"a")
+    assert (tmp_path / "new/folder/a").read_bytes() == b"a"
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(InputError):
+        write_bytes(tmp_path / name, b"a")
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)

@@ -48,6 +48,11 @@ class NreRenderer(Renderer):
             )
         self._names = self._camera_names(scenario, place.options.get("cameras"))
 
+    @staticmethod
+    def check_address(address: str) -> None:
+        """Refuse what is no address, before a run begins."""
+        Address.parse("nre", address, OPTIONS)
+
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
         return self.render_batch([request])[0]
