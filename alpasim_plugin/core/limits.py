@@ -128,7 +128,7 @@ PICTURE_PIXELS = Bound(
 )
 
 # Places and sizes
-COORDINATE_M = Bound("coordinate", "m", -10_000, 10_000, "no scene reaches farther from its drive")
+COORDINATE_M = Bound("coordinate", "m", -25_000, 25_000, "no scene reaches farther from its drive")
 SEGMENT_M = Bound(
     "length of a road element", "m", 0.1, 10_000, "longer roads are built of several elements"
 )

@@ -12,6 +12,7 @@ from alpasim_plugin.core.types import F64, HeightField
 
 MAX_NODES = 30_000_000  # 240 MB of heights
 SIGHT_M = 400.0  # nothing farther from a drive is built or seen, so no ground is fitted there
+BUILT_WHOLE_M = 1500.0  # a longer drive is built in sections, those within `SIGHT_M` of a camera
 SLOPE_SPAN_M = 1.5  # half the length over which a pose's slope is taken: about half a wheelbase
 
 

@@ -119,7 +119,7 @@ def place_houses(site: Site) -> Houses:
     """
     environment = site.scenario.environment
     rng = site.rng("houses")
-    free = ((site.off_road_m > CLEAR_M) & ~site.taken).astype(np.uint8)
+    free = ((site.off_road_m > CLEAR_M) & ~site.taken & site.owned_cells).astype(np.uint8)
     fronts, aways, heights = [], [], []
     low_m, high_m = environment.building_height_m
     for line in contours(site, SETBACK_M[site.highway], WITHIN_M):

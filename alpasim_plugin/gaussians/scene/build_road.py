@@ -24,7 +24,15 @@ from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
-from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, left_of, to_pixels, unit
+from alpasim_plugin.gaussians.scene.site import (
+    CELL_M,
+    HORIZON_M,
+    SHIFT_BITS,
+    Site,
+    left_of,
+    to_pixels,
+    unit,
+)
 from alpasim_plugin.gaussians.scene.surfels import (
     SPREAD,
     THICKNESS,
@@ -352,7 +360,7 @@ def _ground_nodes(
                 np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1),
                 np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1),
             ]
-            keep = inside == keep_inside
+            keep = (inside == keep_inside) & site.owns(plan)
             parts.append((plan[keep], np.full(keep.sum(), size), averages[k][i, j][keep]))
         plan, size_m, painted = (np.concatenate(column) for column in zip(*parts, strict=True))
         above = painted[:, 3]
@@ -411,7 +419,9 @@ def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
     return np.column_stack([xy, z + above_m]), normals
 
 
-def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
+def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
+    owned = site.owns((everywhere.start + everywhere.end) / 2)
+    strokes = Strokes(*(column[owned] for column in everywhere))
     if len(strokes.start) == 0:
         return []
     rng = site.rng("paint-wear")
@@ -461,11 +471,11 @@ def _surroundings(site: Site) -> list[SceneNode]:
     h, w = site.road.shape
     size = np.array([w, h]) * 0.25
     cell = 12.0
-    n = np.ceil((size + 2 * 160.0) / cell).astype(int)
+    n = np.ceil((size + 2 * HORIZON_M) / cell).astype(int)
     grid = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1])), axis=-1).reshape(-1, 2)
-    plan = site.low - 160.0 + (grid + 0.5) * cell
+    plan = site.low - HORIZON_M + (grid + 0.5) * cell
     outside = np.any((plan < site.low - 0.3 * cell) | (plan > site.low + size + 0.3 * cell), axis=1)
-    plan = plan[outside]
+    plan = plan[outside & site.owns(plan)]
     rgb = np.array([0.36, 0.40, 0.26]) * (
         1 + 0.08 * site.rng("far-field").standard_normal((len(plan), 1))
     )

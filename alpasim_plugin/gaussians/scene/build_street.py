@@ -12,7 +12,14 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.build_road import KERB_M
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
-from alpasim_plugin.gaussians.scene.site import CELL_M, Roadside, Site, contours, places
+from alpasim_plugin.gaussians.scene.site import (
+    CELL_M,
+    TILE_M,
+    Roadside,
+    Site,
+    contours,
+    places,
+)
 from alpasim_plugin.gaussians.scene.surfels import (
     IDENTITY,
     SPREAD,
@@ -32,7 +39,6 @@ TREE_LINE_M = {
     False: 1.6,
     True: 7.0,
 }  # distance of street trees from the road's edge, by highway or not
-TILE_M = 32.0
 RIM_RGB = (0.88, 0.88, 0.86)
 SIGN_RGB = ((0.75, 0.12, 0.10), (0.10, 0.28, 0.62), (0.88, 0.72, 0.12), (0.10, 0.42, 0.26))
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
@@ -45,11 +51,12 @@ def build_street(site: Site, houses: Houses) -> list[SceneNode]:
     parts = [edge, ("tree", _trees(site, houses)), ("pole", _poles(site, houses))]
     nodes = []
     for name, items in [*parts, ("sign", _signs(site))]:
-        levels = [
-            (cell_m, cloud, tile_numbers(at - site.low, TILE_M))
-            for cell_m, cloud, at in items
-            if len(cloud)
-        ]
+        levels = []
+        for cell_m, cloud, at in items:
+            owned = site.owns(at)
+            if owned.any():
+                tile = tile_numbers(at[owned] - site.low, TILE_M)
+                levels.append((cell_m, cloud.take(owned), tile))
         nodes += nodes_by_tile(name, levels)
     return nodes
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Scenario
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades
 from alpasim_plugin.gaussians.scene.build_road import build_road
@@ -20,9 +24,10 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
     nodes_by_tile,
     tile_numbers,
 )
-from alpasim_plugin.gaussians.scene.site import HeightAt, make_site
-from alpasim_plugin.gaussians.scene.sky import make_sky
+from alpasim_plugin.gaussians.scene.site import HeightAt, make_site, path_of, section_of
+from alpasim_plugin.gaussians.scene.sky import Sky, make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.world.ground import BUILT_WHOLE_M, SIGHT_M
 
 FILE_TILE_M = 16.0
 LIGHT = {
@@ -46,14 +51,63 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
     actors = [lit(node, light) for node in build_actors(scenario)]
     if scenario.background is not None and not scenario.background.keep_road:
         return SceneGraph([], actors, sky)
-    site = make_site(scenario, height_at)
-    nodes = build_road(site, paint_strokes(site))
     if scenario.background is not None:
+        site = make_site(scenario, height_at)
+        nodes = build_road(site, paint_strokes(site))
         return SceneGraph([lit(node, light) for node in nodes], actors, sky)
+    if len(path_of(scenario)) > BUILT_WHOLE_M:
+        return LongScene(scenario, height_at, actors, sky)
+    return SceneGraph(build_surroundings(scenario, height_at), actors, sky)
+
+
+def build_surroundings(
+    scenario: Scenario, height_at: HeightAt, section: int | None = None
+) -> list[SceneNode]:
+    """Build everything that does not move, or a section of it: see `make_site`."""
+    light = np.array(LIGHT[scenario.environment.sky])
+    site = make_site(scenario, height_at, section)
+    road = build_road(site, paint_strokes(site))
     facades, houses = build_facades(site)
-    return SceneGraph(
-        [lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky
-    )
+    return [lit(node, light) for node in (*road, *facades, *build_street(site, houses))]
+
+
+class LongScene(SceneGraph):
+    """A scene that is built in sections along the path, as a camera comes near to them; those out of
+    its sight are freed.
+
+    What a camera sees depends on where it stands, not on where cameras stood before.
+    """
+
+    def __init__(
+        self, scenario: Scenario, height_at: HeightAt, actors: Sequence[SceneNode], sky: Sky
+    ) -> None:
+        super().__init__([], actors, sky)
+        self._scenario, self._height_at = scenario, height_at
+        self._path = path_of(scenario)
+        self._sections: dict[int, list[SceneNode]] = {}
+        self._lock = Lock()  # a server draws views of several drives at once
+
+    def render(
+        self,
+        camera: PinholeCamera,
+        actor_poses: Mapping[str, F64],
+        threads: int | None = None,
+        device: str = "cpu",
+        sky_in_alpha: bool = False,
+    ) -> RasterOutput:
+        """Render one view; see `SceneGraph.render`."""
+        with self._lock:
+            away_m = np.linalg.norm(self._path[:, :2] - camera.centre_world[:2], axis=1)
+            near = tuple(np.unique(section_of(np.flatnonzero(away_m < SIGHT_M))).tolist())
+            if near != tuple(self._sections):
+                self._sections = {i: self._sections.get(i) or self._built(i) for i in near}
+                self.set_background([node for i in near for node in self._sections[i]])
+            return super().render(camera, actor_poses, threads, device, sky_in_alpha)
+
+    def _built(self, section: int) -> list[SceneNode]:
+        """Build a section; its nodes get names of their own."""
+        nodes = build_surroundings(self._scenario, self._height_at, section)
+        return [replace(node, name=f"{section}/{node.name}") for node in nodes]
 
 
 def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:

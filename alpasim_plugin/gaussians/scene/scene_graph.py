@@ -132,14 +132,20 @@ class SceneGraph:
         actors: Sequence[SceneNode],
         sky: Sky,
     ) -> None:
-        self.background = tuple(background)
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
-        self._centre, self._radius = _spheres(self.background)
-        self._far = np.array([node.far_m for node in self.background])
         self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
         self._actor_index = {name: i for i, name in enumerate(self.actors)}
         self._prepared: dict[tuple[str, int], PreparedCloud] = {}
+        self.set_background(background)
+
+    def set_background(self, background: Sequence[SceneNode]) -> None:
+        """Replace the background; what was kept for nodes that are no longer in it is freed."""
+        self.background = tuple(background)
+        self._centre, self._radius = _spheres(self.background)
+        self._far = np.array([node.far_m for node in self.background])
+        names = {node.name for node in self.background} | set(self.actors)
+        self._prepared = {key: kept for key, kept in self._prepared.items() if key[0] in names}
         self._uploaded: dict[str, tuple[UploadedClouds, dict[tuple[str, int], int]]] = {}
 
     def __len__(self) -> int:

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, Bool, Lane, Scenario
+from alpasim_plugin.core.types import F32, F64, I64, Bool, Lane, Scenario
 
 HeightAt = Callable[[F64], F64]  # (N, 2+) world xy -> (N,) metres
 
@@ -31,6 +32,9 @@ REACH_M = 110.0  # how far from the path the rasters reach
 CLOSE_GAP_M = 1.5  # gaps between lanes narrower than twice this are road too
 SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
 HIGHWAY_MPS = 22.0
+TILE_M = 32.0  # a section owns whole tiles; all grids of the ground are cut along them
+HORIZON_M = 160.0  # large Gaussians lie so far around the rasters
+SECTION_M, OVERLAP_M = 250, 40  # of the path; a section's path goes on into its neighbours
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ class Site:
         road: ``(H, W)`` bool, paved for vehicles.
         taken: ``(H, W)`` bool, ground that actors stand on or drive over at any time.
         highway: Fast road without pavements and houses at its edge.
+        section: Number of the section along the path that is built; None: all of it.
+        owned: ``(Ty, Tx)`` bool, which tiles of `TILE_M`, from ``low - HORIZON_M`` on, are built.
     """
 
     scenario: Scenario
@@ -87,10 +93,27 @@ class Site:
     road: Bool
     taken: Bool
     highway: bool
+    section: int | None
+    owned: Bool
 
     def rng(self, component: str) -> np.random.Generator:
         """Return the random stream of one part of the scene."""
-        return stream(self.scenario.scene_id, self.scenario.seed, f"scene/{component}")
+        part = "" if self.section is None else f"{self.section}/"
+        return stream(self.scenario.scene_id, self.scenario.seed, f"scene/{part}{component}")
+
+    def owns(self, plan: F64) -> Bool:
+        """Return which ground points ``(N, 2)`` lie in tiles that are built."""
+        ij = np.floor((plan - self.low + HORIZON_M) / TILE_M).astype(np.int64)
+        h, w = self.owned.shape
+        return self.owned[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
+
+    @property
+    def owned_cells(self) -> Bool:
+        """Return ``(H, W)`` which cells of the rasters lie in tiles that are built."""
+        first, cells = round(HORIZON_M / TILE_M), round(TILE_M / CELL_M)
+        h, w = self.road.shape
+        tiles = self.owned[first:, first:]
+        return np.asarray(np.repeat(np.repeat(tiles, cells, axis=0), cells, axis=1)[:h, :w])
 
     @cached_property
     def off_road_m(self) -> F32:
@@ -145,9 +168,13 @@ def distance_m(mask: Bool) -> F32:
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M)
 
 
-def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
-    """Rasterise the ground plan of a scenario."""
-    path_world = _path(scenario)
+def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = None) -> Site:
+    """Rasterise the ground plan of a scenario, or of a section of `SECTION_M` along its path.
+
+    A section owns the tiles whose centres are nearest to its part of the path, so that sections
+    have no ground in common and leave none out.
+    """
+    path_world = path_of(scenario)
     chord = path_world[-1, :2] - path_world[0, :2]
     heading = scenario.ego_log.quat[0]
     yaw = (
@@ -156,8 +183,13 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
         else 2 * np.arctan2(heading[3], heading[0])
     )
     frame = GroundFrame(path_world[0, :2], float(yaw))
-    path = frame.to_ground(path_world)
-    low = np.floor(path.min(axis=0) - REACH_M)
+    whole = path = frame.to_ground(path_world)
+    if section is None:
+        low = np.floor(path.min(axis=0) - REACH_M)
+    else:
+        first = section * SECTION_M
+        path = whole[max(0, first - OVERLAP_M) : first + SECTION_M + OVERLAP_M]
+        low = np.floor((path.min(axis=0) - REACH_M) / TILE_M) * TILE_M
     size = np.ceil((path.max(axis=0) + REACH_M - low) / CELL_M).astype(int)
     shape = (int(size[1]), int(size[0]))
 
@@ -180,10 +212,28 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
     taken = _taken(scenario, frame, low, shape)
     highway = _is_highway(scenario, near)
-    return Site(scenario, height_at, frame, low, path, road.astype(bool), taken, highway)
+    owned = _owned_tiles(whole, low, high, section)
+    return Site(
+        scenario, height_at, frame, low, path, road.astype(bool), taken, highway, section, owned
+    )
 
 
-def _path(scenario: Scenario) -> F64:
+def _owned_tiles(path: F64, low: F64, high: F64, section: int | None) -> Bool:
+    """Return which tiles ``(Ty, Tx)`` of a site, and around it to the horizon, a section owns."""
+    count = np.ceil((high - low + 2 * HORIZON_M) / TILE_M).astype(np.int64)
+    if section is None:
+        return np.ones(count[::-1], dtype=bool)
+    grid = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1])), axis=-1)
+    _, nearest = scipy.spatial.KDTree(path).query(low - HORIZON_M + (grid + 0.5) * TILE_M)
+    return np.asarray(section_of(nearest) == section)
+
+
+def section_of(point: I64) -> I64:
+    """Return the section of points of the path, by their numbers."""
+    return point // SECTION_M
+
+
+def path_of(scenario: Scenario) -> F64:
     """Return the logged path and 40 m of the route behind its end, ``(N, 3)`` world, one point a
     metre.
     """
