@@ -65,9 +65,10 @@ def drive_of(length_m, scenario):
 
 def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built():
     scenario = load_scenario("smoke/straight")
-    check_scenario(drive_of(3000.0, scenario), "a log")
+    check_scenario(drive_of(20_000.0, scenario), "a log")
+    towers = replace(scenario.environment, buildings=1.0, building_height_m=(100.0, 200.0))
     with pytest.raises(InputError):
-        check_scenario(drive_of(9000.0, scenario), "a log")
+        check_scenario(replace(drive_of(1500.0, scenario), environment=towers), "a log")
     with pytest.raises(InputError, match="road users"):
         check_scenario(
             replace(scenario, actors=load_scenario("smoke/lead_car").actors * 1001), "a log"
