@@ -89,7 +89,7 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
     """Return the newest frame of a camera.
 
     Args:
-        observation: What the policy is given.
+        observation: What the policy receives.
         camera: Which camera, and at which size.
         policy: Name of the policy, for the error.
 

@@ -15,6 +15,7 @@ checkpoints load; docs/fixers.md lists them.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Self, cast
@@ -42,6 +43,7 @@ RELEASED_ROPE_RATIOS = (
     3.0,
     1.0,
 )  # height, width, time, as all released single-view experiments set them
+CUT = 3.0  # standard deviations of initial weights
 FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")
 __all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext"]
 
@@ -320,3 +322,40 @@ class CosmosCausalDiT(nn.Module):
                 f"text: shape {list(text.shape)}",
                 f"give (batch or 1, tokens, {self.sizes.text_width})",
             )
+
+
+def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:
+    """Draw a state dict.
+
+    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations;
+    norm gains are one, the bias and the final layer's second modulation are zero (the original's
+    initialisation), and so are the embeddings of the opacity (ArtiFixer's).
+
+    Args:
+        sizes: The network.
+        seed: Of the draw, for example from `alpasim_plugin.core.seeding.derive_seed`.
+        zero_velocity: Also zero the output layer: the predicted velocity is then zero, and one step
+            returns its source unchanged.
+
+    Returns:
+        Float32 tensors by key, for `CosmosCausalDiT.from_state_dict`.
+    """
+    generator = torch.Generator().manual_seed(seed % 2**63)
+    with torch.device("meta"):
+        net = CosmosCausalDiT(sizes)
+    out = {}
+    for key, value in net.state_dict().items():
+        tensor = torch.zeros(value.shape)
+        if key.endswith("norm.weight"):
+            tensor.fill_(1.0)
+        elif (
+            tensor.ndim == 2
+            and key != "final_layer.adaln_modulation.2.weight"
+            and not key.endswith("opacity_embed.weight")
+        ):
+            std = 1 / math.sqrt(tensor.shape[1])
+            nn.init.trunc_normal_(tensor, std=std, a=-CUT * std, b=CUT * std, generator=generator)
+        out[key] = tensor
+    if zero_velocity:
+        out["final_layer.linear.weight"].zero_()
+    return out

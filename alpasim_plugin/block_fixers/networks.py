@@ -16,10 +16,15 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.dit import FLOAT32_KEYS, CosmosCausalDiT, TextContext
+from alpasim_plugin.block_fixers.dit import (
+    FLOAT32_KEYS,
+    CosmosCausalDiT,
+    TextContext,
+    initial_weights,
+)
 from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, OneFixerSettings
-from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.streaming import State
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
@@ -122,7 +127,7 @@ def streaming_dit(
 
 
 def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
-    """Return the sizes of the condition that a transformer is given; models without a map take the
+    """Return the sizes of the condition that a transformer receives; models without a map take the
     render, or nothing, in its place.
     """
     if not isinstance(settings, OneFixerSettings):

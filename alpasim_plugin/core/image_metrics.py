@@ -1,4 +1,4 @@
-"""What images are judged by: one definition of PSNR, SSIM and a black picture for every stage,
+"""What images are measured by: one definition of PSNR, SSIM and a black image for every stage,
 table, report and training log.
 
 SSIM follows Wang et al., IEEE TIP 2004, Eq. 13, in the convention of the 3DGS papers: Gaussian
@@ -68,7 +68,7 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
 
 def gaussian_blur(image: F32) -> F32:
     """Return local means ``(H, W, C)`` under SSIM's window."""
-    import cv2  # not for those who only ask whether a picture is black
+    import cv2  # not for those who only ask whether an image is black
 
     window = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
     return cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT)

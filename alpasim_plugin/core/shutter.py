@@ -1,4 +1,4 @@
-"""Rolling shutters: a picture whose pixels are exposed at different times, as bands that are drawn
+"""Rolling shutters: an image whose pixels are exposed at different times, as bands that are drawn
 at one instant each.
 
 A pixel that is exposed at the share s of the shutter is seen from the camera's pose at s, and shows
@@ -30,7 +30,7 @@ MOST_BANDS = 64
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A part of a picture that is drawn at one instant.
+    """A part of an image that is drawn at one instant.
 
     Attributes:
         rows, columns: The window that holds its pixels.
@@ -46,7 +46,7 @@ class Band:
     actors: Mapping[str, F64]
 
     def put(self, whole: Any, part: Any) -> None:
-        """Write the band's pixels of a window's picture ``(h, w, ...)`` into the whole one."""
+        """Write the band's pixels of a window's image ``(h, w, ...)`` into the whole one."""
         window = whole[self.rows, self.columns]
         if self.exposed is None:
             window[...] = part
@@ -149,10 +149,10 @@ def between(start: F64, end: F64, share: float) -> F64:
 
 
 def motion_px(request: RenderRequest) -> float:
-    """Return by how many pixels a thing in the picture moves while the shutter is open, at most.
+    """Return by how many pixels a thing in the image moves while the shutter is open, at most.
 
-    Of the street that is what is `NEAR_M` away or at infinity, at the picture's edge; of the road
-    users in view their near side. Pixels are those of the picture's middle: at the edge of a wide
+    Of the street that is what is `NEAR_M` away or at infinity, at the image's edge; of the road
+    users in view their near side. Pixels are those of the image's middle: at the edge of a wide
     pinhole they are smaller, but those of the lens that it stands for are not.
     """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
@@ -182,7 +182,7 @@ def angle_between(a: F64, b: F64) -> F64:
 
 
 def rolling(width: int, height: int, along: Along, backwards: bool) -> F32:
-    """Return the shares of a picture exposed row by row (``along`` is ``rows``) or column by
+    """Return the shares of an image exposed row by row (``along`` is ``rows``) or column by
     column, the first at shutter start.
 
     Example:

@@ -172,7 +172,7 @@ class RenderRequest:
     )
 
 
-# Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by
+# Facts of a frame that a fixer made of recorded ones: shares of the image, 0 to 1, and both by
 # cell (`fixers.trust`).
 RECORDED_SHARE = "recorded_share"
 GUESSED_SHARE = "guessed_share"
@@ -209,7 +209,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture of the recorded drive in a file, undistorted, and where it was taken, as the
+    """An image of the recorded drive in a file, undistorted, and where it was taken, as the
     reconstruction believes.
     """
 
@@ -219,7 +219,7 @@ class Photograph:
     height: int
     K: F64  # (3, 3) pixels
     T_world_camera: F64  # (4, 4)
-    path: str  # of the picture
+    path: str  # of the image
     use: Literal["fitted", "held-out", "never-fitted"] = (
         "fitted"  # by the reconstruction; never-fitted: all of a further camera
     )
@@ -227,7 +227,7 @@ class Photograph:
         1.0,
         1.0,
         1.0,
-    )  # gain of each channel, by which the reconstruction explains this picture
+    )  # gain of each channel, by which the reconstruction explains this image
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +236,7 @@ class RecordedFrame:
 
     t_us: int
     camera: str
-    K: F64  # (3, 3) pixels, of the picture
+    K: F64  # (3, 3) pixels, of the image
     T_world_camera: F64  # (4, 4), as the reconstruction believes
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
     read: Callable[

@@ -27,7 +27,7 @@ LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
 # grey levels of mean change in the raw frames above which an unchanged output counts as frozen
 MOVED = 0.5
-CELL = 8  # pixels of the side of a cell; changes are judged by cells
+CELL = 8  # pixels of the side of a cell; changes are measured by cells
 REACH = 2  # cells around, where the map or the last output may support a change
 # opacity of a cell: below the first the generator is free, above the second the render is trusted
 OPAQUE = (0.9, 0.98)
@@ -84,7 +84,7 @@ def check_frames(measured: F32, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     Args:
         measured: ``(T, 3)``, the frames as decoded; see `measures`.
         fixed: ``(T, H, W, 3)`` the same as images.
-        raw: ``(T, H, W, 3)`` what the fixer was given.
+        raw: ``(T, H, W, 3)`` what the fixer received.
         before: Last fixed and raw frame of the previous block, if there was one.
 
     Returns:

@@ -94,7 +94,7 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     )
     scale: Literal["auto"] | Positive = Field(
         default="auto",
-        description="The network looks at a image this many times smaller; render and references are blended at full size. "
+        description="The network looks at an image this many times smaller; render and references are blended at full size. "
         "auto: the largest that leaves as many pixels as 256x144 has, the usual size of the training.",
     )
     precision: Literal["fp32", "bf16"] = Field(

@@ -1,4 +1,4 @@
-"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.ground` carries
+"""Recorded frames as references of a fixer: which of them a frame receives. `fixers.ground` carries
 them into its view.
 
 Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph,
@@ -78,7 +78,7 @@ class ReferenceIndex:
             T_world_camera: ``(4, 4)`` of the view.
             t_us: Its time.
             count: Frames at most.
-            last: What the same camera was given for its last frame: these stay a little longer.
+            last: What the same camera received for its last frame: these stay a little longer.
             past: Only frames recorded before ``t_us``.
         """
         if not count or not self.recorded:

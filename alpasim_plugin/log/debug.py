@@ -1,4 +1,4 @@
-"""What a policy says of itself in ``Plan.debug``, as rows of ``debug.jsonl``: text, images, heat
+"""What a policy reports about itself in ``Plan.debug``, as rows of ``debug.jsonl``: text, images, heat
 maps, boxes and lines.
 """
 
@@ -25,7 +25,7 @@ KINDS: tuple[tuple[str, str, str, tuple[int, ...], int | None], ...] = (
 
 
 def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
-    """Return what a policy says of itself with one plan, by kind; each value follows its name.
+    """Return what a policy reports about itself with one plan, by kind; each value follows its name.
 
     Text is shortened; images are JPEG and heat maps PNG in base64, a heat map followed by its least
     and its greatest value; boxes are ``(N, 4)`` x0, y0, x1, y1 in pixels of the first camera; lines

@@ -30,7 +30,7 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
         )
     options = {
         # A log is written while the loop runs. One filter for all rows, and no search for
-        # repetitions, which rendered pictures hardly have, take less than half of the time of
+        # repetitions, which rendered images hardly have, take less than half of the time of
         # libpng's own choices at its lowest level. Of filters that are as fast, averages leave
         # least.
         "png": [*COMPRESSION, *STRATEGY, *FILTER],

@@ -54,7 +54,7 @@ def load_av() -> Any:
 
 
 def exact_conversion(av: Any) -> Any:
-    """Return the scaler's settings for colour conversion. Its faster ones darken pictures by a grey
+    """Return the scaler's settings for colour conversion. Its faster ones darken images by a grey
     level; these are exact to a tenth.
     """
     flags = av.video.reformatter.Interpolation
@@ -62,7 +62,7 @@ def exact_conversion(av: Any) -> Any:
 
 
 class TimedFrame(NamedTuple):
-    """One picture ``(H, W, 3)`` uint8 sRGB, shown from ``time`` for ``duration``, both in units of
+    """One image ``(H, W, 3)`` uint8 sRGB, shown from ``time`` for ``duration``, both in units of
     the video's ``time_base``.
     """
 
@@ -73,7 +73,7 @@ class TimedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """What a video states about itself; pictures are upright, so width and height are those after
+    """What a video states about itself; images are upright, so width and height are those after
     the quarter turns and mirrors of its display matrix.
 
     Attributes:
@@ -107,7 +107,7 @@ class VideoReader:
 
     Raises:
         InputError: Missing or unreadable file, no video in it, no frames, damage, a changing
-            picture size, times that go back.
+            image size, times that go back.
 
     Example:
         >>> with VideoReader("drive.mp4") as video:                           # doctest: +SKIP
@@ -265,7 +265,7 @@ class VideoWriter:
         path: The file.
         time_base: Seconds of one tick of the frames' times.
         rate: Frames per second, for players that ask; times are what counts.
-        colour: Matrix, primaries and transfer that the pictures follow (ITU-T H.273); they are
+        colour: Matrix, primaries and transfer that the images follow (ITU-T H.273); they are
             stated in the file.
         pixel_aspect: Width of a pixel over its height.
         crf: Quality of the encoder, 0 (lossless in yuv) to 51.

@@ -64,12 +64,12 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
     """
     before: dict[str, LoggedImage] = {}
     frozen: set[int] = set()
-    for image in sorted(images, key=lambda picture: picture.end_us):
+    for image in sorted(images, key=lambda image: image.end_us):
         last = before.get(image.camera)
         if last is None or last.data != image.data:
             before[image.camera] = image
             continue
-        # Counted from the first of the equal pictures, so that a creeping car leaves it behind as
+        # Counted from the first of the equal images, so that a creeping car leaves it behind as
         # well.
         ends = [
             np.interp([last.end_us, image.end_us], rollout.ego.t_us, rollout.ego.xyz[:, k])

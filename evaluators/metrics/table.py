@@ -663,10 +663,10 @@ STEP_SERIES = MetricTable(
         ),
         # Of a fixer that looks at recorded frames.
         "recorded_share": MetricInfo(
-            "", "none", "last", "share of the picture that is recorded frames", is_share=True
+            "", "none", "last", "share of the image that is recorded frames", is_share=True
         ),
         "guessed_share": MetricInfo(
-            "", "none", "last", "share of the picture that the fixer made up", is_share=True
+            "", "none", "last", "share of the image that the fixer made up", is_share=True
         ),
     }
 )

@@ -11,6 +11,7 @@ import math
 import torch
 from einops import rearrange, repeat
 
+from alpasim_plugin.block_fixers.dit import initial_weights
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 
 
@@ -18,9 +19,9 @@ def random_weights(sizes: DiTSizes, seed: int = 0) -> dict[str, torch.Tensor]:
     """Draw weights that leave no path at zero; gains are around 1."""
     g = torch.Generator().manual_seed(seed)
     out = {}
-    for key, shape in sizes.shapes().items():
-        x = torch.randn(shape, generator=g)
-        out[key] = 1 + 0.1 * x if key.endswith("norm.weight") else x / math.sqrt(shape[-1])
+    for key, value in initial_weights(sizes, 0).items():
+        x = torch.randn(value.shape, generator=g)
+        out[key] = 1 + 0.1 * x if key.endswith("norm.weight") else x / math.sqrt(x.shape[-1])
     return out
 
 

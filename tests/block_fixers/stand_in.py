@@ -12,9 +12,10 @@ from pathlib import Path
 
 import torch
 
+from alpasim_plugin.block_fixers.dit import initial_weights
 from alpasim_plugin.block_fixers.networks import condition_sizes
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.seeding import derive_seed, stream

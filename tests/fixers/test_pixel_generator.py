@@ -85,15 +85,6 @@ def test_the_state_is_all_that_goes_on():
     assert not torch.equal(net(*clip[3], after_two)[0], whole[3])  # and the past is seen
 
 
-def test_fresh_clips_start_again_and_others_go_on():
-    net, clip = network(), frames(2)
-    _, state = rolled(net, clip[:1])
-    mixed = state.restarted(torch.tensor([True, False]), net.start(clip[1][0]))
-    assert torch.equal(mixed.output[0], clip[1][0][0])
-    assert torch.equal(mixed.hidden[1], state.hidden[1])
-    assert not mixed.hidden[0].any()
-
-
 def test_time_one_is_the_deployed_step_and_other_times_differ():
     net, (frame,) = network(), frames(1)
     torch.nn.init.normal_(net.time.weight)

@@ -67,7 +67,7 @@ class RendererClient:
         )
 
     def render(self, requests: Iterable[sensorsim_pb2.RGBRenderRequest]) -> dict[str, bytes]:
-        """Render one frame of several cameras; return the encoded pictures by camera.
+        """Render one frame of several cameras; return the encoded images by camera.
 
         Raises:
             grpc.RpcError: The server refused, or was away three times.

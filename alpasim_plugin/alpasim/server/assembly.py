@@ -46,7 +46,7 @@ def version_of(
 
     Args:
         spec: Renderer and fixer.
-        settings: What else shapes the pictures: device, scenes, reliability, masks.
+        settings: What else shapes the images: device, scenes, reliability, masks.
         upstream: The upstream's own triple.
 
     Returns:
@@ -145,7 +145,7 @@ class Settings:
         masks: Grey masks by camera.
         kept_scenes: Scenes that stay loaded.
         shutter: Which shutters roll; see `shutters.exposure_of`.
-        render_width: Pixels; wider pictures are made at this width and enlarged. None: all are made
+        render_width: Pixels; wider images are made at this width and enlarged. None: all are made
             as asked.
     """
 
@@ -218,7 +218,7 @@ def assemble(settings: Settings) -> Assembled:
         )
     if settings.upstream is not None and settings.render_width is not None:
         raise InputError(
-            "--render-width: the upstream chooses the size of its pictures",
+            "--render-width: the upstream chooses the size of its images",
             "use it without --upstream",
         )
     busy = threading.Lock()

@@ -32,7 +32,7 @@ QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
 
 @dataclass(frozen=True)
 class Answered:
-    """What the tree keeps of a frame: the picture that was given, and the fixer's past for the next
+    """What the tree keeps of a frame: the image that was given, and the fixer's past for the next
     one.
     """
 
@@ -48,7 +48,7 @@ class FrameServer:
         fixers: Fixes; None: frames are given as rendered, and no history is kept.
         tree: Histories.
         busy: Held while something is computed.
-        width: Wider pictures are made at this width and enlarged to the size asked for; None: all
+        width: Wider images are made at this width and enlarged to the size asked for; None: all
             are made as asked.
     """
 
@@ -70,7 +70,7 @@ class FrameServer:
         self.events: Counter[str] = Counter()
 
     def answers(self, requests: Sequence[Request], left: CallTime) -> list[bytes]:
-        """Return an encoded picture for every request, in order. Equal requests get equal bytes.
+        """Return an encoded image for every request, in order. Equal requests get equal bytes.
 
         Raises:
             SimrunError, grpc.RpcError, Late: See `status.status_of`.
@@ -137,7 +137,7 @@ class FrameServer:
             parent = self.tree.parent_of(view)
             if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
                 raise UpstreamFault(
-                    f"scene {view.scene_id!r}, camera {view.camera!r}: a picture of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)",
+                    f"scene {view.scene_id!r}, camera {view.camera!r}: an image of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)",
                     "see the upstream's log",
                 )
             past = None if parent is None else parent.state.past
@@ -157,7 +157,7 @@ class FrameServer:
         return known
 
     def _sized(self, image: U8, size: tuple[int, int]) -> U8:
-        """Return a picture at the size asked for, where it was made smaller; an upstream's picture
+        """Return an image at the size asked for, where it was made smaller; an upstream's image
         has the size that the upstream chose.
         """
         return image if self._width is None else enlarged(image, size)
@@ -199,7 +199,7 @@ def image_form(request: Request) -> tuple[int, float]:
 
 
 def enlarged(image: U8, size: tuple[int, int]) -> U8:
-    """Return a picture at a size (width, height), between pixels bicubically; as it is where it has
+    """Return an image at a size (width, height), between pixels bicubically; as it is where it has
     that size.
     """
     if image.shape[1::-1] == size:
@@ -208,7 +208,7 @@ def enlarged(image: U8, size: tuple[int, int]) -> U8:
 
 
 def encode(image: U8, form: tuple[int, float]) -> bytes:
-    """Encode a picture ``(H, W, 3)`` as asked."""
+    """Encode an image ``(H, W, 3)`` as asked."""
     return encode_image(image, ENCODINGS[form[0]], round(form[1]))
 
 

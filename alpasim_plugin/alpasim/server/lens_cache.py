@@ -15,7 +15,7 @@ ENTRY_BYTES = 64 << 10  # that a value counts beside its arrays, so that their n
 
 
 class LensCache:
-    """Values by lens, the oldest going first; one is made at a time, since that of a large picture
+    """Values by lens, the oldest going first; one is made at a time, since that of a large image
     takes a gigabyte for some seconds.
 
     Args:

@@ -22,7 +22,7 @@ from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
-SCAN_PX = 900, 604  # of a picture of a quarter of the horizon: 0.13 degrees a pixel in its middle
+SCAN_PX = 900, 604  # of an image of a quarter of the horizon: 0.13 degrees a pixel in its middle
 SCAN_MOST_M = 200.0
 ONE_SURFACE = 0.05  # neighbouring depths that differ by a smaller share are of one surface,
 # as are those whose step is at most so many times the smaller one beside it: a plane far away has
@@ -289,7 +289,7 @@ class Lidar:
     Attributes:
         rows_deg: Elevations.
         azimuths_deg: From the left of straight ahead.
-        looks_deg: Azimuths of the pictures that cover them.
+        looks_deg: Azimuths of the images that cover them.
     """
 
     rows_deg: F64
@@ -305,7 +305,7 @@ class Lidar:
         return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
 
     def cameras(self) -> list[CameraSpec]:
-        """Return the cameras of the pictures, 90 degrees wide, placed on the sensor."""
+        """Return the cameras of the images, 90 degrees wide, placed on the sensor."""
         width, height = SCAN_PX
         K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
         out: list[CameraSpec] = []
@@ -331,12 +331,12 @@ LIDARS = {
 
 
 def points_of(
-    rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], pictures: Sequence[U8]
+    rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], images: Sequence[U8]
 ) -> tuple[F64, F64]:
-    """Return where rays meet the surfaces of depth pictures, ``(P, 3)`` metres in the sensor's
+    """Return where rays meet the surfaces of depth images, ``(P, 3)`` metres in the sensor's
     frame, and how bright it is there ``(P,)``.
 
-    Inverse depth is linear in a picture of a plane, so it is interpolated between the four pixels
+    Inverse depth is linear in an image of a plane, so it is interpolated between the four pixels
     around a ray where they are of one surface; elsewhere the nearest pixel counts. Rays without a
     surface, or beyond `SCAN_MOST_M`, give no point.
 
@@ -344,12 +344,12 @@ def points_of(
         rays: ``(N, 3)`` of length 1.
         cameras: Placed on the sensor.
         depths: ``(H, W)`` of each, metres along the axis; 0 without a surface.
-        pictures: ``(H, W, 3)`` of each.
+        images: ``(H, W, 3)`` of each.
     """
     axes = np.array([camera.T_rig_camera[:3, 2] for camera in cameras])
     nearest = np.argmax(rays @ axes.T, axis=1)
     points, bright = [], []
-    for index, (camera, depth, picture) in enumerate(zip(cameras, depths, pictures, strict=True)):
+    for index, (camera, depth, image) in enumerate(zip(cameras, depths, images, strict=True)):
         mine = rays[nearest == index]
         p = mine @ camera.T_rig_camera[:3, :3]
         u, v = (
@@ -372,12 +372,12 @@ def points_of(
         length = z / p[:, 2]
         hit = length <= SCAN_MOST_M  # not where it is NaN, without a surface
         points.append(mine[hit] * length[hit, None])
-        bright.append(picture[row + (b > 0.5), column + (a > 0.5)][hit].mean(axis=1) / 255.0)
+        bright.append(image[row + (b > 0.5), column + (a > 0.5)][hit].mean(axis=1) / 255.0)
     return np.concatenate(points), np.concatenate(bright)
 
 
 def _is_one_surface(inverse: F64) -> Bool:
-    """Tell ``(H - 1, W)`` which neighbours down a picture of inverse depth are of one surface:
+    """Tell ``(H - 1, W)`` which neighbours down an image of inverse depth are of one surface:
     alike, or in even steps.
     """
     step = np.abs(np.diff(inverse, axis=0))

@@ -70,7 +70,7 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
     """Read grey masks ``(H, W)`` by camera: 255 is trusted.
 
     Raises:
-        InputError: A file that is no picture.
+        InputError: A file that is no image.
     """
     return {
         camera: np.asarray(read_image(path, flag=cv2.IMREAD_GRAYSCALE))
@@ -293,7 +293,7 @@ class UpstreamSource:
         trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path
             (`reliability`).
         masks: Grey masks by camera.
-        as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed
+        as_png: Ask for PNG whatever the caller asked for, so that the image is not compressed
             twice.
         threads: Threads of the map rasteriser.
         shutter: Which shutters roll, for the map; see `shutters.exposure_of`.
@@ -322,7 +322,7 @@ class UpstreamSource:
 
         Raises:
             grpc.RpcError: The upstream failed.
-            UpstreamFault: It sent no picture, or another number of them.
+            UpstreamFault: It sent no image, or another number of them.
             InputError: An unknown scene, or no recorded path to estimate the reliability from.
         """
         cameras = [view.camera for view in views]
@@ -455,10 +455,10 @@ def mount_of(entry: SceneEntry, view: View) -> F64:
 
 
 def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]) -> list[bytes]:
-    """Return the pictures of a batch in the order of ``names``.
+    """Return the images of a batch in the order of ``names``.
 
     Raises:
-        UpstreamFault: A picture is missing, there twice, or marked as failed.
+        UpstreamFault: An image is missing, there twice, or marked as failed.
     """
     found = {item.camera_name: item for item in reply.items}
     bad = [
@@ -473,7 +473,7 @@ def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]
 
 
 def decoded(data: bytes, what: str) -> U8:
-    """Decode an upstream's picture.
+    """Decode an upstream's image.
 
     Raises:
         UpstreamFault: It is not whole.
@@ -492,7 +492,7 @@ def decoded(data: bytes, what: str) -> U8:
         return decode_image(data, what)
     except SimrunError as error:
         raise UpstreamFault(
-            f"{what}: the upstream's picture: {error.message}", "see the upstream's log"
+            f"{what}: the upstream's image: {error.message}", "see the upstream's log"
         ) from error
 
 

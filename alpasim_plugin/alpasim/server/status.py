@@ -2,7 +2,7 @@
 
 The runtime retries a render on UNAVAILABLE, and on a text with "Stopped waiting for backend";
 anything else fails the rollout. So what may pass (an upstream that is away, busy, or sent a broken
-picture) is UNAVAILABLE, and what would fail again is not.
+image) is UNAVAILABLE, and what would fail again is not.
 """
 
 from __future__ import annotations

@@ -141,12 +141,12 @@ def read_lens(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Lens:
 
 @dataclass(frozen=True, eq=False)
 class Straight:
-    """The pinhole that shows all that a lens sees, in as many columns as the lens's picture has.
+    """The pinhole that shows all that a lens sees, in as many columns as the lens's image has.
 
     Attributes:
         K: ``(3, 3)``.
         size: Its width and height.
-        place: ``(height, width, 2)`` float32 place in the lens's picture of every pixel; None where
+        place: ``(height, width, 2)`` float32 place in the lens's image of every pixel; None where
             the lens is that pinhole.
     """
 
@@ -155,7 +155,7 @@ class Straight:
     place: F32 | None
 
     def image(self, seen: U8) -> U8:
-        """Return the pinhole's picture of the lens's ``(H, W, 3)``; black where the lens sees
+        """Return the pinhole's image of the lens's ``(H, W, 3)``; black where the lens sees
         nothing.
         """
         if self.place is None:
@@ -167,7 +167,7 @@ class Straight:
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
-    """Return the pinhole for the pictures ``(height, width)`` of a lens; see `read_lens`."""
+    """Return the pinhole for the images ``(height, width)`` of a lens; see `read_lens`."""
     what = ("straight", width, height)
     return lenses.get(spec, what, lambda: _straight(spec, width, height))
 

@@ -8,7 +8,7 @@ reads what:
   library opens itself, and gzip, zstd and zip, decompressed to a stated size at most.
 - `arrays`: NumPy files, by their header against the file's size, and headers and checkpoints of
   weights.
-- `images`: pictures, by their header before they are decoded.
+- `images`: images, by their header before they are decoded.
 - `tables`: parquet and Arrow tables with typed columns.
 
 Light modules only are imported here; `arrays`, `images` and `tables` are imported where they are

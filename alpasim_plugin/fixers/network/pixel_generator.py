@@ -178,17 +178,6 @@ class PixelState(NamedTuple):
     hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
     recorded: Tensor  # (B, H, W, 1) share of the references in the last output, 0 to 1
 
-    def detached(self) -> PixelState:
-        """Return the same values, cut off from the graph that made them."""
-        return PixelState(*(part.detach() for part in self))
-
-    def restarted(self, fresh: Tensor, start: PixelState) -> PixelState:
-        """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
-        at = fresh[:, None, None, None]
-        return PixelState(
-            *(torch.where(at, new, old) for new, old in zip(start, self, strict=True))
-        )
-
 
 class Repaired(NamedTuple):
     """What the network made of a frame, before references are blended in."""

@@ -186,7 +186,7 @@ def offsets(at2: Tensor, at4: Tensor) -> Tensor:
 
 
 class Sources(NamedTuple):
-    """What a image is blended of: the generator's own, then each reference."""
+    """What an image is blended of: the generator's own, then each reference."""
 
     colour: Tensor  # (B, 1 + K, H, W, 3)
     logit: Tensor  # (B, 1 + K, H, W, 1) their softmax over the sources is the blend

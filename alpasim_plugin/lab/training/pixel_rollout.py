@@ -43,6 +43,17 @@ ROAD_USER = 4  # a policy looks at road users, who are few pixels
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
 
+def detached(state: PixelState) -> PixelState:
+    """Return the same values, cut off from the graph that made them."""
+    return PixelState(*(part.detach() for part in state))
+
+
+def restarted(state: PixelState, fresh: Tensor, start: PixelState) -> PixelState:
+    """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
+    at = fresh[:, None, None, None]
+    return PixelState(*(torch.where(at, new, old) for new, old in zip(start, state, strict=True)))
+
+
 @dataclass(frozen=True)
 class PixelObjectives:
     """Weights of the terms, and the axes of the ablation.
@@ -165,14 +176,14 @@ def pixel_losses(
                 render,
                 opacity,
                 sdmap,
-                state.detached(),
+                detached(state),
                 interpolant(truth, source, t),
                 sample.t,
                 references,
             )
             flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
         if i and i % objectives.horizon == 0:
-            state = state.detached()
+            state = detached(state)
         before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
             out, state, sources = with_sources(
@@ -221,7 +232,7 @@ def pixel_losses(
     )
     total = total + objectives.grid * grid + objectives.flow * flow + objectives.choice * choice
     return PixelLosses(
-        total, picture, perceptual, temporal, flow, grid, choice, made, state.detached()
+        total, picture, perceptual, temporal, flow, grid, choice, made, detached(state)
     )
 
 

@@ -13,7 +13,12 @@ from torch import Tensor
 
 from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelGenerator, PixelState
-from alpasim_plugin.lab.training.pixel_rollout import Distance, PixelSample, pixel_losses
+from alpasim_plugin.lab.training.pixel_rollout import (
+    Distance,
+    PixelSample,
+    pixel_losses,
+    restarted,
+)
 from alpasim_plugin.lab.training.pixel_variants import PixelVariant
 
 SEEN = 2  # frames of the perceptual term in an update
@@ -171,7 +176,7 @@ class PixelTask:
         """Return the loss of an update and what is logged; the state goes on to the next."""
         sample = batch.sample
         start = self.net.start(sample.render[:, 0])
-        state = start if self._state is None else self._state.restarted(batch.fresh, start)
+        state = start if self._state is None else restarted(self._state, batch.fresh, start)
         distance = None if self.distance is None else self.distance[1]
         found = pixel_losses(
             self.net, sample, state, self.variant.objectives(index, self.steps), distance

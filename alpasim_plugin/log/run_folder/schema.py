@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow.compute as pc
 
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
-# of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times
+# of a metric's value: a double holds no thousandths of larger ones, and no image a thousand times
 # as much
 LARGEST = 1e15
 LATEST_US = 2.0**62  # of a time: the difference of two is one of 64 bits
@@ -48,7 +48,7 @@ AGGREGATE = "aggregate"  # AlpaSim's aggregation of scored logs
 # Files of the folder of a rollout.
 LOG_NAME = "rollout.asl"
 FRAMES_NAME = "frames.jsonl"  # facts of every camera frame
-DEBUG_NAME = "debug.jsonl"  # what the policy says of itself with its plans
+DEBUG_NAME = "debug.jsonl"  # what the policy reports about itself with its plans
 OUTPUT_NAME = "output.log"  # what its parts printed
 STRIP_NAME = "strip.jpg"  # a few frames, of earlier versions
 VIDEO_NAME = "front.mp4"

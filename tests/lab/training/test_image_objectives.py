@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, initial_weights
 from alpasim_plugin.block_fixers.networks import Parts
-from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings, make_fixer

@@ -9,9 +9,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, initial_weights
 from alpasim_plugin.block_fixers.sampling import CONTEXT_STEP, context_level, mixed_source
-from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers.network.schedule import interpolant
