@@ -260,6 +260,8 @@ def finished(tmp_path_factory):
                 "constant-velocity",
                 "--workers",
                 "1",
+                "--set",
+                "timing.duration_us=1000000",
                 "--out",
                 str(folder / "run"),
                 "smoke/straight",
