@@ -27,12 +27,9 @@ from scenarios.map_traffic import place_followers, vehicles
 from scenarios.opendrive import bordered, read_lanes
 from scenarios.opendrive_road import (
     OdrMap,
-    Road,
-    lane_borders,
-    lane_key,
+    lanes_at,
     parse_map,
-    reference_line,
-    road_points,
+    placed,
     sided,
 )
 from scenarios.opendrive_signals import CYCLE, GREEN_S, Head, traffic_lights, with_cycles
@@ -75,7 +72,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     graph = LaneGraph(lanes)
     with drawn.at("map", "route"):
         way = _way(drawn, spec.map, graph, odr, T_local_map)
-    if not graph.before(way.lane_ids[0]):
+    if not any(way.lane_ids[0] in lane.successors for lane in lanes.values()):
         way = replace(way, start_m=max(way.start_m, REAR_M))
     goal_m = graph.line(way).length_m - way.beyond_m
     way = graph.carried_on(way, AHEAD_M)
@@ -177,28 +174,19 @@ def _spots(text: str, graph: LaneGraph, odr: OdrMap, T_local_map: F64) -> list[S
         raise InputError(
             f"{text}: the map has no road {name!r}", f"choose a road such as {', '.join(near)}"
         )
-    if s_m > road.length_m or not road.records:
+    if s_m > road.length_m or not road.records or not road.sections:
         raise InputError(
-            f"{text}: road {name} is {road.length_m:.1f} m long", "choose a smaller distance"
+            f"{text}: road {name} has lanes from 0 to {road.length_m:.1f} m", "choose a place on it"
         )
-    spots = _on_road(road, s_m, graph, T_local_map)
+    spots = []
+    for _, key, inner_t, outer_t in lanes_at(road, s_m):
+        if key in graph.lanes:
+            point = placed(road, np.array([[s_m, (inner_t + outer_t) / 2]]), T_local_map)[0]
+            spots.append(Spot(key, project(graph.lanes[key].centre, point)[0]))
     if not spots:
         raise InputError(
-            f"{text}: road {name} has no lane for vehicles there", "choose another place"
+            f"{text}: road {name} has no lane there on which a car fits", "choose another place"
         )
-    return spots
-
-
-def _on_road(road: Road, s_m: float, graph: LaneGraph, T_local_map: F64) -> list[Spot]:
-    at = np.array([min(s_m, float(np.nextafter(road.length_m, 0.0)))])
-    index = max((i for i, part in enumerate(road.sections) if part.s_m <= at[0]), default=0)
-    line = reference_line(road.records, at)
-    spots = []
-    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], at):
-        key = lane_key(road, index, lane.lane_id)
-        if key in graph.lanes:
-            point = road_points(road, line, at, (inner_t + outer_t) / 2, T_local_map)[0]
-            spots.append(Spot(key, project(graph.lanes[key].centre, point)[0]))
     return spots
 
 

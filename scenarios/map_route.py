@@ -55,10 +55,6 @@ class LaneGraph:
         """Return the lanes that follow a lane."""
         return tuple(key for key in self.lanes[lane_id].successors if key in self.lanes)
 
-    def before(self, lane_id: str) -> tuple[str, ...]:
-        """Return the lanes that a lane follows."""
-        return tuple(key for key in self.lanes if lane_id in self.lanes[key].successors)
-
     def driven_m(self, way: Way) -> float:
         """Return the length of a way without lane changes, up to its goal."""
         return sum(self.length_m[key] for key in way.lane_ids) - way.start_m - way.beyond_m

@@ -12,6 +12,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
@@ -396,7 +397,7 @@ def _with_signals(
         signals = [_signal(files, here, one) for one in element.findall("signals/signal")]
         rings = [_rectangle(one, CROSSWALK_M) for one in signals if one.kind == CROSSWALK]
         for one in element.findall("objects/object"):
-            if one.get("type") == "crosswalk":
+            if one.get("type") == "crosswalk" and one.find(".//outline") is not None:
                 rings.append(_crosswalk(files, here, one))
             elif "stopline" in f"{one.get('name')}{one.get('subtype')}".lower().replace(" ", ""):
                 signals.append(replace(_signal(files, here, one), kind=STOP_LINE))
@@ -463,32 +464,21 @@ def _rectangle(one: RoadSignal, along_m: float) -> F64:
 
 
 def _crosswalk(files: SourceFiles, here: str, one: Element) -> F64:
-    """Return the ring ``(N, 2)`` of s and t of a crosswalk: its outline, or the rectangle of its
-    length and width.
-    """
-    s, t = (_number(files, here, one, name) for name in "st")
-    local = one.findall(".//cornerLocal")
-    if not local and one.find(".//cornerRoad") is not None:
-        corners = np.array(
-            [[_number(files, here, c, k) for k in "st"] for c in one.findall(".//cornerRoad")]
-        )
-    else:
-        turn = _number(files, here, one, "hdg", 0.0)
-        c, s_ = np.cos(turn), np.sin(turn)
-        if local:
-            shape = np.array([[_number(files, here, corner, k) for k in "uv"] for corner in local])
-        else:
-            half = [_number(files, here, one, k) / 2 for k in ("length", "width")]
-            shape = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-        corners = shape @ np.array([[c, s_], [-s_, c]]) + [s, t]
-    return np.concatenate([corners, corners[:1]])
+    """Return the ring ``(N, 2)`` of s and t of a crosswalk's outline."""
+    number = partial(_number, files, here)
+    turn = number(one, "hdg", 0.0)
+    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    local = [[number(corner, k) for k in "uv"] for corner in one.findall(".//cornerLocal")]
+    placed = np.array(local).reshape(-1, 2) @ turned + [number(one, "s"), number(one, "t")]
+    on_road = [[number(corner, k) for k in "st"] for corner in one.findall(".//cornerRoad")]
+    ring = np.concatenate([placed, np.array(on_road).reshape(-1, 2)])
+    return np.concatenate([ring, ring[:1]])
 
 
 def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
     here = f"{where}, road {element.get('id')}"
 
-    def number(owner: Element, name: str, default: float | None = None) -> float:
-        return _number(files, here, owner, name, default)
+    number = partial(_number, files, here)
 
     def cubics(
         owner: Element | None, tag: str, at: str = "s", start_m: float = 0.0
@@ -649,6 +639,20 @@ def lane_borders(road: Road, section: Section, s_m: F64) -> Iterator[tuple[OdrLa
                 outer_t = inner_t + sign * np.maximum(cubics_at(lane.widths, s_m), 0.0)
             yield lane, inner_t, outer_t
             inner_t = outer_t
+
+
+def lanes_at(road: Road, s_m: float) -> Iterator[tuple[OdrLane, str, float, float]]:
+    """Give each lane at an arc length with its key and the signed distances of its borders."""
+    at = np.array([min(s_m, float(np.nextafter(road.length_m, 0.0)))])
+    index = max((i for i, section in enumerate(road.sections) if section.s_m <= at[0]), default=0)
+    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], at):
+        yield lane, lane_key(road, index, lane.lane_id), float(inner_t[0]), float(outer_t[0])
+
+
+def placed(road: Road, st: F64, T_local_map: F64) -> F64:
+    """Return points ``(N, 3)`` in the local frame of a road's s and t ``(N, 2)``."""
+    line = reference_line(road.records, st[:, 0])
+    return road_points(road, line, st[:, 0], st[:, 1], T_local_map)
 
 
 def road_points(road: Road, line: F64, s_m: F64, t_m: F64, T_local_map: F64) -> F64:

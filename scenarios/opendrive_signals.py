@@ -24,10 +24,9 @@ from scenarios.opendrive_road import (
     Road,
     RoadSignal,
     driven_along,
-    lane_borders,
-    lane_key,
+    lanes_at,
+    placed,
     reference_line,
-    road_points,
 )
 
 PEDESTRIAN_LIGHT = "1000002"
@@ -60,12 +59,12 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
     poles: list[F64] = []
     signs: list[tuple[F64, Box]] = []
     for road in _roads(odr, lanes):
-        crosswalks += [_placed(road, ring, T_local_map) for ring in road.crosswalks]
+        crosswalks += [placed(road, ring, T_local_map) for ring in road.crosswalks]
         for one in road.signals:
             if one.kind == STOP_LINE:
                 stop_lines += _across(road, one, lanes, T_local_map)
             elif one.dynamic:
-                foot = _placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)
+                foot = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)
                 top = foot + np.array([0.0, 0.0, max(one.above_m + one.height_m, 2.0)])
                 poles.append(np.concatenate([foot, top]))
             elif one.kind != CROSSWALK and one.height_m > PLATE_M:
@@ -136,12 +135,6 @@ def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:
     return [road for road in odr.roads if road.road_id in kept]
 
 
-def _placed(road: Road, st: F64, T_local_map: F64) -> F64:
-    """Return points ``(N, 3)`` of a road's s and t ``(N, 2)``."""
-    line = reference_line(road.records, st[:, 0])
-    return road_points(road, line, st[:, 0], st[:, 1], T_local_map)
-
-
 def _heads(
     road: Road,
     one: RoadSignal,
@@ -163,10 +156,10 @@ def _heads(
             held = _lanes_at(road, s_m, along, one, lanes)
             if not held:
                 continue
-            ends = _placed(road, _line(s_m, held), T_local_map)
+            ends = placed(road, _line(s_m, held), T_local_map)
             signal = Signal(
                 ends, _heading_rad(road, s_m, along, T_local_map), (), 0, one.signal_id,
-                tuple(lane.lane_id for lane, _, _ in held),
+                tuple(key for key, _, _ in held),
             )  # fmt: skip
         group = controllers.get(one.signal_id, f"road {road.road_id}")
         heads.append(Head(signal, junction, group, road.road_id))
@@ -182,13 +175,11 @@ def _for_people(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_
     if rings:
         ring = min(rings, key=lambda ring: abs(float(ring[:, 0].mean()) - one.s_m))
         low_m, high_m = float(ring[:, 0].min()), float(ring[:, 0].max())
-    ends = _placed(road, np.array([[low_m, one.t_m], [high_m, one.t_m]]), T_local_map)
+    ends = placed(road, np.array([[low_m, one.t_m], [high_m, one.t_m]]), T_local_map)
     towards = -np.pi / 2 if one.t_m > 0 else np.pi / 2
     heading = _heading_rad(road, one.s_m, True, T_local_map) + towards
     crossed = [
-        lane.lane_id
-        for along in (True, False)
-        for lane, _, _ in _lanes_at(road, one.s_m, along, None, lanes)
+        key for along in (True, False) for key, _, _ in _lanes_at(road, one.s_m, along, None, lanes)
     ]
     return Signal(ends, heading, (), 0, one.signal_id, tuple(crossed), pedestrians=True)
 
@@ -210,7 +201,7 @@ def _waiting_m(road: Road, one: RoadSignal, along: bool) -> float:
     return min(lines, key=lambda s_m: abs(s_m - one.s_m), default=one.s_m)
 
 
-Held = tuple[Lane, float, float]  # a lane and the signed distances of its borders
+Held = tuple[str, float, float]  # a lane and the signed distances of its borders
 
 
 def _lanes_at(
@@ -219,17 +210,12 @@ def _lanes_at(
     """Return the lanes of one direction for vehicles, where a signal names some of them, only
     those.
     """
-    s_m = min(s_m, float(np.nextafter(road.length_m, 0.0)))
-    index = max((i for i, section in enumerate(road.sections) if section.s_m <= s_m), default=0)
     found: list[tuple[int, Held]] = []
-    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], np.array([s_m])):
-        made = lanes.get(lane_key(road, index, lane.lane_id))
-        if (
-            made is not None
-            and made.kind in ("vehicle", "bus")
-            and driven_along(road, lane) == along
-        ):
-            found.append((lane.lane_id, (made, float(inner_t[0]), float(outer_t[0]))))
+    for lane, key, inner_t, outer_t in lanes_at(road, s_m):
+        made = lanes.get(key)
+        for_vehicles = made is not None and made.kind in ("vehicle", "bus")
+        if for_vehicles and driven_along(road, lane) == along:
+            found.append((lane.lane_id, (key, inner_t, outer_t)))
     named = [held for lane_id, held in found if one is not None and one.holds(lane_id)]
     return named or [held for _, held in found]
 
@@ -243,7 +229,7 @@ def _line(s_m: float, held: Sequence[Held]) -> F64:
 def _across(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64) -> list[F64]:
     """Return a stop line's ends, a line for each direction that it is for."""
     held = [_lanes_at(road, one.s_m, along, one, lanes) for along in _senses(one)]
-    return [_placed(road, _line(one.s_m, some), T_local_map) for some in held if some]
+    return [placed(road, _line(one.s_m, some), T_local_map) for some in held if some]
 
 
 def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float:
@@ -258,6 +244,6 @@ def _plate(road: Road, one: RoadSignal, T_local_map: F64) -> tuple[F64, Box]:
     heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
     c, s = np.cos(heading), np.sin(heading)
     pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = _placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
+    pose[:3, 3] = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
     pose[2, 3] += one.above_m + one.height_m / 2
     return pose, Box(0.05, one.width_m, one.height_m)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from alpasim_plugin.core import limits as b
 
@@ -254,9 +254,10 @@ class MapSpec(Part):
     """A map without a drive: an expert drives a route on it, and the street is built around."""
 
     opendrive: str = Field(min_length=1, description="OpenDRIVE file, relative to this file.")
-    route: Literal["random"] | MapRoute = Field(
-        default="random", description="Where to drive; random: drawn by the scene seed."
-    )
+    route: Annotated[
+        Annotated[Literal["random"], Tag("(drawn)")] | Annotated[MapRoute, Tag("(named)")],
+        Discriminator(lambda given: "(drawn)" if isinstance(given, str) else "(named)"),
+    ] = Field(default="random", description="Where to drive; random: drawn by the scene seed.")
     vehicles: int = Field(
         default=6, ge=0, le=100, description="Vehicles near the route, which react (IDM)."
     )
