@@ -7,9 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib import import_module
 from pathlib import Path
-from threading import Thread
 from typing import Any, Protocol
 
 from alpasim_plugin import __version__
@@ -147,8 +145,6 @@ def execute_run(
         progress.started(plan, root, threads)
         began = time.perf_counter()
         how = HowToRun(threads, resume, limit_s, executor)
-        if threads.workers > 1:
-            Thread(target=_load_ending, daemon=True).start()
         known = held.get("policy_checks") or {}
         try:
             checks = check_policies(plan, known, how, progress.noticed)
@@ -165,12 +161,6 @@ def execute_run(
             end_children()
         summary = finish_run(root, manifests, more, report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
-
-
-def _load_ending() -> None:
-    """Load what the tables and reports take, while workers drive."""
-    for module in ("scipy.special", "alpasim_plugin.runs.reports", "evaluators.report.terminal"):
-        import_module(module)
 
 
 def finish_run(
@@ -201,7 +191,7 @@ def finish_run(
     summary = summary_of_run(root, info, manifests)
     scenes = [f"{SCENES}/{slug(scene)}.json" for scene in info["scenes"]]
     state_files(root, [RUN_INFO, DECISION, *TABLES, *scenes])
-    from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
+    from alpasim_plugin.runs.reports import write_reports  # templates: only once all is driven
 
     write_reports(root, flips=info.get("kind") != "score", page=report)
     return summary

@@ -58,6 +58,8 @@ def _images(
     cameras = {camera.name: camera for camera in scenario.cameras}
     first = next((image.camera for image in log.images), None)
     until = [image for image in log.images if image.camera == first and image.end_us <= failed_us]
+    if not until:
+        return []  # the policy has no camera, or the log no images
     images = []
     try:
         renderer = make_renderer(spec, scenario, cell.seed, plan.options.device, threads)
