@@ -75,12 +75,6 @@ def fork(
     lines = []
     if fork_facts:
         lines.append(f"replay to {at:g} s   equal to the log, bit for bit")
-        after = fork_facts.get("continuation")
-        if after == "equal":
-            lines.append("continuation      equal to the log, bit for bit")
-        elif after is not None:
-            where = f"{after['component']} at step {after['step']} ({after['what']})"
-            lines.append(f"continuation      differs first in {where}")
     show(as_json, facts, *lines, f"report   {root / 'report.html'}")
     for failed in () if as_json else result.summary["failures"]["cells"]:
         warn(failed["path"], *error_lines(failed["error"]))

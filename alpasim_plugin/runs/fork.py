@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ from typing import Any
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
-from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
     EgoState,
     Frame,
@@ -38,9 +37,9 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO
+from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
-from alpasim_plugin.log.trace import Difference, Trace, first_difference
+from alpasim_plugin.log.trace import first_difference
 from alpasim_plugin.runs.cell import RolloutParts, build_parts, run_cell
 from alpasim_plugin.runs.execute import thread_budget
 from alpasim_plugin.runs.logged_rollout import LoggedRollout
@@ -48,8 +47,6 @@ from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.run import RunResult, finish_run, write_run_info
 from alpasim_plugin.runs.summary import pool_of
-
-UNCHANGED = "replay"
 
 
 class SwitchedRenderer(Renderer):
@@ -177,7 +174,7 @@ class Change:
             self.policy or "",
             f"seed {self.seed}" if self.seed is not None else "",
         ]
-        return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
+        return f"{', '.join(part for part in parts if part)} from {self.after_us * 1e-6:g} s"
 
     def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
         """Return the cell with the replaced parts; ``fixer`` are the run's fixer settings."""
@@ -205,8 +202,7 @@ def fork_rollout(
 
     In the tables the continuation is a renderer of its own (`Change.label`), paired with the
     original: same policy name, scene and seed. ``fork`` in ``run.json`` and in the manifest holds
-    the change, the result of the replay and, for an empty change, whether the continuation equals
-    the log.
+    the change.
 
     Args:
         past: The logged rollout.
@@ -215,10 +211,15 @@ def fork_rollout(
         command: For ``run.json``.
 
     Raises:
-        InputError: The instant lies outside the rollout, its latency is measured, or ``root`` holds
-            a run.
+        InputError: Nothing changes, the instant lies outside the rollout, its latency is measured,
+            or ``root`` holds a run.
         InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
     """
+    if change == Change(change.after_us):
+        raise InputError(
+            f"--at {change.after_us * 1e-06:g}: nothing changes there",
+            "Name a --renderer, a --policy or a --seed; `simrun --repeat` drives a rollout twice.",
+        )
     length_us = int(past.manifest["steps"]) * past.scenario.rates.control_us
     if not 0 <= change.after_us < length_us:
         raise InputError(
@@ -263,11 +264,8 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
         fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change)
     )
     if manifest["status"] == "ok":
-        manifest["fork"] = (
-            asdict(change)
-            | {"of": past.name}
-            | _compare_with_log(past, change, at_us, root / fork.folder)
-        )
+        _check_replay(past, at_us, root / fork.folder)
+        manifest["fork"] = asdict(change) | {"of": past.name, "replay": "equal"}
         write_manifest(root / fork.folder, manifest)
     cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
     plan = RunPlan(
@@ -308,16 +306,14 @@ def _parts(
             before.renderer, before.renderer if same_renderer else after.renderer, at_us
         ),
         SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario),
-        own.rollout_key if then == own else fork.rollout_key,
-        before.names if then == own else after.names,
+        fork.rollout_key,
+        after.names,
         SwitchedController(before.controller, after.controller, at_us),
     )
 
 
-def _compare_with_log(
-    past: LoggedRollout, change: Change, at_us: int, folder: Path
-) -> dict[str, Any]:
-    """Compare the replay with the log up to the instant; for an empty change also the continuation.
+def _check_replay(past: LoggedRollout, at_us: int, folder: Path) -> None:
+    """Compare the replay with the log up to the instant.
 
     Raises:
         InfrastructureError: They differ before the instant.
@@ -330,26 +326,14 @@ def _compare_with_log(
         for key, value in other["frames"].items()
         if key in one["frames"] or key[0] >= at_us
     }
-    where = (past.scenario.start_us, past.scenario.rates.control_us)
     # The pose at the instant follows from the original parts; its frames and its plan come from the
     # new ones.
     until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
-    difference = first_difference(one, other, *where, until)
+    step_us = past.scenario.rates.control_us
+    difference = first_difference(one, other, past.scenario.start_us, step_us, until)
     if difference is not None:
         (folder / MANIFEST).unlink()
         raise InfrastructureError(
             f"{past.name}: its replay differs from the log before the change: {difference}",
             "use the machine and the versions in run.json, or run the rollout again",
         )
-    if change == Change(change.after_us):
-        return {"replay": "equal", "continuation": _continuation(one, other, past, folder, where)}
-    return {"replay": "equal"}
-
-
-def _continuation(
-    one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]
-) -> Mapping[str, Any] | str:
-    difference = first_difference(one, other, *where)
-    if difference is None and file_sha256(past.folder / LOG_NAME) != file_sha256(folder / LOG_NAME):
-        difference = Difference("log", where[0], None, "an entry that belongs to no component")
-    return "equal" if difference is None else difference.as_dict()

@@ -15,7 +15,7 @@ def test_a_part_of_the_users_own_drives_again_only_if_it_is_named_too(tmp_path, 
     drive = ["run", "--renderer", "clean", "--policy", "own.py:Own", "--images", "none", *short]
     assert run_command([*drive, "--out", "run", "smoke/straight"]) == 0
     (cell,) = Path("run").glob("rollouts/*/*/*/*")
-    again = ["fork", str(cell), "--at", "0.5", "--out", "forked"]
+    again = ["fork", str(cell), "--at", "0.5", "--renderer", "clean", "--out", "forked"]
     assert run_command(again) == 2
     assert run_command([*again, "--policy", "pure-pursuit"]) == 2
     assert run_command([*again, "--own", "own.py:Own"]) == 0

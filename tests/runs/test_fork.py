@@ -73,18 +73,12 @@ def forked(root):
     return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
 
 
-def test_an_untouched_continuation_is_the_log_to_the_byte(past, tmp_path):
-    go(past, tmp_path)
-    told = read_json(tmp_path / "run.json")["fork"]
-    assert (told["of"], told["replay"], told["continuation"]) == (CELL, "equal", "equal")
-    assert (forked(tmp_path) / "rollout.asl").read_bytes() == (
-        past.folder / "rollout.asl"
-    ).read_bytes()
-    one, other = (
-        log_trace(past.folder),
-        log_trace(forked(tmp_path)),
-    )
-    assert one == other
+@pytest.mark.parametrize("renderer", ["clean", "broken-frozen"])
+def test_a_part_that_is_named_again_continues_with_its_history(root, tmp_path, renderer):
+    past = find_rollout(root, CELL.replace("clean", renderer))
+    go(past, tmp_path, renderer=renderer)
+    assert read_json(tmp_path / "run.json")["fork"]["of"] == past.name
+    assert log_trace(past.folder) == log_trace(forked(tmp_path))
 
 
 @pytest.mark.parametrize("change", first_of([{"policy": "pure-pursuit", "seed": 5}, {}]))
@@ -127,16 +121,18 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(past, tmp_path):
     write_facts(copy / "frames.jsonl", facts)
     moved = replace(past, root=tmp_path / "copy")
     with pytest.raises(InfrastructureError, match=r"frames at step 3 \(camera front"):
-        go(moved, tmp_path / "out")
+        go(moved, tmp_path / "out", renderer="clean")
     assert not (tmp_path / "out" / "run.json").exists()
 
 
 def test_instants_outside_and_folders_in_use_are_refused(past, root, tmp_path):
     for after_us in (-1, 1_200_000, 10**12):
         with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
-            fork_rollout(past, Change(after_us), tmp_path, [])
+            fork_rollout(past, Change(after_us, "clean"), tmp_path, [])
     with pytest.raises(InputError, match="it holds a run already"):
-        fork_rollout(past, Change(AT_US), root, [])
+        fork_rollout(past, Change(AT_US, "clean"), root, [])
+    with pytest.raises(InputError):
+        fork_rollout(past, Change(AT_US), tmp_path, [])
 
 
 def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root, past):
