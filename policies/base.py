@@ -65,7 +65,7 @@ def seconds(times_us: I64) -> F64:
     return (times_us - times_us[0]) * 1e-6
 
 
-def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
+def front_camera(scenario: Scenario) -> CameraSpec:
     """Return the camera to look through: the first pinhole with "front" in its name, else the first
     one that looks ahead.
 
@@ -191,11 +191,8 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
 def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
     step = np.gradient(line, axis=0)
-    normal = (
-        np.column_stack([-step[:, 1], step[:, 0]])
-        / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
-    )
-    return line + left_m * normal
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    return line + left_m * np.column_stack([-step[:, 1], step[:, 0]]) / length[:, None]
 
 
 def curve_speeds(path: Path, cruise_mps: float) -> F64:

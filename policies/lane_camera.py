@@ -111,12 +111,7 @@ class LaneCamera(Policy):
         route = None
         left = route_left(observation.route_rig)
         if left is not None:  # with a lateral navigation error that is constant over the drive
-            line = smooth_line(left)
-            step = np.gradient(line, axis=0)
-            normal = np.column_stack([-step[:, 1], step[:, 0]]) / np.maximum(
-                np.linalg.norm(step, axis=1, keepdims=True), 1e-9
-            )
-            route = line + self.navigation_error_m * normal
+            route = shifted(smooth_line(left), self.navigation_error_m)
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)

@@ -60,7 +60,7 @@ class Learned(Policy):
                 f"temperature: {temperature}",
                 "give 0 or a positive number",
             )
-        self.camera = front_camera(scenario, "learned")
+        self.camera = front_camera(scenario)
         self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
         self.net = load_net(type(self).files[0] if weights is None else Path(weights))

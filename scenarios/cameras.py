@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, resized
-from alpasim_plugin.core.types import F64, CameraSpec, LensModel, Vehicle
+from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
 from scenarios.schema import CameraModel, CameraSet, Rigs
 from scenarios.variation import Drawn
 
@@ -101,9 +102,8 @@ def camera_spec(model: CameraModel | None = None) -> CameraSpec:
     middle = m.centre_px or (m.width / 2, m.height / 2)
     K = np.array([[focal[0], 0.0, middle[0]], [0.0, focal[1], middle[1]], [0.0, 0.0, 1.0]])
     T = np.eye(4)
-    T[:3, :3] = (
-        _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
-    )
+    turns = Rotation.from_euler("ZY", [m.yaw_deg, m.pitch_down_deg], degrees=True)
+    T[:3, :3] = turns.as_matrix() @ _RIG_FROM_FORWARD_CAMERA
     T[:3, 3] = m.x_m, m.y_m, m.z_m
     lens = None
     if m.lens != "pinhole":
@@ -121,17 +121,6 @@ def _focal_px(m: CameraModel) -> float:
     powers = half ** (2 * np.arange(len(m.coefficients)) + 2)
     bent = 1.0 if m.lens == "ftheta" else 1.0 + float(powers @ np.array(m.coefficients))
     return 0.5 * m.width / (float(half) * bent)
-
-
-def _rotation(yaw: float, pitch_down: float) -> F64:
-    """Return Rz(yaw) Ry(pitch): positive pitch about y (left) turns x (forward) down."""
-    cy = np.cos(yaw)
-    sy = np.sin(yaw)
-    cp = np.cos(pitch_down)
-    sp = np.sin(pitch_down)
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    return about_z @ about_y
 
 
 def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:

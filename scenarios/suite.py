@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
-from alpasim_plugin.core.config import Document, load_yaml, validate
+from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.parts import names as part_names
@@ -197,7 +197,8 @@ def _expand(
         try:
             refs = _expand(item.path, real(path).parent, (*chain, real(path)), opened)
         except InputError as e:
-            raise _placed(document, i, e) from e
+            mark = document.mark(("scenarios", i))
+            raise InputError(f"{mark}: {e.message}", e.hint) from e
         extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())
         out += [
             ScenarioRef(r.path, seed, (*r.overrides, *extra))
@@ -219,10 +220,6 @@ def _locate(text: str, base: Path | None) -> Path:
         if key in names:
             return names[key]
     raise unknown(text, "scenario or suite", names)
-
-
-def _placed(document: Document, i: int, e: InputError) -> InputError:
-    return InputError(f"{document.mark(('scenarios', i))}: {e.message}", e.hint)
 
 
 def _head(path: Path) -> dict[str, Any]:

@@ -12,16 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, BackgroundFile, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files import read_gaussians
 
-NEAR_M, BELOW_M, ABOVE_M = (
-    10.0,
-    5.0,
-    15.0,
-)  # a Gaussian is near a point of the path: in plan view, and in height
+# A Gaussian is near a point of the path: in plan view, and in height.
+NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0
 FEWEST = 20  # Gaussians near a point of the path for it to count as covered
 STEP_M = 2.0
 VISIBLE = 0.05  # opacity
@@ -61,22 +58,17 @@ def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
     if not len(points):
         return Coverage(np.full(3, np.nan), np.full(3, np.nan), 0.0)
     low, high = np.percentile(points, BULK, axis=0)
-    at = _along(path)
-    covered = [_count_near(points, one) >= FEWEST for one in at]
-    return Coverage(low, high, float(np.mean(covered)))
-
-
-def _along(path: F64) -> F64:
-    """Return points ``(K, 3)`` every `STEP_M` along a path ``(N, 3)``."""
-    s = arc_lengths(path[:, :2])
-    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / STEP_M) + 1))
-    return np.column_stack([np.interp(at, s, path[:, axis]) for axis in range(3)])
-
-
-def _count_near(points: F64, at: F64) -> int:
-    rise = points[:, 2] - at[2]
-    flat = (points[:, 0] - at[0]) ** 2 + (points[:, 1] - at[1]) ** 2 <= NEAR_M**2
-    return int(np.sum(flat & (rise >= -BELOW_M) & (rise <= ABOVE_M)))
+    length_m = float(arc_lengths(path[:, :2])[-1])
+    places = resample(path, np.linspace(0.0, length_m, max(2, int(length_m / STEP_M) + 1)))
+    near = [
+        np.sum(
+            (np.hypot(*(points[:, :2] - place[:2]).T) <= NEAR_M)
+            & (points[:, 2] >= place[2] - BELOW_M)
+            & (points[:, 2] <= place[2] + ABOVE_M)
+        )
+        for place in places
+    ]
+    return Coverage(low, high, float(np.mean(np.array(near) >= FEWEST)))
 
 
 LEAST = 0.05  # share of the route with Gaussians near it; below it the cameras look into emptiness

@@ -137,14 +137,11 @@ class MapDraft:
 
     def finish(self) -> LaneMap:
         """Freeze the map."""
-        edges = tuple(self.road_edges)
-        areas = tuple(self.drivable_areas)
-        crosswalks = tuple(self.crosswalks)
         return LaneMap(
             dict(self.lanes),
-            edges,
-            areas,
-            crosswalks,
+            tuple(self.road_edges),
+            tuple(self.drivable_areas),
+            tuple(self.crosswalks),
             tuple(self.stop_lines),
             tuple(self.markings),
             signals=(),
@@ -201,13 +198,16 @@ def build_strip(
         for key, line in lines.items():
             if key in joint:
                 line[0] = joint[key]
-    forward = tuple(draft.add(_lane(name, "f", k, lines, profile)) for k in range(profile.forward))
-    turned = reverse(lines)
-    backward = tuple(
-        draft.add(_lane(name, "b", k, turned, profile)) for k in range(profile.backward)
-    )
     add_sides(draft, name, lines, profile)
-    return Strip(forward, backward, lines)
+    return _add_lanes(draft, name, lines, profile)
+
+
+def _add_lanes(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profile) -> Strip:
+    """Add the lanes between named lines."""
+    turned = {key: line[::-1].copy() for key, line in lines.items() if key.startswith("b")}
+    forward = [_lane(name, "f", k, lines, profile) for k in range(profile.forward)]
+    backward = [_lane(name, "b", k, turned, profile) for k in range(profile.backward)]
+    return Strip(tuple(map(draft.add, forward)), tuple(map(draft.add, backward)), lines)
 
 
 def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
@@ -228,13 +228,6 @@ def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
         offset_line(curve, profile.left_extent_m()) if strip else lines[f"b{profile.backward}"]
     )
     return lines
-
-
-def reverse(lines: dict[str, F64]) -> dict[str, F64]:
-    """Return the oncoming lanes' lines in their own driving direction; neighbours go on sharing one
-    array.
-    """
-    return {key: line[::-1].copy() for key, line in lines.items() if key.startswith("b")}
 
 
 def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profile) -> None:
@@ -327,9 +320,8 @@ def build_taper(
     half = profile.median_m / 2
     s = np.hypot(curve[:, 0] - curve[0, 0], curve[:, 1] - curve[0, 1])
     share = smoothstep(s / s[-1])
-    out = (
-        (1.0 - share) if kind == "merge" else share
-    )  # 1 where the extra lane stands fully beside the others
+    # 1 where the extra lane stands fully beside the others
+    out = 1.0 - share if kind == "merge" else share
     left, centre, right = (
         offset_line(curve, -half - (n - 1 + shift + out) * w) for shift in (0.0, 0.5, 1.0)
     )
@@ -344,24 +336,17 @@ def build_taper(
         for key, line in lines.items():
             if key in joint and key != "right":
                 line[0] = joint[key]
-        left[0], centre[0], right[0] = (
-            joint[f"f{extra}"],
-            joint[f"fc{extra}"],
-            joint[f"f{extra + 1}"],
-        )
+        left[0] = joint[f"f{extra}"]
+        centre[0] = joint[f"fc{extra}"]
+        right[0] = joint[f"f{extra + 1}"]
         edge[0] = joint["right"]
     if kind == "merge":  # the narrow end: meet the neighbour exactly
-        left[-1], centre[-1], right[-1] = (
-            lines[f"f{n - 1}"][-1],
-            lines[f"fc{n - 1}"][-1],
-            lines[f"f{n}"][-1],
-        )
-    inner = replace(profile, shoulder_m=0.0, parking_m=0.0)
-    scratch = MapDraft()
-    strip = build_strip(scratch, name, curve, inner)
-    turned = reverse(lines)
-    for lane_id in (*strip.forward, *strip.backward):
-        draft.add(_with_lines(scratch.lanes[lane_id], lane_id, name, lines, turned, n))
+        left[-1] = lines[f"f{n - 1}"][-1]
+        centre[-1] = lines[f"fc{n - 1}"][-1]
+        right[-1] = lines[f"f{n}"][-1]
+    strip = _add_lanes(draft, name, lines, profile)
+    outermost = draft.lanes[strip.forward[-1]]  # the slanting lane crosses its edge
+    draft.lanes[outermost.lane_id] = replace(outermost, right_paint="dashed_white")
     slant = draft.add(
         Lane(
             f"{name}_{kind}",
@@ -378,20 +363,3 @@ def build_taper(
     if kind == "split":
         end_lines |= {f"fc{n}": centre, f"f{n + 1}": right}
     return Strip(strip.forward, strip.backward, end_lines), slant
-
-
-def _with_lines(
-    lane: Lane, lane_id: str, name: str, lines: dict[str, F64], turned: dict[str, F64], n: int
-) -> Lane:
-    """Put the shared line arrays into a lane, and dashed paint where the slanting lane crosses."""
-    k = int(lane_id.removeprefix(f"{name}_")[1:])
-    if lane_id.startswith(f"{name}_f"):
-        paint = "dashed_white" if k == n - 1 else lane.right_paint
-        return replace(
-            lane,
-            centre=lines[f"fc{k}"],
-            left=lines[f"f{k}"],
-            right=lines[f"f{k + 1}"],
-            right_paint=paint,
-        )
-    return replace(lane, centre=turned[f"bc{k}"], left=turned[f"b{k}"], right=turned[f"b{k + 1}"])

@@ -5,11 +5,11 @@ Which lines are painted is the rule of `world.paint`.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Paint
@@ -22,6 +22,7 @@ DOUBLE_OFFSET_M = 0.16
 STEP_M = 0.75  # length of a stroke of a line; a quarter of a dash
 BAR_M = 0.45  # zebra bar and the gap beside it
 STOP_LINE_M = 0.4
+JOINED_M = 0.7  # a line that begins this near to the end of another goes on with its dashes
 WHITE, YELLOW = 0, 1
 
 
@@ -53,53 +54,34 @@ def paint_strokes(site: Site) -> Strokes:
     pieces = [p for p in pieces if len(p.start)]
     if not pieces:
         return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    start, end = np.concatenate([p.start for p in pieces]), np.concatenate([p.end for p in pieces])
-    width_m, colour = (
-        np.concatenate([p.width_m for p in pieces]),
-        np.concatenate([p.colour for p in pieces]),
-    )
-    inside = np.all((start > site.low) & (start < high), axis=1)
-    return Strokes(start[inside], end[inside], width_m[inside], colour[inside])
+    joined = Strokes(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+    inside = np.all((joined.start > site.low) & (joined.start < high), axis=1)
+    return Strokes._make(column[inside] for column in joined)
 
 
 def _with_phase(lines: list[tuple[F64, Paint]]) -> list[tuple[F64, Paint, float]]:
     """Give each line the distance painted before it, so that dashes run on from lane to lane."""
-    starts: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for i, (line, _) in enumerate(lines):
-        starts[_key(line[0])].append(i)
-    before = [-1] * len(lines)
+    if not lines:
+        return []
+    tree = scipy.spatial.KDTree([line[0] for line, _ in lines])
+    following: list[list[int]] = [[] for _ in lines]
+    has_one_before = [False] * len(lines)
     for i, (line, paint) in enumerate(lines):
-        x, y = _key(line[-1])
-        for j in (
-            j for dx in (-1, 0, 1) for dy in (-1, 0, 1) for j in starts.get((x + dx, y + dy), [])
-        ):
-            if (
-                j != i
-                and before[j] < 0
-                and lines[j][1] == paint
-                and np.linalg.norm(lines[j][0][0] - line[-1]) < 0.7
-            ):
-                before[j] = i
+        for j in sorted(tree.query_ball_point(line[-1], JOINED_M)):
+            if j != i and not has_one_before[j] and lines[j][1] == paint:
+                following[i].append(j)
+                has_one_before[j] = True
     phase: dict[int, float] = {}
-
-    def follow(i: int) -> float:
-        chain = []
-        while i not in phase and i not in chain and before[i] >= 0:
-            chain.append(i)
-            i = before[i]
-        phase.setdefault(i, 0.0)
-        for j in reversed(chain):
-            if j not in phase:
-                phase[j] = phase[before[j]] + float(arc_lengths(lines[before[j]][0])[-1])
-        return 0.0
-
-    for i in range(len(lines)):
-        follow(i)
+    # Lines that nothing leads to begin; what is left then runs in a circle.
+    for first in sorted(range(len(lines)), key=lambda i: has_one_before[i]):
+        waiting = [(first, 0.0)]
+        while waiting:
+            i, begin_m = waiting.pop()
+            if i not in phase:
+                phase[i] = begin_m
+                end_m = begin_m + float(arc_lengths(lines[i][0])[-1])
+                waiting += [(j, end_m) for j in following[i]]
     return [(line, paint, phase[i]) for i, (line, paint) in enumerate(lines)]
-
-
-def _key(point: F64) -> tuple[int, int]:
-    return int(np.floor(point[0])), int(np.floor(point[1]))
 
 
 def _line_strokes(line: F64, paint: Paint, phase_m: float) -> Strokes:

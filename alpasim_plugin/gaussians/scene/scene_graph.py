@@ -134,8 +134,6 @@ class SceneGraph:
     ) -> None:
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
-        self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
-        self._actor_index = {name: i for i, name in enumerate(self.actors)}
         self._prepared: dict[tuple[str, int], PreparedCloud] = {}
         self.set_background(background)
 
@@ -210,27 +208,23 @@ class SceneGraph:
                 f"poses of {len(actor_poses)} actors: actor {unknown[0]!r} has no model in this scene",
                 "pass poses of the scenario's own actors only",
             )
-        eye, f = camera.centre_world, max(camera.fx, camera.fy)
-        distance = np.linalg.norm(self._centre - eye, axis=1) - self._radius
-        seen = in_view(camera, self._centre, self._radius) & (distance < self._far)
-        chosen: list[tuple[SceneNode, int, F64 | None]] = []
-        for i in np.flatnonzero(seen):
-            node = self.background[i]
-            chosen.append((node, self._level(node, float(distance[i]), f), None))
-        present = [name for name in self.actors if name in actor_poses]
-        if present:
-            index = [self._actor_index[name] for name in present]
-            poses = np.stack([actor_poses[name] for name in present])
-            centre = (
-                np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index])
-                + poses[:, :3, 3]
-            )
-            radius = self._actor_radius[index]
-            distance = np.linalg.norm(centre - eye, axis=1) - radius
-            for i in np.flatnonzero(in_view(camera, centre, radius)):
-                node = self.actors[present[i]]
-                chosen.append((node, self._level(node, float(distance[i]), f), poses[i]))
-        return chosen
+        present = [node for node in self.actors.values() if node.name in actor_poses]
+        poses = np.array([actor_poses[node.name] for node in present]).reshape(-1, 4, 4)
+        centre, radius = _spheres(present)
+        moved = np.einsum("nij,nj->ni", poses[:, :3, :3], centre) + poses[:, :3, 3]
+        centres, radii = (
+            np.concatenate([self._centre, moved]),
+            np.concatenate([self._radius, radius]),
+        )
+        distance = np.linalg.norm(centres - camera.centre_world, axis=1) - radii
+        seen = in_view(camera, centres, radii)
+        seen[: len(self._far)] &= distance[: len(self._far)] < self._far
+        nodes, places = (*self.background, *present), [None] * len(self.background) + list(poses)
+        focal_px = max(camera.fx, camera.fy)
+        return [
+            (nodes[i], self._level(nodes[i], float(distance[i]), focal_px), places[i])
+            for i in np.flatnonzero(seen)
+        ]
 
     def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:
         allowed_m = CELL_PX * max(distance_m, 0.0) / focal_px

@@ -195,7 +195,11 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
 
     lanes = list(scenario.lane_map.lanes.values())
     high = low + size * CELL_M
-    near = [lane for lane in lanes if _touches(frame.to_ground(lane.centre), low, high)]
+    near = []
+    for lane in lanes:
+        plan = frame.to_ground(lane.centre)
+        if np.all(plan.max(axis=0) > low) and np.all(plan.min(axis=0) < high):
+            near.append(lane)
     road = np.zeros(shape, dtype=np.uint8)
     for ring in (*_lane_rings(near), *scenario.lane_map.drivable_areas):
         if len(ring) >= 3:
@@ -251,10 +255,6 @@ def path_of(scenario: Scenario) -> F64:
         forward = np.array([1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3]), 0.0])
         line, length = np.stack([log[0], log[0] + 2.0 * forward]), 2.0
     return resample(line, np.linspace(0.0, length, max(2, int(np.ceil(length)) + 1)))
-
-
-def _touches(plan: F64, low: F64, high: F64) -> bool:
-    return bool(np.all(plan.max(axis=0) > low) and np.all(plan.min(axis=0) < high))
 
 
 def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.geometry import wrap_angle
 from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
@@ -83,17 +84,12 @@ class Sky:
         # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
         forward = camera.T_camera_world[2, :3]
         ahead = np.arctan2(forward[1], forward[0])
-        azimuth = ahead + _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
+        azimuth = ahead + wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
         columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w)
-        columns += np.float32(WIDTH) * (
-            columns < 0
-        )  # all lie within a turn of column 0: what % would give, in a tenth of its time
+        # All lie within a turn of column 0: what % would give, in a tenth of its time.
+        columns += np.float32(WIDTH) * (columns < 0)
         rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
         return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
-
-
-def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
