@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.sampling import (
+    context_level,
     finalise,
     flow_step,
     mixed_source,
@@ -169,3 +170,17 @@ def test_wrong_number_of_noise_draws_is_refused():
     net, (z_1, _, text, hdmap) = network(), clip(2)
     with pytest.raises(InputError):
         sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(2))
+
+
+def test_cache_write_is_told_128_and_noised_like_its_nearest_neighbour():
+    level = context_level()
+    assert level.t == 128.0
+    assert level.sigma == pytest.approx(0.12992832, abs=1e-8)
+
+
+def test_one_step_is_equation_two():
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    one = net.new_cache(1, 4, 6)
+    z_0 = sample_block(net, [z_1], text, hdmap, one, steps(1))
+    with torch.no_grad():
+        assert furthest(z_0, z_1 - net(z_1, 1000.0, text, hdmap)) < 1e-5

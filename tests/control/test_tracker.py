@@ -245,3 +245,10 @@ def test_perfect_controller_stands_on_the_plan_and_holds_its_last_pose():
     held = perfect.advance(state, plan, 5_000_000)
     assert yaw_of(held.T_world_rig) == pytest.approx(1.0)
     assert perfect.advance(held, plan, 5_100_000).speed_mps == 0.0
+
+
+def test_standing_start_reaches_the_planned_acceleration_and_place():
+    t = np.arange(0, 10, 0.1)
+    states = drive(plan_of(t, t * t, 0, 0), at(), 5.0)
+    assert states[-1].speed_mps == pytest.approx(10.0, abs=0.05)
+    assert states[-1].T_world_rig[0, 3] == pytest.approx(25.0, abs=0.1)

@@ -66,3 +66,9 @@ def test_exit_codes_tell_the_cause():
         e.exit_code
         for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)
     ] == [2, 4, 4, 2, 5]
+
+
+def test_clock_does_not_drift_over_an_hour_at_thirty_hertz():
+    clock = Clock(0, 3_600_000_000, Rates(33_333, 33_333, 33_333))
+    assert clock.n_steps == 3_600_000_000 // 33_333
+    assert [t.t_us for t in clock.ticks()][-1] == clock.n_steps * 33_333

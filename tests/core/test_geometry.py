@@ -18,6 +18,7 @@ from alpasim_plugin.core.geometry import (
     project,
     quat_from_matrix,
     quat_from_yaw,
+    resample,
     se2,
     slerp,
     trajectory_from_poses,
@@ -113,3 +114,8 @@ def test_one_quaternion_is_that_of_many_to_the_last_bit():
     np.testing.assert_array_equal(np.stack([quat_from_matrix(one) for one in matrices]), many)
     assert not np.signbit(quat_from_matrix(np.eye(3))).any()
     assert np.isnan(quat_from_matrix(np.full((3, 3), np.nan))).all()
+
+
+def test_resampling_skips_repeated_points():
+    line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
+    np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, sides_of
+from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, resized, sides_of
 from alpasim_plugin.core.types import CameraSpec, Frame, LensModel
 
 W, H = 320, 240
@@ -108,3 +108,12 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
 def test_a_lens_that_cannot_be_drawn_whole_is_refused(lens):
     with pytest.raises(InputError):
         check_lens(camera(lens))
+
+
+def test_a_camera_of_another_size_sees_the_same_at_its_corners():
+    for lens in (OPENCV, FISHEYE, FTHETA, BACKWARD):
+        spec = camera(lens)
+        ray = np.array([[0.3, -0.2, 1.0], [-0.5, 0.1, 1.0]])
+        whole, _ = pixels_of(spec, ray)
+        half, _ = pixels_of(resized(spec, W // 2, H // 2), ray)
+        np.testing.assert_allclose(half, whole / 2, atol=1e-6)

@@ -116,3 +116,7 @@ def test_road_users_are_where_they_are_at_the_time_of_the_band():
     )
     T, actors = at_share(request, 0.5)
     assert (T[0, 3], actors["a"][0, 3], actors["b"][0, 3]) == pytest.approx((0.5, 5.5, 9.0))
+
+
+def test_a_picture_of_one_row_is_exposed_at_the_end():
+    assert rolling(4, 1, "rows", False).tolist() == [[1.0]]

@@ -315,3 +315,15 @@ def test_a_part_of_the_rows_is_that_part_of_the_picture(rows):
     scene, boxes = street()
     whole = draw_map(scene, PIN, at(), boxes)
     np.testing.assert_array_equal(draw_map(scene, PIN, at(), boxes, rows=rows), whole[rows])
+
+
+def test_concave_area_stays_concave():
+    ring = line((6, -3, 0), (6, 3, 0), (12, 3, 0), (7, 0, 0), (12, -3, 0))
+    image = draw_map(prepare_map(replace(EMPTY, crosswalks=(ring,))), PIN, at(z=3.0))
+
+    def pixel(x, y):
+        return image[int(72 + 128 * 3.0 / x), int(128 - 128 * y / x)]
+
+    assert pixel(6.4, 0.0).any()
+    assert pixel(9.0, 2.4).any()
+    assert not pixel(10.0, 0.0).any()

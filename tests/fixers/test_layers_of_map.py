@@ -184,3 +184,8 @@ def test_labels_are_found_in_any_case():
         "cyclist",
         "other",
     ]
+
+
+def test_each_lobe_of_a_ring_that_crosses_itself_is_filled():
+    ring = np.array([(0, 0), (2, 2), (2, 0), (0, 2.0)])
+    assert sum(triangle.area for triangle in filled(ring)) == pytest.approx(2.0)

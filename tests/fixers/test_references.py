@@ -282,3 +282,14 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
             images, found.of(replace(asked, T_world_camera=T), frame), strict=True
         ):
             np.testing.assert_array_equal(image[band.rows], alone[band.rows])
+
+
+def test_a_wall_seen_from_nearer_is_larger():
+    far, near = at(0.0), at(10.0)
+    out = warp(
+        picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {})
+    )
+    # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
+    expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
+    assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
+    assert (out[..., 3] == VALID).all()

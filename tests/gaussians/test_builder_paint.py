@@ -126,3 +126,18 @@ def test_zebra_bars_lie_along_the_road_across_the_walk():
     assert np.abs(direction[:, 1]).max() < 0.01
     assert len(strokes.start) >= 14
     np.testing.assert_allclose(np.diff(np.sort(middle[:, 1])), 0.9, atol=0.02)
+
+
+def test_edge_known_to_be_bare_stays_bare():
+    lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
+    lanes["r-a1"] = replace(lanes["r-a1"], left_paint="none")
+    _, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
+    assert not at(middle, -LANE_M).any()
+    assert at(middle, LANE_M).any()
+
+
+def test_stop_line_is_wide_and_white():
+    stop = np.array([[20.0, -3.0, 0], [20.0, 0.0, 0]])
+    strokes, _ = strokes_of(make_scenario(LaneMap({}, stop_lines=(stop,)), PATH))
+    assert strokes.width_m.tolist() == [0.4]
+    assert strokes.colour.tolist() == [WHITE]

@@ -133,3 +133,11 @@ def test_one_transform_is_rigid_where_many_are(entry, by):
     far[0, 3] = np.inf
     assert not all_rigid(mirrored[None])
     assert not all_rigid(far[None])
+
+
+def test_a_gaussian_with_two_faults_is_counted_once():
+    data = arrays()
+    data["means"][0] = np.nan
+    data["quats"][0] = 0
+    _, report = GaussianCloud.cleaned(**data)
+    assert sum(report.dropped.values()) == 1

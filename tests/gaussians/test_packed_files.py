@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians import read_ply
+from alpasim_plugin.gaussians import GaussianCloud, read_ply
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
     _parity,
@@ -297,3 +297,17 @@ def test_unknown_form_lists_the_known_ones(tmp_path):
     (tmp_path / "a.gltf").write_bytes(b"PK\x03\x04....")
     with pytest.raises(InputError):
         read_gaussians(tmp_path / "a.gltf")
+
+
+def test_chunks_that_do_not_cover_the_gaussians_are_refused(tmp_path):
+    path = write_compressed(tmp_path / "a.compressed.ply", 257, 1, (0, 0, 0, 0))
+    with pytest.raises(InputError):
+        read_compressed_ply(path)
+
+
+def test_turning_axes_turns_the_ellipsoids(tmp_path):
+    path = write_spz(tmp_path / "a.spz", 3, 6, 0, body_streams(3, 6, 0))
+    flip = np.diag([1.0, -1.0, -1.0])
+    turned = read_spz(path)
+    before, after = (GaussianCloud(*one[:5]).covariances() for one in (as_stored(turned), turned))
+    np.testing.assert_allclose(after, flip @ before @ flip, rtol=1e-5, atol=1e-12)

@@ -204,3 +204,32 @@ def test_other_cameras_see_the_same_lane(camera):
     one = LaneCamera(scenario_with(camera))  # type: ignore[arg-type]
     plan = look(one, ROAD.image(camera, ROAD.pose(0.0, 0.4)), camera=camera)  # type: ignore[arg-type]
     assert plan.debug["lane_offset_m"] == pytest.approx(-0.4, abs=0.12)
+
+
+def test_route_half_a_lane_off_does_not_pull_the_car_out_of_its_lane():
+    off, on = (close_loop(policy(), ROAD, 12.0, 3.5, route_off_m=r) for r in (0.9, 0.0))
+    assert np.abs(off.offset_m - on.offset_m).max() < 0.15
+
+
+@pytest.mark.slow
+def test_slower_car_is_followed_at_a_distance():
+    drive = close_loop(
+        policy(),
+        lambda t: BusyRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)),
+        10.0,
+        7.0,
+    )
+    gap = 30.0 + 6.0 * 6.9 - 2.25 - (drive.s_m[-1] + 1.4 + 4.855 / 2)
+    assert gap > 4.0
+    assert drive.speed_mps[-1] == pytest.approx(6.0, abs=1.5)
+
+
+@pytest.mark.slow
+def test_car_in_the_next_lane_is_passed():
+    drive = close_loop(policy(), BusyRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0)
+    assert drive.speed_mps.min() > 8.5
+
+
+def test_camera_that_sees_no_road_is_refused():
+    with pytest.raises(PolicyError):
+        LaneCamera(scenario_with(pinhole_camera(pitch_deg=-40.0)))

@@ -206,3 +206,12 @@ def test_wrong_frame_is_refused():
     policy = Learned(scenario_with())
     with pytest.raises(PolicyError, match=r"shape \(10, 10, 3\)"):
         policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
+
+
+def test_command_says_nothing_about_the_place_in_the_lane():
+    for after_m in (3.0, 25.0):
+        words = {
+            route_command(route_with_turn(after_m, 12.0, True, lateral_m))
+            for lateral_m in (-1.5, -0.3, 0.0, 1.5)
+        }
+        assert len(words) == 1

@@ -113,3 +113,12 @@ def test_file_background_replaces_the_street_and_keeps_actors_and_sky(scenario, 
     assert frame.alpha.max() > 0.9
     without = renderer.render(replace(request(filed), actors={}))
     assert np.any(without.rgb != frame.rgb)
+
+
+def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario):
+    r = request(scenario)
+    moved = replace(
+        r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]])
+    )
+    renderer = make_renderer("clean", scenario)
+    np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)

@@ -285,3 +285,18 @@ def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none()
         np.array_equal(a.camera.T_camera_world, b.camera.T_camera_world)
         for a, b in zip(moved, again, strict=True)
     )
+
+
+def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(
+    fitted,
+):
+    on_path, beside = error_db(fitted, 0.0), error_db(fitted, 3.0)
+    assert on_path > 19
+    assert on_path > beside + 1
+
+
+def test_recipe_has_the_views_depth_error_and_pose_error_of_the_scenario():
+    log_s = 1.4
+    recipe = recipe_of(street(replace(FITTED, **DAMAGE)))
+    assert recipe.splat.views == round(20.0 * log_s)
+    assert (recipe.range_error, recipe.pose_error_m) == (0.3, 0.1)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.report.birdseye import path_data, scene_view
+from evaluators.report.rollouts import events_of
 
 VARIANTS = {("a", "p"): (0, 0)}
 
@@ -132,3 +133,24 @@ def test_event_that_no_step_shows_is_listed_without_a_place():
     view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, VARIANTS)
     assert view.marks[0].x is None
     assert view.marks[0].text == "a \u00b7 seed 0: off-road at a time that no step shows"
+
+
+def test_far_from_the_origin_costs_no_precision():
+    s = np.linspace(0, 60, 30)
+    rollout = Rollout("a", "p", "s", 0, "ok")
+    views = []
+    for offset in (0.0, 5_412_345.25):
+        x, y = (s + offset).tolist(), (0.05 * s + offset).tolist()
+        views.append(
+            scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, VARIANTS)
+        )
+    assert views[0] == views[1]
+
+
+def test_event_during_warm_up_does_not_give_the_time():
+    rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
+    off = [1.0] * 5 + [0.0] * 10 + [1.0] * 5
+    relevant = [0.0] * 8 + [1.0] * 12
+    series = {rollout.cell: series_of([0.0] * 20, [0.0] * 20, offroad=off, eval_relevant=relevant)}
+    (event,) = events_of(rollout, series)
+    assert event.t_s == pytest.approx(1.5)

@@ -77,3 +77,8 @@ def test_a_rolling_shutter_exposes_rows_and_road_users_at_their_own_times(
     assert request.exposure.actors_start["new"][0, 3] == 5.0
     assert request.exposure.share.shape == (camera.height, 1)
     assert request.exposure.share[[0, -1], 0].tolist() == [0.0, 1.0]
+
+
+def test_every_frame_but_the_last_is_taken_when_all_rates_agree(straight_road):
+    # No drive follows the last instant, so nobody would look at its frame.
+    assert rendered_steps(straight_road, Rates(), [SensorSpec("front")]) == list(range(30))

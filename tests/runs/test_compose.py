@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -11,7 +12,8 @@ from alpasim_plugin import make_renderer
 from alpasim_plugin.block_fixers.chunk import ChunkRenderer
 from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.parts import resolve_renderer, spec
+from alpasim_plugin.core.parts import resolve, resolve_renderer, spec
+from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from scenarios.suite import expand
@@ -141,3 +143,25 @@ def test_a_bad_setting_is_named_with_the_nearest(override, found, do):
     assert found in str(caught.value)
     assert do in caught.value.hint
     assert "--set fixer." in caught.value.message
+
+
+def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path):
+    path = tmp_path / "net.safetensors"
+    path.write_bytes(b"one")
+    first = keys(("onefixer-dit-tiny",), (f"weights.dit={path}",))
+    path.write_bytes(b"one")
+    assert keys(("onefixer-dit-tiny",), (f"weights.dit={path}",)) == first
+    path.write_bytes(b"two")
+    assert keys(("onefixer-dit-tiny",), (f"weights.dit={path}",)) != first
+    fixer = resolve("fixer", "onefixer-dit-tiny", (f"weights.dit={path}",))
+    assert dict(fixer.files) == {str(path): file_sha256(path)}
+    json.dumps(fixer.as_dict())
+
+
+def test_settings_for_a_fixer_that_is_not_there_are_refused():
+    with pytest.raises(InputError):
+        plan(("3dgs",), ("mode=chunk",))
+    with pytest.raises(InputError):
+        plan(("3dgs", "identity+clean"), ("identity:mode=chunk",))
+    with pytest.raises(InputError):
+        plan(("3dgs", "identity+clean"), ("3dgs:mode=chunk",))

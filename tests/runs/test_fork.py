@@ -10,10 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.runs.fork import Change, fork_rollout
+from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import log_trace
@@ -151,3 +152,15 @@ def test_a_scenario_that_has_changed_is_refused(root, past, tmp_path):
     write_run_json(tmp_path, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)
+
+
+def test_two_policies_share_a_camera_at_the_shorter_period(straight_road):
+    first, then = (
+        (SensorSpec("front"), SensorSpec("left", 200_000)),
+        (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear")),
+    )
+    assert merge_sensors(first, then, straight_road) == (
+        SensorSpec("front", 50_000),
+        SensorSpec("left"),
+        SensorSpec("rear"),
+    )

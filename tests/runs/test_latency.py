@@ -48,3 +48,11 @@ def test_a_fixer_slower_than_the_camera_falls_behind():
     queue.submit(late, 200_000, wall_us=0)
     assert queue.active(449_999) is None
     assert queue.active(450_000) is late
+
+
+def test_the_fixer_counts_only_where_asked_for():
+    queue = PlanQueue(Latency("measured"))
+    queue.frames(0, {"fix": 150.0})
+    now = plan(0)
+    queue.submit(now, 0, wall_us=5_000)
+    assert queue.active(5_000) is now

@@ -255,3 +255,10 @@ def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_
         refine_video(files, Inverting, stop)
     assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
     assert refine_video(files, Inverting).frames == 20
+
+
+def test_variable_frame_times_are_kept(tmp_path):
+    times = [100, 140, 147, 1600, 1601, 1700]
+    source = video(tmp_path / "in.mp4", pictures(6), times=times, base=Fraction(1, 1000))
+    refine_video(RefineFiles(source, tmp_path / "out.mp4"), Inverting)
+    assert read(tmp_path / "out.mp4")[0] == [Fraction(t, 1000) for t in times]

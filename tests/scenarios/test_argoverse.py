@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import shapely
 
+from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios.argoverse import LABELS, PAINTS, read_argoverse
 from tests.scenarios.make_argoverse import (
     CAR,
     ORIGIN,
     STEP_NS,
     T0_NS,
+    TRACKS,
     cuboids,
     lane,
     line,
@@ -152,3 +154,21 @@ def test_opposite_neighbour_is_no_neighbour(tmp_path):
         None,
         None,
     )
+
+
+def test_cuboids_turn_with_the_ego(tmp_path):
+    ego = poses()
+    half = np.radians(90) / 2
+    ego["qw"][:], ego["qz"][:] = np.cos(half), np.sin(half)
+    rows = cuboids([("a", "BUS", (12.0, 2.5, 3.0), [3], place(0.0, 0.0, 1.5))], ego)
+    rows["tx_m"], rows["ty_m"], rows["tz_m"] = [7.0], [2.0], [1.0]
+    actor = read_argoverse(write_argoverse(tmp_path / "x", ego=ego, annotations=rows)).actors[0]
+    np.testing.assert_allclose(actor.track.xyz[0], [3.0 - 2.0, 7.0, 1.33], atol=1e-8)
+    assert yaw_from_quat(actor.track.quat[0]) == pytest.approx(np.pi / 2)
+
+
+def test_rows_of_the_ego_are_no_actor(tmp_path):
+    rows = cuboids([*TRACKS, ("ego", "EGO_VEHICLE", (4.877, 2.0, 1.473), range(21), ORIGIN)])
+    assert [
+        a.actor_id for a in read_argoverse(write_argoverse(tmp_path / "x", annotations=rows)).actors
+    ] == ["parked", "walker"]

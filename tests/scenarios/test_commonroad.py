@@ -461,3 +461,9 @@ def test_unknown_ego(tmp_path):
     error = refused(tmp_path, ego="99")
     assert "no moving obstacle '99'" in error.message
     assert "choose the ego among 11, 12, 13" in error.hint
+
+
+def test_another_ego_can_be_asked_for(tmp_path):
+    log = read(tmp_path, ego="12")
+    assert [a.actor_id for a in log.actors] == ["11", "13"]
+    assert log.notes[0] == "ego is the recorded vehicle 12, as asked"

@@ -386,3 +386,22 @@ def test_cars_of_another_simulator_drive_in_the_lanes(shared_data):
         ahead = [abs((np.arctan2(s[1], s[0]) - yaw + np.pi) % (2 * np.pi) - np.pi) for s in steps]
         best.append(min(d for d, a in zip(near, ahead, strict=True) if a < 0.3))
     assert max(best) < 0.6  # some lane there runs its way, and it is in its middle
+
+
+def test_with_left_hand_traffic_lanes_run_the_other_way():
+    found = lanes_of(road(left=lane(1), right=lane(-1), more='rule="LHT"'))
+    np.testing.assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12
+    )  # its left is the road's outside
+    np.testing.assert_allclose(found.lanes["1.0.1"].right[:, 1], 0.0, atol=1e-12)
+
+
+def test_paint_of_marks():
+    mark = '<roadMark sOffset="0" type="{}" color="{}"/>'
+    middle = (
+        f'<center><lane id="0" type="none">{mark.format("solid solid", "yellow")}</lane></center>'
+    )
+    sides = f"{middle}<right>{lane(-1, more=mark.format('broken', 'white'))}</right>"
+    one = lanes_of(road(sections=f'<laneSection s="0">{sides}</laneSection>')).lanes["1.0.-1"]
+    assert (one.left_paint, one.right_paint) == ("double_yellow", "dashed_white")

@@ -169,3 +169,39 @@ def test_hash_depends_on_the_bytes_of_data_files(tmp_path):
     assert first.background.path == str(tmp_path / "bg.ply")
     (tmp_path / "bg.ply").write_bytes(b"ply two")
     assert load_scenario(path).content_hash != first.content_hash
+
+
+def test_a_variations_block_asks_for_it_at_seed_0_too(tmp_path):
+    scene = load_scenario(write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n"))
+    assert list(scene.varied) == ["actors.lead.s_m"]
+    assert scene.varied["actors.lead.s_m"] == (40, pytest.approx(measures(scene)["place"]))
+
+
+def test_jitter_switched_off_gives_the_numbers_in_the_file(tmp_path):
+    path = write(
+        tmp_path,
+        "jitter: {length: 0, curvature: 0, lane_width: 0, speed: 0, position_m: 0, time_us: 0}\n",
+    )
+    assert measures(load_scenario(path, seed=9)) == pytest.approx(
+        {"length": 100.0, "width": 3.5, "place": 40.0}
+    )
+    assert (
+        load_scenario(path, seed=9).ego_log.xyz.tobytes()
+        == load_scenario(path, seed=8).ego_log.xyz.tobytes()
+    )
+
+
+def test_adding_an_actor_does_not_change_the_others(tmp_path):
+    one = load_scenario(write(tmp_path), seed=2)
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        BASE.replace(
+            "actors:\n", "actors:\n  - {kind: oncoming, id: new, s_m: 100, speed_mps: 8}\n"
+        )
+    )
+    two = load_scenario(path, seed=2)
+    assert (
+        one.lane_map.lanes["s0_f0"].centre.tobytes() == two.lane_map.lanes["s0_f0"].centre.tobytes()
+    )
+    by_id = {a.actor_id: a for a in two.actors}
+    assert one.actors[0].track.xyz.tobytes() == by_id["lead"].track.xyz.tobytes()

@@ -277,3 +277,11 @@ def test_stripped_rails_leave_the_centres(tmp_path):
     assert lane.left is None
     assert lane.right is None
     assert len(lane.centre) > 2
+
+
+def test_a_segment_of_exactly_two_metres_is_split_as_in_alpasims_loader(tmp_path):
+    rows = [{"key": key("L"), "lane": {"left_rail": rail(1.0, 61), "right_rail": rail(-1.0, 61)}}]
+    scene = read_usdz_scene(
+        write(tmp_path / "a.usdz", changed(clipgt__lane_dot_parquet=parquet(rows)))
+    )
+    assert len(scene.lane_map.lanes["L"].centre) == 121

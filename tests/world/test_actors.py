@@ -240,3 +240,19 @@ def test_an_outlook_ends_with_the_track_and_with_the_drivers_way():
         actors.step(t, FAR_AWAY)
     assert set(actors.forecast().at(900_000)) == {"replayed", "driver"}
     assert set(actors.forecast().at(1_100_000)) == set()
+
+
+def test_one_pose_track_is_there_at_its_instant():
+    one = Trajectory(
+        np.array([200_000]), np.array([[1.0, 2.0, 0.75]]), quat_from_yaw(np.array([0.3]))
+    )
+    actors = Actors([Actor("a", "car", BOX, one)], Vehicle(), 0)
+    assert actors.step(100_000, FAR_AWAY) == {}
+    np.testing.assert_allclose(actors.step(200_000, FAR_AWAY)["a"][:3, 3], [1.0, 2.0, 0.75])
+
+
+def test_reset_gives_the_same_drive_again():
+    actors = Actors([idm("a", 0, 10), idm("b", -15, 12)], Vehicle(), 500_000, ground=flat())
+    first = run(actors, ego_at(70.0), 6_000_000)
+    actors.reset()
+    assert run(actors, ego_at(70.0), 6_000_000) == first

@@ -161,3 +161,7 @@ def test_the_leaders_of_many_drivers_are_those_of_each():
     assert met > 100
     none, nobody = np.zeros(0), np.zeros(0, dtype=np.int64)
     assert find_leaders(lines, nobody, none, none, NO_BODIES, none, nobody) == []
+
+
+def test_oncoming_leader_counts_as_standing():
+    assert find_leader(ROAD, 10.0, 0.95, car(40, 0, np.pi, 8.0)).speed_mps == 0.0

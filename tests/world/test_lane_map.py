@@ -172,3 +172,13 @@ def test_centre_lies_halfway_between_edges_with_different_numbers_of_points():
     np.testing.assert_allclose(centre[:, 2], 0.5, atol=1e-12)
     np.testing.assert_allclose(centre[[0, -1], 0], [0, 50])
     assert np.diff(centre[:, 0]).max() <= 2.0 + 1e-9
+
+
+def test_long_segments_are_found_by_their_middle():
+    assert LaneIndex(make(straight("a", 0, 400))).within(np.array([203.3, 3.0, 0.0]), 3.1) == ("a",)
+
+
+def test_path_ends_with_the_map():
+    path = LaneIndex(make(straight("a", 0, 20, successors=("gone",)))).path_ahead("a", 75.0)
+    assert path.lane_ids == ("a",)
+    assert arc_lengths(path.xyz)[-1] == pytest.approx(20.0)

@@ -193,3 +193,30 @@ def test_any_winding_road_is_sound(bends, forward, backward, shoulder, heading):
         assert (
             polygon(lane).is_valid or not polygon(lane).is_simple
         )  # a lane may cross itself after a full turn
+
+
+def test_oncoming_lane_runs_the_other_way_on_the_left():
+    lane_map = build_road([Curve(30)], Profile(1, 1, lane_width_m=3.0)).lane_map
+    np.testing.assert_allclose(lane_map.lanes["s0_f0"].centre[[0, -1], :2], [[0, -1.5], [30, -1.5]])
+    np.testing.assert_allclose(lane_map.lanes["s0_b0"].centre[[0, -1], :2], [[30, 1.5], [0, 1.5]])
+
+
+def test_t_junction_closes_the_missing_side():
+    road = build_road(
+        [Curve(40), Intersection("left", ("left", "right")), Curve(40)], Profile(1, 1)
+    )
+    assert not any("straight" in i for i in road.lane_map.lanes)
+    assert_sound(road.lane_map)
+    borders = shapely.union_all([shapely.LineString(e[:, :2]) for e in road.lane_map.road_edges])
+    beyond = shapely.LineString([(45.0, 0.0), (80.0, 0.0)])  # straight on at the T
+    assert borders.intersects(beyond)
+
+
+def test_merging_lane_ends_exactly_on_its_neighbour():
+    road = build_road([Curve(30), LaneTaper("merge", 60), Curve(30)], Profile(3, 0))
+    slant, after = road.lane_map.lanes["s1_merge"], road.lane_map.lanes["s2_f1"]
+    assert slant.successors == ("s2_f1",)
+    assert road.lane_map.lanes["s1_f1"].successors == ("s2_f1",)
+    assert slant.right is not None
+    assert after.right is not None
+    assert (slant.right[-1] == after.right[0]).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2
+from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
 from alpasim_plugin.core.types import Route, Trajectory
 from alpasim_plugin.world.route import (
     LaneIndex,
@@ -16,7 +16,7 @@ from alpasim_plugin.world.route import (
     route_from_log,
     route_in_rig,
 )
-from tests.world.small_maps import arc, make, straight
+from tests.world.small_maps import FAR, arc, make, straight
 
 
 def drive(x, y=None, z=0.0):
@@ -134,3 +134,48 @@ def test_skidding_ego_is_not_sent_to_a_far_stretch_that_runs_its_way():
 def test_ego_against_the_route_sees_the_route_run_backwards():
     seen = route_in_rig(Route(np.array([[0.0, 0, 0], [200.0, 0, 0]])), se2(100.0, 0.0, np.pi))
     assert seen[3, 0] == pytest.approx(-3 * 80 / 19)
+
+
+def test_extension_leaves_the_log_without_a_kink():
+    x = np.arange(5.0, 60.0, 0.5)
+    route = route_from_log(ROAD, drive(x, np.full_like(x, 0.9)))
+    heading = np.arctan2(*np.diff(route.xyz[:, :2], axis=0).T[::-1])
+    assert np.abs(np.diff(heading)).max() < 0.03
+    assert np.abs(heading).max() < 0.08
+
+
+def test_oncoming_lanes_are_never_the_route():
+    assert route_from_log(ROAD, drive(np.arange(60.0, 5.0, -0.5))).lane_ids == ()
+
+
+def test_route_ends_where_the_map_ends():
+    route = route_from_log(make(straight("a", 0, 40)), drive(np.arange(5.0, 30.0)))
+    assert route.xyz[-1, 0] == pytest.approx(40.0)
+
+
+def test_far_maps_give_the_same_route():
+    x = np.arange(5.0, 60.0, 0.5)
+    log = drive(x, 0.3 * np.sin(x / 10))
+    moved = Trajectory(log.t_us, log.xyz + FAR, log.quat)
+    near, far = (
+        route_from_log(ROAD, log),
+        route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved),
+    )
+    assert near.lane_ids == far.lane_ids
+    np.testing.assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
+
+
+def test_rows_behind_the_end_are_nan_and_only_those():
+    seen = route_in_rig(
+        Route(np.array([[0.0, 0, 0], [30.0, 0, 0]])), se2(10.0, 0.0, 0.0), n=10, spacing_m=4.0
+    )
+    assert np.isfinite(seen[:6]).all()
+    assert np.isnan(seen[6:]).all()
+
+
+def test_way_points_lie_level_in_a_pitched_rig():
+    pitch = np.array([np.cos(0.05), 0.0, -np.sin(0.05), 0.0])
+    seen = route_in_rig(
+        Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch)
+    )
+    assert (seen[:, 2] == 0).all()

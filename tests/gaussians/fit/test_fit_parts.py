@@ -275,3 +275,9 @@ def test_the_schedule_stretches_with_the_steps():
 def test_a_recipe_outside_its_range_is_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):
         replace(SplatRecipe(), **change)
+
+
+def test_where_the_cap_leaves_room_for_one_the_strongest_pull_wins():
+    model, adam, gradients, recipe = density_case(cap=5)
+    densify(model, adam, gradients, recipe, 50.0, stream("t", 0, "split"))
+    assert model.node.tolist() == [0, 0, 0, 1, 1]
