@@ -307,7 +307,7 @@ def _lens(name: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
 
 
 def _rows(data: bytes) -> Iterator[list[str]]:
-    for line in data.decode("utf-8").splitlines():
+    for line in data.decode("utf-8-sig").splitlines():
         if line.strip() and not line.startswith("#"):
             yield line.split()
 
@@ -319,7 +319,7 @@ def _cameras_txt(data: bytes) -> Iterator[tuple[int, Lens]]:
 
 def _images_txt(data: bytes) -> Iterator[_Image]:
     """Yield the images. Below each stands a line of points, which may be empty or left out."""
-    for line in data.decode("utf-8").splitlines():
+    for line in data.decode("utf-8-sig").splitlines():
         words = line.split()
         if line.startswith("#") or (len(words) % 3 == 0 and all(map(_is_number, words))):
             continue

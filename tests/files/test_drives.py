@@ -393,3 +393,16 @@ def test_a_walk_around_an_object_without_metres_has_no_speed(tmp_path):
     drive = read_source(folder, photographs=False)
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     check_motion(drive, place(drive, nothing))
+
+
+def test_text_of_windows_is_read(tmp_path):
+    model = tmp_path / "a/sparse/0"
+    colmap(model, [f"{i}.png" for i in range(13)])
+    for file in model.glob("*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert along(read_source(tmp_path / "a", photographs=False)) == STRAIGHT
+    folder = transforms(tmp_path / "b", [f"{i}.png" for i in range(13)])
+    file = folder / "transforms.json"
+    file.write_text(file.read_text().replace("images/", r".\\images\\"))
+    first = read_source(folder, photographs=False).pictures[0].file
+    assert first == folder / "images/0.png"

@@ -259,3 +259,16 @@ def test_flags_and_extensions_of_an_spz(tmp_path, version):
     ):
         with pytest.raises(InputError, match=found):
             opened(write_spz(path, version, flags, extensions))
+
+
+def test_what_mesh_and_point_editors_write_is_read(tmp_path):
+    plain, _ = opened(model(tmp_path / "a.ply"))
+    file = model(tmp_path / "b.ply")
+    faces = b"element face 0\nproperty list uchar int vertex_indices\nend_header"
+    data = file.read_bytes().replace(b"end_header", faces)
+    for name in (b"opacity", b"f_dc_", b"scale_", b"rot_"):  # as CloudCompare names them
+        data = data.replace(b"property float " + name, b"property float scalar_" + name)
+    file.write_bytes(data)
+    cloud, report = opened(file)
+    assert np.array_equal(cloud.scales, plain.scales)
+    assert not report.notes

@@ -251,7 +251,8 @@ def _check_elements(header: PlyHeader) -> None:
     """Refuse elements that may change what is drawn."""
     for element in header.elements:
         linear = element.name == "color_space" and read_ply_element(header, element.name)[0][0]
-        if linear or not (element.name.startswith("vertex") or element.name in _BESIDE):
+        known = element.name.startswith("vertex") or element.name in _BESIDE
+        if linear or (element.count and not known):
             found = "linear colours" if linear else f"{element.count} rows of unknown meaning"
             raise InputError(
                 f"{header.path}, element {element.name!r}: {found}",
@@ -474,14 +475,15 @@ def _with_property(
     name, count, fields = element
     if words[1] == "list" or fields is None:
         return name, count, None
+    known_as = words[2].removeprefix("scalar_")  # which CloudCompare puts before every name
     if (
         len(fields) >= MAX_PROPERTIES
         or words[1] not in _SCALAR_CODES
         or not byte_order
-        or any(words[2] == known for known, _ in fields)
+        or any(known_as == known for known, _ in fields)
     ):
         raise _bad_line(path, number, " ".join(words))
-    return name, count, [*fields, (words[2], byte_order + _SCALAR_CODES[words[1]])]
+    return name, count, [*fields, (known_as, byte_order + _SCALAR_CODES[words[1]])]
 
 
 def _place(

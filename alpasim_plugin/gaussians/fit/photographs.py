@@ -379,6 +379,7 @@ def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     name = frame.get(key)
     if not isinstance(name, str):
         raise InputError(f"{where}, {key}: {name!r}", "name a file, relative to the folder")
+    name = name.replace("\\", "/")  # of a file that was written under Windows
     path = folder / name
     if not path.suffix and os.path.isfile(
         folder / f"{name}.png"
