@@ -87,7 +87,7 @@ class Lookup(NamedTuple):
         sizes: ``(A, 3)`` length, width and height, metres.
         free_share: A recorded surface that is at least this share of a point's distance away does
             not hide the point. Infinite: only one that agrees with the point does not.
-        seen: Where the view sees the boxes; None: not yet known.
+        seen: Where the view sees the boxes.
     """
 
     depth: F32
@@ -100,7 +100,7 @@ class Lookup(NamedTuple):
     T_then_box: F64
     sizes: F64
     free_share: float
-    seen: SeenBoxes | None = None
+    seen: SeenBoxes
 
 
 def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf) -> U8:
@@ -165,7 +165,7 @@ def place_boxes(
     present = [boxes[name] for name in names]
     lengths = [(box.length_m, box.width_m, box.height_m) for box in present]
     sizes = np.array(lengths).reshape(-1, 3)
-    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, shape)
+    seen = see_boxes(K, T_world_camera, T_box_world, sizes, shape)
     return PlacedBoxes(names, T_box_world, sizes, seen)
 
 
@@ -190,9 +190,6 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     depth_then = np.ascontiguousarray(lookup.depth_then)
     _coordinates(depth, depth_then, A, b, lookup.free_share, x, y, held)
     seen = lookup.seen
-    if seen is None:
-        boxes = lookup.T_box_world, lookup.sizes
-        seen = _seen_boxes(lookup.K, lookup.T_world_camera, *boxes, shape)
     to_then: F64 = project @ lookup.T_then_box
     shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
     for i in reversed(shown):  # of two boxes the first counts
@@ -302,9 +299,10 @@ class SeenBoxes(NamedTuple):
     pixels: I64  # (A, 4) first row, last, first column, last; the last ones are not included
 
 
-def _seen_boxes(
+def see_boxes(
     K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]
 ) -> SeenBoxes:
+    """Return where a camera of ``shape`` rows and columns may see boxes ``(A, 3)``."""
     if not len(sizes):
         return SeenBoxes(
             np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64)

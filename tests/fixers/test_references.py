@@ -30,6 +30,7 @@ from alpasim_plugin.fixers.warp import (
     Lookup,
     RecordedImage,
     WarpTarget,
+    see_boxes,
     warp,
     warp_coordinates,
 )
@@ -143,17 +144,10 @@ def hard_case(seed):
     T_then[rng.random(count) < 0.3] = np.nan
     sizes = rng.uniform(0.3, 6.0, (count, 3))
     free_share = float(rng.choice([0.0, 0.4, np.inf]))
+    T_box_world = inverse(T_now) if count else T_now
+    seen = see_boxes(K, view, T_box_world, sizes, depth.shape)
     return Lookup(
-        depth,
-        K,
-        view,
-        K,
-        inverse(other),
-        then,
-        inverse(T_now) if count else T_now,
-        T_then,
-        sizes,
-        free_share,
+        depth, K, view, K, inverse(other), then, T_box_world, T_then, sizes, free_share, seen
     )
 
 
