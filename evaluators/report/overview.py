@@ -245,9 +245,7 @@ class Overview:
 
 def overview_of(run: Run) -> Overview:
     """Lay out the first screen of a run."""
-    table = run.summary.get("outcomes") or {}
-    if not table or any("endings" not in entry for entry in table.values()):
-        table = outcome_table(run.rollouts)  # a folder of an earlier version
+    table = run.summary.get("outcomes") or outcome_table(run.rollouts)
     decision = read_decision(run.folder)
     differences = {} if decision is not None else differences_of(run)
     rows = tuple(_row(run, name, entry, differences) for name, entry in table.items())
@@ -272,30 +270,16 @@ def variant_name(run: Run, name: str) -> str:
     return name.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else name
 
 
-def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
-    """Give the tone of one paired difference, or where no verdict is stated whether its interval
-    excludes zero.
+def tone_of(entry: Mapping[str, Any]) -> Tone:
+    """Give the tone of one metric of ``summary.json``'s ``paired``.
 
     Neutral means non-inferior: no worse than its margin, and not shown to be better.
-
-    Args:
-        entry: One metric of ``summary.json``'s ``paired``.
-        direction: "lower", "higher" or "none": which way is better.
     """
-    stated = str(entry.get("verdict") or "").lower()
-    if stated:
-        shown = entry.get("difference")
-        if shown == "better" or (shown == "worse" and stated != "non-inferior"):
-            return "better" if shown == "better" else "worse"
-        known: dict[str, Tone] = {"worse": "worse", "better": "better", "undecided": "unclear"}
-        return known.get(stated, "neutral")
-    difference = finite(entry.get("diff"))
-    bounds = interval(entry.get("ci95"), difference)
-    if difference is None or bounds is None or bounds[0] <= 0.0 <= bounds[1]:
-        return "unclear"
-    if direction not in ("lower", "higher"):
-        return "neutral"
-    return "worse" if (difference > 0) == (direction == "lower") else "better"
+    stated, shown = entry.get("verdict"), entry.get("difference")
+    if shown == "better" or (shown == "worse" and stated != "non-inferior"):
+        return "better" if shown == "better" else "worse"
+    known: dict[str, Tone] = {"worse": "worse", "undecided": "unclear"}
+    return known.get(str(stated), "neutral")
 
 
 def differences_of(run: Run) -> dict[str, Difference]:
@@ -318,7 +302,7 @@ def differences_of(run: Run) -> dict[str, Difference]:
         key, entry = entries[number]
         if key in found or (of_renderers and number >= of_renderers):
             continue
-        tone = tone_of(entry, metric.direction)
+        tone = tone_of(entry)
         if tone in ("worse", "better") and (number, metric_name) not in shown:
             tone = "unclear"
         bounds = interval(entry.get("ci95"), float(entry["diff"]))

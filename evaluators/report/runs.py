@@ -80,10 +80,10 @@ class RunEntry:
 
     @property
     def outcome(self) -> Mapping[str, Any]:
-        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or else the summary."""
+        """Give ``n_rollouts`` and ``n_failed``, from ``run.json``."""
         if self.state != "finished":
             return {}
-        stated: Mapping[str, Any] = self.info.get("outcome") or self.summary.get("failures") or {}
+        stated: Mapping[str, Any] = self.info.get("outcome") or {}
         return stated
 
     @property
@@ -165,7 +165,7 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
         return RunEntry(folder, "damaged", f"{ROLLOUTS}: missing", info)
     entry = RunEntry(folder, "finished", "", info)
     try:
-        if with_summary or "outcome" not in info:
+        if with_summary:
             entry.summary  # noqa: B018 - read now, so that damage is a fact of the entry
     except InputError as error:
         return RunEntry(folder, "damaged", f"{SUMMARY}: {error.message}", info)

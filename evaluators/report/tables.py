@@ -147,10 +147,9 @@ def pair_rows(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[
     """
     rows = []
     for variant, pairs in pair_tables(summary):
-        for name in known.ordered(pairs):
-            stats = (summary.get("metrics") or {}).get(variant, {}).get(name) or {}
-            # older summaries state unit and direction in metrics only
-            rows.append(_pair_row(variant, known.shown(name), stats | (pairs[name] or {})))
+        rows += [
+            _pair_row(variant, known.shown(name), pairs[name]) for name in known.ordered(pairs)
+        ]
     return rows
 
 
@@ -172,8 +171,8 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
     if p is not None:
         text = "< 0.001" if p < 0.001 else fixed(p, 3)
         p_cell = Cell(text, str(entry.get("test") or ""), sort=p)
-    tone = tone_of(entry, str(entry.get("direction", "none")))
-    verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
+    tone = tone_of(entry)
+    verdict = str(entry.get("verdict"))
     margin = finite(entry.get("margin"))
     hint = ""
     if margin is not None and entry.get("direction") != "none":

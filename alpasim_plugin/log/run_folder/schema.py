@@ -50,14 +50,13 @@ LOG_NAME = "rollout.asl"
 FRAMES_NAME = "frames.jsonl"  # facts of every camera frame
 DEBUG_NAME = "debug.jsonl"  # what the policy reports about itself with its plans
 OUTPUT_NAME = "output.log"  # what its parts printed
-STRIP_NAME = "strip.jpg"  # a few frames, of earlier versions
 VIDEO_NAME = "front.mp4"
 STEPS_NAME = "steps.parquet"  # its rows of the run's table
 WHY_NAME = "why.html"
 SAME_POSES = "same_poses.json"  # of a failure: what the run's other renderers show
 MANIFEST = "manifest.json"  # written last, with the digests of DRIVEN and DERIVED
 # Only driving makes them.
-DRIVEN = (LOG_NAME, FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME, STRIP_NAME, VIDEO_NAME)
+DRIVEN = (LOG_NAME, FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME, VIDEO_NAME)
 DERIVED = (STEPS_NAME,)  # made from the log
 
 
