@@ -66,13 +66,14 @@ OBSTACLE_RANGE_M = 48.0
 
 
 class LaneCamera(Policy):
-    """Keep the lane that the paint shows and stop for what stands on it.
+    """Keep the lane that lane markings show and stop for what stands on it.
 
     It reads the newest frame of one camera, its own motion, and the route. The lateral position
-    comes from the paint: the route's weight is its variance against the paint's, which near the car
-    is below one percent. The route decides which lane, where to turn, and everything when no paint
-    is seen for long. ``Plan.debug["mode"]`` names the source of the plan: ``lane`` (paint in this
-    frame), ``memory`` (the estimate of earlier frames), ``route`` or ``straight`` (neither).
+    comes from lane markings: the route's weight is its variance against theirs, which near the car
+    is below one percent. The route decides which lane, where to turn, and everything when no lane
+    marking is seen for long. ``Plan.debug["mode"]`` names the source of the plan: ``lane`` (lane
+    markings in this frame), ``memory`` (the estimate of earlier frames), ``route`` or ``straight``
+    (neither).
     """
 
     def __init__(self, scenario: Scenario) -> None:

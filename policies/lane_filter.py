@@ -3,8 +3,8 @@
 In the rig frame the lane's centre is ``y(x) = offset + heading x + curvature x^2 / 2 + bend x^3 /
 6`` (the cubic of a clothoid for small angles; Dickmanns and Mysliwetz 1992) and its two painted
 borders lie half a width to either side, measured across the lane. All five numbers are carried with
-their covariance: the ego's own motion predicts them, every point of paint near a border corrects
-them, and a frame with much paint therefore counts for more than a frame with little.
+their covariance: the ego's own motion predicts them, every point of a marking near a border
+corrects them, and a frame with many points therefore counts for more than a frame with little.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ class LaneState:
 
     mean: F64  # (5,): offset m, heading rad, curvature 1/m, bend 1/m^2, width m
     cov: F64  # (5, 5)
-    left_m: float = 0.0  # metres of paint seen in the newest frame on the left border
+    left_m: float = 0.0  # metres of lane markings seen in the newest frame on the left border
     right_m: float = 0.0
-    seen_to_m: float = 0.0  # distance up to which paint supports the shape
-    blind_m: float = 0.0  # metres driven since paint was last seen
+    seen_to_m: float = 0.0  # distance up to which lane markings support the shape
+    blind_m: float = 0.0  # metres driven since lane markings were last seen
 
     def centre(self, x_m: F64) -> F64:
         """Return the lateral position (K,) of the lane's centre at distances (K,)."""
         return _basis(x_m) @ self.mean[:4]
 
     def sigma(self, x_m: F64) -> F64:
-        """Return the standard deviation (K,) of `centre`, growing beyond the paint that was
-        seen.
+        """Return the standard deviation (K,) of `centre`, growing beyond the lane markings that
+        were seen.
         """
         basis = _basis(x_m)
         var = np.einsum("ki,ij,kj->k", basis, self.cov[:4, :4], basis)
@@ -102,14 +102,14 @@ def predict(lane: LaneState, forward_m: float, left_m: float, turn_rad: float) -
 
 
 def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
-    """Correct the estimate by points of paint.
+    """Correct the estimate by points of lane markings.
 
     Each point belongs to the nearer border if it lies within a gate; inside the gate a Cauchy
     weight lets outliers fade. A few rounds, as association and weights depend on the estimate.
 
     Args:
         lane: The predicted estimate.
-        points: Paint in the rig frame.
+        points: Lane markings in the rig frame.
         row_m: (N,) length of road that each point covers.
     """
     near = points.x_m < MAX_RANGE_M
@@ -162,10 +162,10 @@ def shift(lane: LaneState, lanes_left: int) -> LaneState:
 def search(
     points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float, curvature_1pm: float
 ) -> LaneState | None:
-    """Find the lane in one frame around a rough guess; None where the paint does not show one.
+    """Find the lane in one frame around a rough guess; None where lane markings do not show one.
 
-    For every heading and curvature on a small grid the paint is collapsed along the curve into a
-    histogram over the lateral position; where the curve is right the piles are sharp. In the
+    For every heading and curvature on a small grid lane markings are collapsed along the curve into
+    a histogram over the lateral position; where the curve is right the piles are sharp. In the
     sharpest histogram the pair of piles that is a lane wide and nearest to the guess wins.
     """
     near = points.x_m < 30.0
@@ -187,7 +187,7 @@ def search(
     ).reshape(len(shapes), n)
     padded = np.pad(histogram, ((0, 0), (1, 1)))
     histogram = histogram + 0.5 * (padded[:, :-2] + padded[:, 2:])
-    # Prefer the guess where the paint is ambiguous.
+    # Prefer the guess where lane markings are ambiguous.
     doubt = ((shapes[:, 0] - heading_rad) / 0.15) ** 2 + (
         (shapes[:, 1] - curvature_1pm) / 0.03
     ) ** 2

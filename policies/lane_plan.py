@@ -62,7 +62,8 @@ class Blend:
     """The path to drive and how it came about."""
 
     path: Path
-    route_weight: float  # share of the route in the lateral position 10 m ahead; 0: paint alone
+    # Share of the route in the lateral position 10 m ahead; 0: lane markings alone.
+    route_weight: float
     route_leaves_m: float  # distance at which the route leaves the lane; inf: it does not
 
 
@@ -76,10 +77,10 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance
     by distance.
 
-    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the
-    route, so the route does not affect the lateral position; it takes over beyond the paint that is
-    seen, where it turns away from the lane (an intersection, an exit), and where the two are more
-    than `SAME_LANE_M` apart.
+    Near the car the standard deviation of lane markings is a few centimetres against
+    `ROUTE_SIGMA_M` of the route, so the route does not affect the lateral position; it takes over
+    beyond the lane markings that are seen, where it turns away from the lane (an intersection, an
+    exit), and where the two are more than `SAME_LANE_M` apart.
 
     Returns:
         Points ``(N, 2)``, and the other two of `Blend`.

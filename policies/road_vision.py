@@ -144,7 +144,7 @@ def _project(camera: CameraSpec, T_camera_rig: F64, points: F64) -> F64:
 
 @dataclass(frozen=True)
 class PaintPoints:
-    """Where paint was seen: one entry per line and grid row, the nearest rows first."""
+    """Where lane markings were seen: one entry per line and grid row, the nearest rows first."""
 
     x_m: F64  # (N,) rig
     y_m: F64  # (N,)
@@ -153,8 +153,8 @@ class PaintPoints:
 
 
 def brightness(ground: U8) -> U8:
-    """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of
-    red and green.
+    """Return the channel ``(R, C)`` in which both white and yellow lane markings are bright: the
+    mean of red and green.
     """
     return cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0)
 
@@ -163,8 +163,8 @@ class RidgeFilter:
     """Contrast of each ground cell against the road on *both* sides of it.
 
     The stroke's width and the distance of the two flanks grow with the pixel's size on the ground,
-    so far paint, blurred over a pixel or two, still stands out. A step (kerb, shadow, the side of a
-    car) outshines one side only and gives no response.
+    so far markings, blurred over a pixel or two, still stand out. A step (kerb, shadow, the side of
+    a car) outshines one side only and gives no response.
     """
 
     def __init__(self, grid: GroundGrid) -> None:
@@ -251,7 +251,7 @@ def find_paint(
     where they are at least four and reach further than a car is wide.
     """
     response = ridges.response(brightness(ground))
-    # Paint is long and noise is not: average over three rows before looking for maxima.
+    # Lane markings are long and noise is not: average over three rows before looking for maxima.
     smooth = cv2.blur(response, (1, 3))
     near = round(MERGE_M / CELL_M)
     peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))

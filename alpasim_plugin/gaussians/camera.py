@@ -43,7 +43,7 @@ class PinholeCamera:
         height: Pixels.
         K: ``(3, 3)`` intrinsics in pixels, no skew.
         T_camera_world: ``(4, 4)`` rigid transform that maps world points, metres, to camera points.
-        whole: `slope_limits` of the picture that this is a window of; None: it is a whole picture.
+        whole: `slope_limits` of the image that this is a window of; None: it is a whole image.
         rolling: Its shutter; None: all pixels are exposed at once.
 
     Raises:
@@ -110,7 +110,7 @@ class PinholeCamera:
         )
 
     def window(self, rows: slice, columns: slice) -> PinholeCamera:
-        """Return the camera of a part of the picture: its pixels show what those of the whole
+        """Return the camera of a part of the image: its pixels show what those of the whole
         do.
         """
         K = self.K.copy()

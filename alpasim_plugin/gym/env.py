@@ -331,7 +331,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
 
 
 class _Watching(Recorder):
-    """Records a rollout without images, and keeps the instants that nobody has judged yet."""
+    """Records a rollout without images, and keeps the instants that nobody has scored yet."""
 
     def __init__(self, scenario: Scenario, seed: int, folder: Path) -> None:
         super().__init__(scenario, seed, folder, images="none")

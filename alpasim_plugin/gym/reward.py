@@ -38,7 +38,7 @@ class Reward:
 
 
 class Scorer:
-    """Judges the steps of one episode.
+    """Score the steps of one episode.
 
     Args:
         scenario: What is driven.

@@ -156,8 +156,8 @@ def rough_start(
     """Return the Gaussians to begin with.
 
     Points that are wrong along the ray of the view they come from look right from there and wrong
-    from aside: that, and not only blur, is what a short fit leaves of a scene beside the logged
-    path.
+    from a lateral offset: that, and not only blur, is what a short fit leaves of a scene beside the
+    logged path.
 
     Args:
         views: With depth.

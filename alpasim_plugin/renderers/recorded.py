@@ -117,7 +117,7 @@ def pose_error(scene_id: str, seed: int, spread_m: float, camera: str, t_us: int
 
 def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:
     """Return the photographs that the model was fitted to; those held out or of another camera stay
-    unseen, so that they can judge.
+    unseen, for evaluation.
 
     Args:
         scenario: Of an imported drive.

@@ -28,7 +28,7 @@ class Profile:
     forward: int = 1  # lanes in the ego's direction
     backward: int = 1  # oncoming lanes; 0 makes the road one-way
     lane_width_m: float = 3.5
-    median_m: float = 0.0  # raised median between the directions; 0: paint only
+    median_m: float = 0.0  # raised median between the directions; 0: lane markings only
     shoulder_m: float = 0.0  # paved strip outside the outer lanes
     parking_m: float = 0.0  # parking strip outside the outer lanes, instead of the shoulder
     speed_limit_mps: float | None = None

@@ -107,7 +107,7 @@ def rasterize_prepared(
     stats = {
         "gaussians": sum(prepared.n_input for prepared, _ in nodes),
         "visible": count,
-        "pairs": tiles.pairs,
+        "pairs": len(tiles.lists),
     }
     return RasterOutput(rgb, alpha, depth, stats)
 
@@ -171,13 +171,11 @@ class TileLists:
         columns: Tiles in a row of tiles.
         starts: int64, where each tile's list begins, and the end of the last.
         lists: int32, numbers of records, in the order of depth within a tile.
-        pairs: Entries of ``lists`` in use.
     """
 
     columns: int
     starts: I64
     lists: npt.NDArray[np.int32]
-    pairs: int
 
 
 def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int) -> TileLists:
@@ -193,11 +191,10 @@ def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int)
     workers = threads if count > WORTH_THREADS else 1
     chunks = (np.zeros(1, np.int64), count, chunk_size, order, records)
     run_on_threads(workers, count_tiles, *chunks, tiles_x, tiles_y, boxes, histogram)
-    pairs = int(tile_offsets(histogram, tiles_x, starts))
-    lists = np.empty(pairs, np.int32)
+    lists = np.empty(tile_offsets(histogram, tiles_x, starts), np.int32)
     chunks[0][:] = 0
     run_on_threads(workers, fill_tiles, *chunks, boxes, tiles_x, histogram, lists)
-    return TileLists(tiles_x, starts, lists, pairs)
+    return TileLists(tiles_x, starts, lists)
 
 
 def composite(

@@ -182,7 +182,7 @@ class _Rasterize(torch.autograd.Function):
         p = _Parameters.of(*tensors)
         tiles = kept.tiles
         g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
-        pairs = np.zeros(tiles.pairs * PAIR, np.float32)
+        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
         lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, kept.records)
         images = (kept.pixels, g_colour, g_alpha, g_depth)
         run_on_threads(view.threads, tile_gradients, *lists, *images, pairs)

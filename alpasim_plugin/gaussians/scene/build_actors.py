@@ -33,22 +33,28 @@ from alpasim_plugin.gaussians.sh import C0
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(
     [
-        *(
-            [0.78, 0.78, 0.78],
-            [0.16, 0.16, 0.17],
-            [0.55, 0.56, 0.58],
-            [0.90, 0.90, 0.88],
-            [0.50, 0.10, 0.10],
-        ),
-        *([0.13, 0.23, 0.45], [0.32, 0.34, 0.36], [0.20, 0.30, 0.24], [0.62, 0.55, 0.42]),
+        [0.78, 0.78, 0.78],
+        [0.16, 0.16, 0.17],
+        [0.55, 0.56, 0.58],
+        [0.90, 0.90, 0.88],
+        [0.50, 0.10, 0.10],
+        [0.13, 0.23, 0.45],
+        [0.32, 0.34, 0.36],
+        [0.20, 0.30, 0.24],
+        [0.62, 0.55, 0.42],
     ]
 )
 TRUCK_RGB = np.array([[0.85, 0.85, 0.83], [0.70, 0.45, 0.18], [0.35, 0.45, 0.55]])
 BUS_RGB = np.array([[0.72, 0.16, 0.13], [0.20, 0.36, 0.60], [0.82, 0.80, 0.74]])
 CLOTHES_RGB = np.array(
     [
-        *([0.15, 0.17, 0.25], [0.45, 0.12, 0.12], [0.20, 0.36, 0.24], [0.60, 0.58, 0.52]),
-        *([0.10, 0.10, 0.11], [0.70, 0.52, 0.16], [0.26, 0.40, 0.62]),
+        [0.15, 0.17, 0.25],
+        [0.45, 0.12, 0.12],
+        [0.20, 0.36, 0.24],
+        [0.60, 0.58, 0.52],
+        [0.10, 0.10, 0.11],
+        [0.70, 0.52, 0.16],
+        [0.26, 0.40, 0.62],
     ]
 )
 SKIN_RGB = np.array([[0.80, 0.62, 0.50], [0.55, 0.38, 0.28], [0.36, 0.25, 0.19]])
@@ -226,10 +232,8 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
     tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
     body = _drawn(BODY_RGB, draw[0])
-    seat, bar = (
-        np.array([-0.12 * length, 0, bottom + 0.52 * height]),
-        np.array([0.26 * length, 0, bottom + 0.60 * height]),
-    )
+    seat = np.array([-0.12 * length, 0, bottom + 0.52 * height])
+    bar = np.array([0.26 * length, 0, bottom + 0.60 * height])
     pedal = np.array([-0.02 * length, 0, bottom + radius])
     grip = np.array([0.0, 0.25, 0.0])
     pairs = [
@@ -240,7 +244,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
         (seat, bar),
         (bar + grip, bar - grip),
     ]
-    start, end = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
+    start, end = np.swapaxes(pairs, 0, 1)
     frame = rods(start, end, 0.10 if heavy else 0.03, body, max(cell_m, 0.12))
     rider = _person(0.80 * height, 0.55, draw, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
     return GaussianCloud.concatenate([tyres, frame, rider])

@@ -1,14 +1,14 @@
-"""Build the ground: asphalt with its wear, paint, pavements and grass, as flat Gaussians whose size
-follows what is to be seen there.
+"""Build the ground: asphalt with its wear, lane markings, pavements and grass, as flat Gaussians
+whose size follows what is to be seen there.
 
 The plan is painted as an image (0.125 m near the path, 0.5 m beyond), and a quadtree over it yields
-the Gaussians: small at paint and kerbs, larger on plain surfaces and far from the path. The same
-quadtree with larger least cells gives the coarser levels of detail, so a level is the average of
-the finer one. Road paint is drawn a second time as long thin Gaussians `LIFT_M` above the ground:
-Gaussians are composited in the order of their centres, so at a grazing angle ground in front of a
-line would otherwise wash over it. The lift, and a shallow trench in the ground around it, put a
-line in front of all ground within ``(lift + trench) * distance / camera height``, which grows with
-distance as the cells do.
+the Gaussians: small at lane markings and kerbs, larger on plain surfaces and far from the path. The
+same quadtree with larger least cells gives the coarser levels of detail, so a level is the average
+of the finer one. Lane markings are drawn a second time as long thin Gaussians `LIFT_M` above the
+ground: Gaussians are composited in the order of their centres, so at a grazing angle ground in
+front of a line would otherwise wash over it. The lift, and a shallow trench in the ground around
+it, put a line in front of all ground within ``(lift + trench) * distance / camera height``, which
+grows with distance as the cells do.
 """
 
 from __future__ import annotations
@@ -50,10 +50,8 @@ GRASS = (0.33, 0.40, 0.22)
 GRAVEL = (0.46, 0.43, 0.38)
 FORECOURT = (0.47, 0.45, 0.42)
 KERB_M = 0.12
-TRENCH_M, TRENCH_DEPTH_M = (
-    0.16,
-    0.03,
-)  # asphalt this near to paint lies this much lower, see build_road
+# Asphalt this near to lane markings lies this much lower, see build_road.
+TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03
 PAVEMENT_M = 2.6  # width of the pavement beside the road
 FORECOURT_M = 6.5  # paved or planted strip up to the facades
 
@@ -68,7 +66,7 @@ class GroundTexture:
         low: ``(2,)`` ground coordinates of the corner.
         rgb: ``(H, W, 3)`` 0..1.
         height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a
-            little below zero around paint.
+            little below zero around lane markings.
         level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
     """
 
@@ -86,7 +84,7 @@ def paint_ground(
 
     Args:
         site: What lies where.
-        strokes: Road paint.
+        strokes: Lane markings.
         cell_m: Cell size of the image.
         window: (first row, first column, rows, columns) in cells of ``cell_m``; None: the whole
             site, padded to whole tiles of 32 m.
@@ -264,7 +262,7 @@ def _coverage(
     shape: tuple[int, int],
     thinnest_m: float = 0.0,
 ) -> F32:
-    """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than
+    """Return the share ``(H, W)`` of each cell under markings of one colour; strokes thinner than
     ``thinnest_m`` are left out.
     """
     mask = np.zeros(shape, dtype=np.uint8)
@@ -280,8 +278,8 @@ def _coverage(
     rings = np.stack(
         [start - left - along, end - left + along, end + left + along, start + left - along], axis=1
     )
-    # Strokes of coarse images are thinner than a pixel: paint at four times the resolution would be
-    # exact, area weighting is enough.
+    # Strokes of coarse images are thinner than a pixel: drawing at four times the resolution would
+    # be exact, area weighting is enough.
     gain = np.minimum(1.0, width / cell_m)
     for ring, share in zip(
         to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True
@@ -301,7 +299,7 @@ PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 
 
 def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
-    """Return the ground's nodes: fine tiles along the path, coarse ones around, and the paint
+    """Return the ground's nodes: fine tiles along the path, coarse ones around, and the markings'
     strokes.
     """
     fine_tiles = _corridor(site)

@@ -35,10 +35,8 @@ RAIL_RGB = (0.62, 0.64, 0.66)
 POST_RGB = (0.45, 0.46, 0.47)
 POLE_RGB = (0.36, 0.38, 0.38)
 TRUNK_RGB = (0.30, 0.24, 0.19)
-TREE_LINE_M = {
-    False: 1.6,
-    True: 7.0,
-}  # distance of street trees from the road's edge, by highway or not
+# Distance of street trees from the road's edge, by highway or not.
+TREE_LINE_M = {False: 1.6, True: 7.0}
 RIM_RGB = (0.88, 0.88, 0.86)
 SIGN_RGB = ((0.75, 0.12, 0.10), (0.10, 0.28, 0.62), (0.88, 0.72, 0.12), (0.10, 0.42, 0.26))
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])

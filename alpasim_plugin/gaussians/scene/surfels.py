@@ -59,7 +59,7 @@ def with_sheen(
     sky.
 
     The share of sky added is ``strength * (1 + d . n)`` for view direction d and normal n, the
-    linear part of what paint and glass do.
+    linear part of what varnish and glass do.
 
     Args:
         cloud: Gaussians of constant colour.
