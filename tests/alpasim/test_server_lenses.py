@@ -212,3 +212,13 @@ def test_what_is_kept_of_lenses_has_an_end(monkeypatch):
         read_lens(pinhole(320 + i, 180), 320 + i, 180)
         assert few.held <= 8 << 20
     assert len(few) < 200
+
+
+def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean():
+    K = read_lens(pinhole(64, 32), 32, 32).K
+    np.testing.assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
+    spec = ftheta(False)
+    whole, half = read_lens(spec, 320, 180), read_lens(spec, 160, 90)
+    np.testing.assert_allclose(
+        shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
+    )

@@ -14,8 +14,9 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
-from alpasim_plugin.alpasim.server.views import read_lens, read_view
+from alpasim_plugin.alpasim.server.views import camera_of, read_lens, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
+from alpasim_plugin.core.lens import lens_shares
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
@@ -161,3 +162,19 @@ def test_the_map_has_the_shutter_of_the_frame():
             drawn[band.rows],
             draw_map(entry.scene_map, camera, band.T_world_camera, users)[band.rows],
         )
+
+
+def test_what_the_lens_does_not_see_is_exposed_never():
+    lens = read_lens(ftheta(False), 320, 180)
+    share = lens_shares(camera_of(ftheta(False), 320, 180), lens, "rows", backwards=False)
+    sees = ~np.isnan(share)
+    used = np.zeros(lens.cover[::-1], bool)
+    assert lens.resample is not None
+    column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T
+    for dx in (0, 1):
+        for dy in (0, 1):
+            used[
+                np.clip(row + dy, 0, lens.cover[1] - 1), np.clip(column + dx, 0, lens.cover[0] - 1)
+            ] = True
+    assert sees[used].all()
+    assert not sees.all()

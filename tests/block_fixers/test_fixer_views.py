@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.core.types import Frame
@@ -70,3 +71,17 @@ def test_pixels_are_copied_so_that_a_renderer_may_reuse_its_buffers():
     before = views.rgb.copy()
     frames[0].rgb[:] = 0
     assert np.array_equal(views.rgb, before)
+
+
+def test_values_beyond_the_range_are_cut():
+    video = torch.tensor([-3.0, 3.0]).view(1, 1, 1, 1, 2).expand(1, 3, 1, 1, 2)
+    (views,) = group_views([Frame(0, "front", np.zeros((1, 2, 3), np.uint8))], [], 1)
+    assert to_images(video, views.size)[0, 0, 0, :, 0].tolist() == [0, 255]
+
+
+def test_rounding_beyond_one_is_cut():
+    alpha = np.full((32, 48), 1.0005, np.float32)
+    alpha[0] = -0.0005
+    (views,) = group_views([replace(moving_picture(1)[0], alpha=alpha)], [], 5)
+    assert views.alpha is not None
+    assert (views.alpha.min(), views.alpha.max()) == (0, 1)

@@ -261,3 +261,27 @@ def test_a_spoiled_file_is_named_in_four_parts(vae, name):
         TinyVAE.from_state_dict(sd, source="tiny.safetensors")
     assert "tiny.safetensors" in error.value.message
     assert "TinyVAE.save" in error.value.hint
+
+
+def test_components_follow_their_names():
+    names = [name for name, _ in COMPONENTS]
+    grey = CosineTransform().analyse(to_grid(torch.full((1, 3, 4, 8, 8), 0.5))).flatten()
+    black = CosineTransform().analyse(to_grid(torch.zeros(1, 3, 4, 8, 8))).flatten()
+    changed = (grey - black).abs() > 1e-5
+    assert changed.tolist() == [name == (0, 0, 0, 0) for name in names]
+    ramp = (
+        torch.linspace(-1, 1, 8).view(1, 1, 1, 8, 1).expand(1, 3, 4, 8, 8)
+    )  # grey, constant in time and along rows: darker at the top
+    seen = (CosineTransform().analyse(to_grid(ramp)).flatten() - black).abs() > 1e-5
+    assert [name for name, on in zip(names, seen.tolist(), strict=True) if on] == [
+        (0, 0, 1, 0),
+        (0, 0, 3, 0),
+    ]
+
+
+def test_full_opacity_is_as_none_for_a_trained_network(vae):
+    video = clip(5, 16, 16)
+    z, cover = vae.encode(video), torch.ones(1, 1, 5, 16, 16)
+    torch.testing.assert_close(
+        vae.decode(z, render=video, opacity=cover), vae.decode(z, render=video), atol=1e-5, rtol=0
+    )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import pytest
 
@@ -338,3 +339,15 @@ def test_another_policy_of_a_stored_baseline_is_named_or_the_only_one(tmp_path, 
         json.loads(capsys.readouterr().out)["paired"]["clean/b"]["progress"]["baseline"]
         == f"{two}: clean/c"
     )
+
+
+def test_an_undecided_rule_that_need_not_decide_is_skipped_in_junit(runs, gate_file, tmp_path):
+    command = ["gate", str(runs["noisy"]), "--gate", gate_file, "--out", str(tmp_path)]
+    assert run_command(command) == 0
+    gate = ET.parse(tmp_path / "gate.junit.xml").getroot().find("testsuite")
+    assert [
+        c.attrib["name"] for c in gate.findall("testcase") if c.find("skipped") is not None
+    ] == ["offroad margin"]
+    assert gate.attrib["skipped"] == "1"
+    Path(gate_file).write_text(EASY.replace(", must_decide: false", ""))
+    assert run_command(command) == 3

@@ -301,3 +301,13 @@ def test_a_footprint_on_the_lane_border_flips_only_next_to_it(nudge, turn):
     assert held(log, road_map(turned)).in_one.tolist() == [
         convex_contains(ring, ego_corners(log, PAPER, 0, origin))
     ]
+
+
+def test_unions_are_kept_for_the_next_rollout_and_not_mixed_between_maps():
+    log = rollout(track(np.linspace(0, 20, 30), 1.75))
+    first = offroad_of(log, TWO_LANES).value
+    other = road_map(
+        lane("right", 0.0), lane("left", 9.0), edges=(*TWO_LANES.road_edges, edge_line(1.75))
+    )
+    assert offroad_of(log, other).value.tolist() == [1.0] * 30
+    np.testing.assert_array_equal(offroad_of(log, TWO_LANES).value, first)

@@ -11,11 +11,13 @@ import pytest
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
+from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import (
     OUTCOMES,
     evaluate_outcomes,
     in_words,
+    outcomes_of,
     recorded_speed,
 )
 from evaluators.metrics.presets import PRESETS
@@ -220,3 +222,10 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
 
 def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have():
     assert evaluate_outcomes(*drive(track(travelled(slowing()))), PRESETS["alpasim"]) == []
+
+
+def test_a_rollout_that_something_else_broke_has_no_outcome():
+    assert (
+        outcomes_of(Rollout("r", "p", "s", 0, "failed", "renderer", metrics={"offroad": 1.0}))
+        == frozenset()
+    )

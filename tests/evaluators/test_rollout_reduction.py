@@ -188,3 +188,8 @@ def test_black_images_remove_the_rollout_only_where_the_preset_says_so():
 def test_series_without_eval_relevant_are_refused():
     with pytest.raises(EvaluatorError, match="no eval_relevant"):
         rollout_values([series("offroad", T, 0.0)])
+
+
+def test_unknown_steps_in_the_warm_up_do_not_matter():
+    one = series("offroad", T, 0.0, np.array([False, True, True, True, True, True]), "no edges")
+    assert value("offroad", offroad=one).value == 0.0

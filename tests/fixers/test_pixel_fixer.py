@@ -273,3 +273,17 @@ def test_more_steps_sample_from_noisier_sources(bundle):
     assert not np.array_equal(
         pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1]))
     )
+
+
+def test_a_reference_of_another_size_is_refused(reading):
+    wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), np.uint8),))
+    with pytest.raises(InputError):
+        session(reading).step([wrong], MAPS[:1])
+
+
+def test_weights_that_read_no_references_leave_them_alone(bundle):
+    plain, given = (
+        session(bundle).step([frame], MAPS[:1])[0]
+        for frame in (FRAMES[0], with_reference(FRAMES[0], 200))
+    )
+    assert np.array_equal(plain.rgb, given.rgb)

@@ -14,7 +14,7 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     pixel_source,
     sparse_source,
 )
-from alpasim_plugin.fixers.network.pixel_layers import cells, pixels
+from alpasim_plugin.fixers.network.pixel_layers import Upsample, cells, pixels
 
 SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
 
@@ -108,3 +108,28 @@ def test_noise_enters_holes_alone():
     dense = pixel_source(render, alpha, torch.from_numpy(np.stack(noise)))
     torch.testing.assert_close(sparse_source(render, alpha, keys), dense)
     assert sparse_source(render, torch.ones_like(alpha), keys) is render
+
+
+def test_an_upsampled_cell_starts_flat():
+    out = Upsample(5, 3)(torch.randn(1, 4, 6, 5))
+    assert out.shape == (1, 8, 12, 3)
+    torch.testing.assert_close(out[:, ::2, ::2], out[:, 1::2, 1::2])
+
+
+def test_weights_say_the_sizes():
+    net = network()
+    again = PixelGenerator.from_state_dict(net.state_dict())
+    assert again.sizes == SMALL
+    clip = frames(1)
+    assert torch.equal(rolled(again, clip)[0][0], rolled(net, clip)[0][0])
+    plain = network(sizes=PixelSizes((8, 8, 8), hidden=0))
+    assert PixelGenerator.from_state_dict(plain.state_dict()).sizes.hidden == 0
+
+
+def test_clips_of_a_batch_do_not_see_each_other():
+    net, clip = network(), frames(3)
+    whole, _ = rolled(net, clip)
+    for b in range(2):
+        alone, _ = rolled(net, [tuple(x[b : b + 1] for x in frame) for frame in clip])  # type: ignore[misc]
+        for one, both in zip(alone, whole, strict=True):
+            torch.testing.assert_close(one[0], both[b], atol=2e-6, rtol=0)

@@ -144,3 +144,11 @@ def test_splitting_by_tile_loses_nothing():
     assert sum(len(p) for p in parts.values()) == 101
     for i, part in parts.items():
         assert np.all(np.floor(part.means[:, 0]) == i)
+
+
+def test_same_sky_seen_while_turning_moves_across_the_image():
+    a, b = SKY.image(camera(256, 96)), SKY.image(camera(256, 96, se2(0, 0, 0.2)))
+    assert np.abs(a - b).max() > 0.02  # clouds and hills moved
+    np.testing.assert_array_equal(
+        SKY.image(camera(256, 96, se2(50, 9, 0.2))), b
+    )  # and do not depend on where one stands

@@ -10,6 +10,7 @@ from scipy.special import sph_harm_y
 
 from alpasim_plugin.gaussians.sh import (
     C0,
+    dc_from_rgb,
     rotate_sh,
     sh_basis,
     sh_colours,
@@ -73,3 +74,10 @@ def test_rotation_matrices_are_orthogonal_and_compose(degree):
     a, b, ab = (sh_rotation(R, degree) for R in (A, B, A @ B))
     assert np.abs(a @ a.T - np.eye(2 * degree + 1)).max() < 1e-12
     assert np.abs(a @ b - ab).max() < 1e-12
+
+
+def test_constant_coefficients_show_one_colour_from_everywhere():
+    rgb = np.array([0.2, 0.5, 0.9])
+    sh = np.broadcast_to(dc_from_rgb(rgb), (50, 1, 3))
+    assert np.abs(sh_colours(sh, directions(50)) - rgb).max() < 1e-12
+    assert dc_from_rgb([1.0])[0] == pytest.approx(0.5 / C0)

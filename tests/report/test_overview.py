@@ -18,6 +18,7 @@ import pytest
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
+from evaluators.numbers import DASH
 from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.report.ci import overview_md
@@ -228,3 +229,10 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
     for shot in shots:
         data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
         assert abs(float(np.mean(cv2.imdecode(data, cv2.IMREAD_COLOR))) - 150.0) < 3
+
+
+def test_a_missing_number_is_a_dash_and_never_zero(tmp_path):
+    plan = Plan(("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])
+    (row,) = overview_of(read_run(make_run(tmp_path, plan))).rows
+    assert (row.primary, row.distance) == (DASH, DASH)
+    assert row.endings == {"not run": 1}

@@ -154,3 +154,16 @@ def test_event_during_warm_up_does_not_give_the_time():
     series = {rollout.cell: series_of([0.0] * 20, [0.0] * 20, offroad=off, eval_relevant=relevant)}
     (event,) = events_of(rollout, series)
     assert event.t_s == pytest.approx(1.5)
+
+
+def test_lane_without_an_edge_gives_its_line_and_no_area():
+    view = scene_view(
+        "s",
+        scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]),
+        [],
+        {},
+        VARIANTS,
+    )
+    assert view is not None
+    assert view.lanes == ""
+    assert view.lines.count("M") == 1

@@ -53,3 +53,8 @@ def test_what_only_drafts_have_is_a_dash_for_whole_blocks():
     assert [cell.text for cell in blocks["cells"][3:6]] == [DASH] * 3
     assert blocks["cells"][6].text == "4"
     assert len(drafted["cells"]) == len(COLUMNS)
+
+
+def test_a_frame_that_the_render_itself_had_black_is_not_the_fixers_failure():
+    only_black = {"fixers": {"f": BLOCKS}, "censoring": {"f": {"frame_events": {"black": 7}}}}
+    assert fixer_cautions(only_black) == []

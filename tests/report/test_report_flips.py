@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.log.run_folder.rows import Rollout
+from evaluators.metrics.outcomes import in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import write_report
 from evaluators.report.flips import find_flips, flip_rows
@@ -113,3 +114,8 @@ def test_frames_outside_the_run_folder_are_not_read(usual_run, tmp_path):
     told["cells"][0]["frames"] = dict.fromkeys(told["cells"][0]["frames"], "../secret.jpg")
     (folder / "flips.json").write_text(json.dumps(told))
     assert not flip_rows(read_run(folder), 10**7)[0][0].pictures
+
+
+def test_events_name_the_gravest_word_only():
+    had = outcomes_of(rollout("clean", collision_any=1.0, collision_at_fault=1.0, offroad=1.0))
+    assert in_words(had) == "at-fault collision and off-road"

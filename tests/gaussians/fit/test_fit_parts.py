@@ -29,7 +29,7 @@ from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.reconstruction import sky_of
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from tests.gaussians.fit.conftest import BOX, FAR
+from tests.gaussians.fit.conftest import BOX, FAR, actor_pose
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import cloud_of
 
@@ -281,3 +281,24 @@ def test_where_the_cap_leaves_room_for_one_the_strongest_pull_wins():
     model, adam, gradients, recipe = density_case(cap=5)
     densify(model, adam, gradients, recipe, 50.0, stream("t", 0, "split"))
     assert model.node.tolist() == [0, 0, 0, 1, 1]
+
+
+def test_a_gaussian_that_no_view_showed_has_no_pull():
+    gradients = ScreenGradients(2)
+    gradients.add(torch.tensor([0, 1]), torch.tensor([0.5, 0.0]), torch.tensor([2, 0]), 4)
+    gradients.add(torch.tensor([0]), torch.tensor([0.1]), torch.tensor([2]), 4)
+    assert gradients.mean().tolist() == pytest.approx([0.6, 0.0])
+
+
+def test_an_actor_that_is_not_in_view_gets_no_model(posed):
+    views = [
+        replace(
+            v,
+            actors={
+                "car": actor_pose(0) @ np.diag([1.0, 1, 1, 1])
+                + np.array([[0, 0, 0, 500.0]] * 3 + [[0] * 4])
+            },
+        )
+        for v in posed.views
+    ]
+    assert not start_from_depth(views, {"car": BOX}, 100, "s", 0).actors
