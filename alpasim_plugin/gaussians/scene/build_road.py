@@ -419,7 +419,7 @@ def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
 
 def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
     owned = site.owns((everywhere.start + everywhere.end) / 2)
-    strokes = Strokes(*(column[owned] for column in everywhere))
+    strokes = Strokes._make(column[owned] for column in everywhere)
     if len(strokes.start) == 0:
         return []
     rng = site.rng("paint-wear")
