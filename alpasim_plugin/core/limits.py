@@ -63,7 +63,6 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-KIB = 1 << 10
 MIB = 1 << 20
 GIB = 1 << 30
 

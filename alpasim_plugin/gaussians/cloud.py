@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, LOG_SCALE_LIMIT, MIP_PX2
 from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
 
@@ -156,23 +156,14 @@ class GaussianCloud:
         """
         raw = cls(*(np.asarray(array) for array in (means, quats, scales, opacities, sh)))
         n = len(raw)
-        q = raw.quats.astype(np.float64)
+        faults = raw._faults()
         # Scaling by the largest component first keeps tiny quaternions of float32 files from
         # underflowing in the square.
-        largest = np.max(np.abs(q), axis=1, initial=0.0, keepdims=True)
+        q = raw.quats.astype(np.float64)
         with np.errstate(invalid="ignore", divide="ignore"):
-            unit = q / largest
+            unit = q / np.abs(q).max(axis=1, initial=0.0, keepdims=True)
             unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-            low, high = np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT)
-            faults = {
-                "non-finite mean": ~np.all(np.isfinite(raw.means), axis=1),
-                "non-finite opacity": ~np.isfinite(raw.opacities),
-                "non-finite colour": ~np.all(np.isfinite(raw.sh), axis=(1, 2)),
-                "NaN or negative scale": np.any(np.isnan(raw.scales) | (raw.scales < 0), axis=1),
-                "overflowing scale": np.any(raw.scales > high, axis=1),
-                "zero quaternion": largest[:, 0] == 0,
-                "non-finite quaternion": ~np.all(np.isfinite(q), axis=1),
-            }
+        low = np.exp(-LOG_SCALE_LIMIT)
         keep = np.ones(n, dtype=bool)
         dropped: dict[str, int] = {}
         for cause, bad in faults.items():
@@ -194,23 +185,17 @@ class GaussianCloud:
         )
         return cloud, CleanReport(n, len(cloud), dropped, repaired)
 
-    def _drawable(self) -> bool:
-        """Return whether every Gaussian can be drawn: whole arrays, as numpy is slow along an axis
-        of three.
-        """
-        scales, opacities, (w, x, y, z) = self.scales, self.opacities, self.quats.T
-        within = not len(self) or (
-            scales.min() >= 0
-            and scales.max() <= LARGEST_SCALE_M
-            and opacities.min() >= 0
-            and opacities.max() <= 1
-        )
-        turns = bool((w != 0).all()) or bool(((w != 0) | (x != 0) | (y != 0) | (z != 0)).all())
-        return (
-            bool(within)
-            and turns
-            and all(np.isfinite(array).all() for array in (self.means, self.quats, self.sh))
-        )
+    def _faults(self) -> dict[str, Bool]:
+        """Return which Gaussians ``(N,)`` cannot be drawn, by cause."""
+        return {
+            "non-finite mean": ~np.isfinite(self.means).all(axis=1),
+            "non-finite opacity": ~np.isfinite(self.opacities),
+            "non-finite colour": ~np.isfinite(self.sh).all(axis=(1, 2)),
+            "NaN or negative scale": (np.isnan(self.scales) | (self.scales < 0)).any(axis=1),
+            "overflowing scale": (self.scales > LARGEST_SCALE_M).any(axis=1),
+            "zero quaternion": ~self.quats.any(axis=1),
+            "non-finite quaternion": ~np.isfinite(self.quats).all(axis=1),
+        }
 
     def require_drawable(self) -> None:
         """Raise where any Gaussian could not be drawn.
@@ -218,22 +203,11 @@ class GaussianCloud:
         Raises:
             InputError: Names the first cause and its count; `cleaned` removes such Gaussians.
         """
-        if self._drawable():
-            return
-        checks = {
-            "non-finite mean": np.isfinite(self.means).all(axis=1),
-            "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1)
-            & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),
-            "negative, non-finite or overflowing scale": np.all(
-                (self.scales >= 0) & (self.scales <= LARGEST_SCALE_M), axis=1
-            ),
-            "opacity outside 0..1": (self.opacities >= 0) & (self.opacities <= 1),
-            "non-finite colour": np.isfinite(self.sh).all(axis=(1, 2)),
-        }
-        for cause, good in checks.items():
-            if not good.all():
+        outside = (self.opacities < 0) | (self.opacities > 1)
+        for cause, bad in {**self._faults(), "opacity outside 0..1": outside}.items():
+            if bad.any():
                 raise InputError(
-                    f"a cloud of {len(self)} Gaussians: {int(np.count_nonzero(~good))} with {cause}, the first at index {int(np.argmin(good))}",
+                    f"a cloud of {len(self)} Gaussians: {np.count_nonzero(bad)} with {cause}, the first at index {np.argmax(bad)}",
                     "build it with GaussianCloud.cleaned, which drops and counts them",
                 )
 

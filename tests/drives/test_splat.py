@@ -14,11 +14,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.drives.splat import import_splat
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.files.packed import write_splat
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.drives.street import COUNT, STEP_M, Street, write_colmap, write_transforms
+from tests.gaussians.test_packed_files import write_splat
 
 pytestmark = pytest.mark.slow
 

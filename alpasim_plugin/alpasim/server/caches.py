@@ -105,19 +105,6 @@ class FixerCache:
         return self._made[key]
 
 
-def size_of(value: Any) -> int:
-    """Return the bytes that arrays and tensors in a past hold."""
-    if hasattr(value, "element_size"):
-        return int(value.numel() * value.element_size())
-    if hasattr(value, "nbytes"):
-        return int(value.nbytes)
-    if isinstance(value, tuple):
-        return sum(size_of(part) for part in value)
-    if hasattr(value, "__dataclass_fields__"):
-        return sum(size_of(getattr(value, name)) for name in value.__dataclass_fields__)
-    return 0
-
-
 @dataclass(frozen=True)
 class SceneEntry:
     """A loaded scene: the scenario, its prepared map, its renderer where the server renders itself,

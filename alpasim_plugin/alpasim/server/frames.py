@@ -11,8 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.alpasim.server.caches import FixerCache, size_of
+from alpasim_plugin.alpasim.server.caches import FixerCache
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
+from alpasim_plugin.alpasim.server.lens_cache import size_of
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import MAX_PIXELS, View, read_view

@@ -33,7 +33,7 @@ class LensCache:
     @property
     def held(self) -> int:
         """Give the bytes of all values."""
-        return sum(map(_bytes_of, self._kept.values()))
+        return sum(ENTRY_BYTES + size_of(value) for value in self._kept.values())
 
     def get(self, spec: sensorsim_pb2.CameraSpec, what: object, make: Callable[[], T]) -> T:
         """Return a value of a lens, made if it is not kept.
@@ -56,9 +56,17 @@ class LensCache:
         return found
 
 
-def _bytes_of(value: Any) -> int:
-    arrays = [value] if hasattr(value, "nbytes") else vars(value).values()
-    return ENTRY_BYTES + sum(getattr(array, "nbytes", 0) for array in arrays)
+def size_of(value: Any) -> int:
+    """Return the bytes that arrays and tensors in a value hold."""
+    if hasattr(value, "element_size"):
+        return int(value.numel() * value.element_size())
+    if hasattr(value, "nbytes"):
+        return int(value.nbytes)
+    if isinstance(value, tuple):
+        return sum(size_of(part) for part in value)
+    if hasattr(value, "__dataclass_fields__"):
+        return sum(size_of(getattr(value, name)) for name in value.__dataclass_fields__)
+    return 0
 
 
 lenses = LensCache()

@@ -1,5 +1,4 @@
-"""Read the quantised forms of a Gaussian model: SuperSplat's compressed PLY, ``.splat`` and SPZ;
-write ``.splat``.
+"""Read the quantised forms of a Gaussian model: SuperSplat's compressed PLY, ``.splat`` and SPZ.
 
 A compressed PLY holds 16 bytes a Gaussian, quantised within chunks of 256. ``.splat`` holds 32
 bytes a Gaussian without a header, constant colour only. SPZ (versions 2 and 3 by gzip, 4 by zstd
@@ -18,12 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.reading.files import parsing, some_of, unzstd
-from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, quat_multiply
+from alpasim_plugin.gaussians.cloud import GaussianArrays, quat_multiply
 from alpasim_plugin.gaussians.constants import EPS2D_PX2
 from alpasim_plugin.gaussians.files.ply import (
     PlyHeader,
@@ -192,29 +190,6 @@ def read_splat(path: Path | str) -> GaussianArrays:
         opacities=rgba[:, 3],
         sh=((rgba[:, None, :3] - 0.5) / C0).astype(np.float32),
     )
-
-
-def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write a cloud as ``.splat``; bands above the constant colour are lost, antialiasing cannot be
-    stated, and colours are clipped to 0..1.
-
-    Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in
-    float32.
-
-    Raises:
-        InfrastructureError: The folder is missing or not writable, or the disk is full.
-    """
-    rows = np.zeros(len(cloud.means), dtype=_ROW)
-    rows["position"] = cloud.means
-    rows["scale"] = cloud.scales
-    rgb = 0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[:, 0, :]
-    rgba = np.concatenate([rgb, np.asarray(cloud.opacities, dtype=np.float64)[:, None]], axis=1)
-    rows["rgba"] = np.rint(np.clip(rgba, 0.0, 1.0) * 255.0)
-    rows["rotation"] = np.clip(
-        np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255
-    )
-    with atomic_file(path) as partial:
-        partial.write_bytes(rows.tobytes())
 
 
 MAGIC = 0x5053474E  # "NGSP" in file order

@@ -25,12 +25,12 @@ from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.gaussians.files import read_gaussians
-from alpasim_plugin.gaussians.files.packed import write_splat
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.writer import write_parquet
 from scenarios.load import load_scenario
 from tests.core.reading.past_failures import png_header
 from tests.gaussians.gaussian_scenes import random_cloud
+from tests.gaussians.test_packed_files import write_splat
 from tests.log.make_rollout import write_rollout
 from tests.scenarios.make_commonroad import write_commonroad
 from tests.scenarios.make_usdz import write as write_usdz
