@@ -105,7 +105,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         vehicle,
         vehicles(followers, run.followers),
         (),
-        tuple(float(x) for x in origin),
+        (float(origin[0]), float(origin[1]), 0.0),
         files.content_hash,
         (*_said(odr, way, goal_m, heads, len(followers)), *notes, *light_notes),
         route=Route(line.xyz[::4], way.lane_ids),

@@ -77,7 +77,9 @@ class LaneGraph:
         """Return the shortest way from one of ``starts`` to one of ``goals``; None without one."""
         aims = {goal.lane_id: goal.at_m for goal in goals}
         # cost, number, lanes, from where on the last lane, whether one has changed into it
-        queue = [(0.0, n, (spot.lane_id,), spot.at_m, False) for n, spot in enumerate(starts)]
+        queue: list[tuple[float, int, tuple[str, ...], float, bool]] = [
+            (0.0, n, (spot.lane_id,), spot.at_m, False) for n, spot in enumerate(starts)
+        ]
         begins = {spot.lane_id: spot.at_m for spot in starts}
         settled: set[tuple[str, bool, bool]] = set()
         pushed = len(queue)

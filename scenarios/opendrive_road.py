@@ -411,14 +411,14 @@ def _with_signals(
             if original is None:
                 unused["references to signals that the map does not have are left out"] += 1
                 continue
-            here = _signal(files, f"{where}, road {road.road_id}", one)
+            place = _signal(files, f"{where}, road {road.road_id}", one)
             signals.append(
                 replace(
                     original,
-                    s_m=here.s_m,
-                    t_m=here.t_m,
-                    orientation=here.orientation,
-                    lanes=here.lanes,
+                    s_m=place.s_m,
+                    t_m=place.t_m,
+                    orientation=place.orientation,
+                    lanes=place.lanes,
                 )
             )
     roads = tuple(
