@@ -277,9 +277,12 @@ def least_scenes(question: Question, most: int = MOST_SCENES) -> int | None:
         values = {asked.metric: np.zeros(n) for asked in question.metrics}
         return state_after(question, values, n).answer == "good"
 
-    numbers = range(1, most + 1)
-    if not is_good(most):
-        return None
+    upper = 1
+    while not is_good(upper):
+        if upper == most:
+            return None
+        upper = min(2 * upper, most)
+    numbers = range(1, upper + 1)
     return numbers[bisect_left(numbers, True, key=is_good)]
 
 
