@@ -143,15 +143,14 @@ def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root, p
     assert CELL in caught.value.hint
 
 
-def test_a_scenario_that_has_changed_is_refused(root, past, tmp_path):
+def test_a_scenario_that_has_changed_is_refused(root, tmp_path):
     info = read_json(root / "run.json")
     info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
-    for name in ("rollouts.parquet", str(past.manifest["path"])):
-        copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
-        copy(root / name, tmp_path / name)
-    write_run_json(tmp_path, info)
+    changed = shutil.copytree(root, tmp_path / "run")
+    (changed / "files.json").unlink()  # else run.json is damaged
+    write_run_json(changed, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
-        find_rollout(tmp_path, CELL)
+        find_rollout(changed, CELL)
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period(straight_road):
