@@ -62,7 +62,10 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
         crosswalks += [placed(road, ring, T_local_map) for ring in road.crosswalks]
         for one in road.signals:
             if one.kind == STOP_LINE:
-                stop_lines += _across(road, one, lanes, T_local_map)
+                held = [_lanes_at(road, one.s_m, along, one, lanes) for along in _senses(one)]
+                stop_lines += [
+                    placed(road, _line(one.s_m, some), T_local_map) for some in held if some
+                ]
             elif one.dynamic:
                 foot = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)
                 top = foot + np.array([0.0, 0.0, max(one.above_m + one.height_m, 2.0)])
@@ -224,12 +227,6 @@ def _line(s_m: float, held: Sequence[Held]) -> F64:
     """Return the ends ``(2, 2)``, s and t, of a line across lanes."""
     borders = [border for _, inner_t, outer_t in held for border in (inner_t, outer_t)]
     return np.array([[s_m, min(borders)], [s_m, max(borders)]])
-
-
-def _across(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64) -> list[F64]:
-    """Return a stop line's ends, a line for each direction that it is for."""
-    held = [_lanes_at(road, one.s_m, along, one, lanes) for along in _senses(one)]
-    return [placed(road, _line(one.s_m, some), T_local_map) for some in held if some]
 
 
 def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float:

@@ -34,7 +34,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import quat_from_matrix, transform_points
-from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_wide
 from scenarios.map_lines import lane_edges, with_vertices
@@ -142,14 +142,6 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         notes=notes,
         first_frame_us=rig.first_frame_us(),
         alpasim_map=road.alpasim if rails or road.alpasim is None else without_rails(road.alpasim),
-    )
-
-
-def read_usdz_scene(path: str | Path, rails: bool = True) -> Scene:
-    """Read what scorers see of a scene; see `read_usdz`."""
-    record = read_usdz(path, rails, needs_map=False)
-    return Scene(
-        record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
     )
 
 

@@ -139,7 +139,7 @@ def verbs() -> dict[str, str]:
         for panel in PANELS.values()
         for verb, (target, _) in panel.items()
     }
-    return own | installed_names(PLUGIN_GROUP, own, "command")
+    return own | installed_names(PLUGIN_GROUP, own)
 
 
 class Verb(TyperCommand):

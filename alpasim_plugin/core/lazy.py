@@ -65,14 +65,13 @@ def installed(group: str) -> Mapping[str, EntryPoint]:
     return {point.name: point for point in _points(group, _search_path())}
 
 
-def installed_names(group: str, taken: Mapping[str, str], what: str) -> dict[str, str]:
+def installed_names(group: str, taken: Mapping[str, str]) -> dict[str, str]:
     """Return what installed packages register in a group: name to ``package.module:attribute``.
     Nothing of theirs is imported.
 
     Args:
         group: Entry-point group, ``simrun.policies``.
         taken: Names that are taken, with the target of each; the same target may be given again.
-        what: What is registered, for the error: ``policy``.
 
     Raises:
         InputError: Two packages claim one name.

@@ -15,6 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from alpasim_plugin.core.kernels import inlined_kernel, kernel
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
@@ -47,7 +48,7 @@ def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> Ref
     return made
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather_references(references, render, scale, mean4, mean2, each4, each2):
     batch = references.shape[0]
     count = references.shape[1]
@@ -94,7 +95,7 @@ def _gather_references(references, render, scale, mean4, mean2, each4, each2):
             _put_runs(mean, mean2[b, i2], at2, DETAIL * CHANNELS)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _put_runs(row, cells, at, run):
     """Write a row of pixels into the row of cells that it crosses, ``run`` values into each, from
     ``at`` on.
@@ -238,7 +239,7 @@ def _stretched(coarse, before, after, share, out):
             out[c, x] = first + share[x] * (line[after[x]] - first)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _between(length, scale):
     """Return for each pixel of a row or column the values before and after it, ``scale`` pixels
     wide, and the share of the second.
@@ -255,7 +256,7 @@ def _between(length, scale):
     return before, after, share
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _correction_row(weight, correction, row, out):
     """Write a row of pixels of what a head says of cells: three corrections, then the logarithm of
     the weight.

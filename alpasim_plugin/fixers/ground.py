@@ -20,8 +20,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from alpasim_plugin.core.kernels import float_kernel
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget, on_boxes, place_boxes, warp
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
@@ -115,7 +115,7 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _ground(depth, down, height_m, out):
     for row in range(out.shape[0]):
         below = down[1] * (row + 0.5) + down[2]

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.kernels import float_kernel
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
@@ -200,7 +201,7 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     return x, y, held
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
     """Fill ``x``, ``y`` and ``held`` as if nothing moved; the loop of `plain_coordinates`, whose
     rows are vectors.
@@ -248,7 +249,7 @@ def _held(surface, rz, free_share):
     return VALID if agrees else INCONSISTENT
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _coordinates_on_box(
     depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held
 ):
@@ -339,7 +340,7 @@ def _walls(sizes: F64) -> F64:
     return np.asarray(walls)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _add_box(ray, eye, walls, pixels, out):
     """Add the pixels that show one box to the part of an image that it may be seen in, by the slab
     method (Kay and Kajiya, 1986).

@@ -96,19 +96,6 @@ class PinholeCamera:
             inverse(np.asarray(T_world_camera, dtype=np.float64)),
         )
 
-    @classmethod
-    def from_hfov(
-        cls, width: int, height: int, hfov_rad: float, T_world_camera: F64 | None = None
-    ) -> PinholeCamera:
-        """Build a camera with square pixels and a centred principal point from its horizontal field
-        of view.
-        """
-        f = width / (2 * np.tan(hfov_rad / 2))
-        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
-        return cls.from_pose(
-            width, height, K, np.eye(4) if T_world_camera is None else T_world_camera
-        )
-
     def window(self, rows: slice, columns: slice) -> PinholeCamera:
         """Return the camera of a part of the image: its pixels show what those of the whole
         do.

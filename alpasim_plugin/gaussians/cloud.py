@@ -245,11 +245,6 @@ class GaussianCloud:
         q = self.quats.astype(np.float64)
         return matrix_from_quat(q / np.linalg.norm(q, axis=1, keepdims=True))
 
-    def covariances(self) -> F64:
-        """Return ``(N, 3, 3)`` float64 covariances ``(R diag s)(R diag s)^T``, metres^2."""
-        factor = self.rotations() * self.scales.astype(np.float64)[:, None, :]
-        return factor @ np.swapaxes(factor, 1, 2)
-
     @staticmethod
     def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
         """Join clouds in the order given (which decides equal depths); lower degrees are padded

@@ -32,6 +32,7 @@ from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, logging_pb2
 class _Collected:
     """What one pass over the entries gathers."""
 
+    path: Path
     metadata: logging_pb2.RolloutMetadata | None = None
     poses: dict[str, list[tuple[int, common_pb2.Pose]]] = field(default_factory=dict)
     requests: list[egodriver_pb2.DriveRequest] = field(default_factory=list)
@@ -71,7 +72,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
     """
     path = Path(path)
     reader = AslReader(path)
-    got = _Collected()
+    got = _Collected(path)
     for entry in reader:
         kind = entry.WhichOneof("log_entry") or "unknown"
         got.counts[kind] += 1
@@ -81,7 +82,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
             )
         handler = _HANDLERS.get(kind)
         if handler is not None:
-            handler(got, getattr(entry, kind), str(path))
+            handler(got, getattr(entry, kind))
         elif kind == "driver_camera_image" and images:
             image = entry.driver_camera_image.camera_image
             got.images.append(
@@ -94,33 +95,33 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         warnings.append(
             f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped"
         )
-    return _assemble(path, got, tuple(warnings))
+    return _assemble(got, tuple(warnings))
 
 
-def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata, where: str) -> None:
+def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata) -> None:
     if got.metadata is not None:
-        raise InputError(f"{where}: a second rollout_metadata", "give one rollout a file")
+        raise InputError(f"{got.path}: a second rollout_metadata", "give one rollout a file")
     got.metadata = message
 
 
-def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses, where: str) -> None:
+def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses) -> None:
     for pose in message.actor_poses:
         got.poses.setdefault(pose.actor_id, []).append((message.timestamp_us, pose.actor_pose))
 
 
-def _route(got: _Collected, message: egodriver_pb2.RouteRequest, where: str) -> None:
+def _route(got: _Collected, message: egodriver_pb2.RouteRequest) -> None:
     got.route = message.route
 
 
-def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest, where: str) -> None:
+def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest) -> None:
     got.requests.append(message)
 
 
-def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where: str) -> None:
+def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> None:
     """Pair first in, first out; a response without poses is a driver that is not ready yet."""
     if not got.requests:
         raise InputError(
-            f"{where}: a driver_return without a driver_request",
+            f"{got.path}: a driver_return without a driver_request",
             "give a whole log",
         )
     request = got.requests.pop(0)
@@ -129,7 +130,7 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where:
     if not message.trajectory.poses:
         got.info["empty_plans"] += 1
         return
-    what = f"{where}, plan at {request.time_now_us} us"
+    what = f"{got.path}, plan at {request.time_now_us} us"
     samples = tuple(
         read_trajectory(sample, f"{what}, sample {i}")
         for i, sample in enumerate(message.debug_info.sampled_trajectories)
@@ -145,17 +146,15 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where:
     )
 
 
-def _driver_session(
-    got: _Collected, message: egodriver_pb2.DriveSessionRequest, where: str
-) -> None:
+def _driver_session(got: _Collected, message: egodriver_pb2.DriveSessionRequest) -> None:
     got.info["seed"] = message.random_seed
 
 
-def _traffic_session(got: _Collected, message: Any, where: str) -> None:
+def _traffic_session(got: _Collected, message: Any) -> None:
     got.static_ids.update(o.object_id for o in message.logged_object_trajectories if o.is_static)
 
 
-def _cameras(got: _Collected, message: Any, where: str) -> None:
+def _cameras(got: _Collected, message: Any) -> None:
     specs = {camera.logical_id: read_camera(camera) for camera in message.available_cameras}
     got.info["cameras"] = tuple(spec for spec in specs.values() if spec is not None)
     got.info["other_cameras"] = tuple(name for name, spec in specs.items() if spec is None)
@@ -173,8 +172,9 @@ _HANDLERS: dict[str, Any] = {
 }
 
 
-def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
+def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
     """Turn what was gathered into a `RolloutLog`."""
+    path = got.path
     if got.metadata is None:
         raise _bad(path, "no rollout_metadata", "give a whole log")
     metadata, session = got.metadata, got.metadata.session_metadata

@@ -11,7 +11,6 @@ from typing import Any
 from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.lens import Lens, joined, lens_shares, sides_of
 from alpasim_plugin.core.types import (
-    CameraSpec,
     Frame,
     RecordedFrame,
     RenderRequest,
@@ -90,7 +89,10 @@ class LensRenderer(Renderer):
         """Return the request of one pinhole of a lens."""
         camera, exposure = request.camera, request.exposure
         if exposure is not None and camera.lens is not None:
-            share = self._share(camera, side)
+            key = camera.name, side.side
+            if key not in self._shares:
+                self._shares[key] = lens_shares(camera, side, "rows", backwards=False)
+            share = self._shares[key]
             exposure = replace(exposure, share=share)
         return replace(
             request,
@@ -99,9 +101,3 @@ class LensRenderer(Renderer):
             ahead=[self._through(later, side) for later in request.ahead],
             exposure=exposure,
         )
-
-    def _share(self, camera: CameraSpec, side: Lens) -> Any:
-        key = camera.name, side.side
-        if key not in self._shares:
-            self._shares[key] = lens_shares(camera, side, "rows", backwards=False)
-        return self._shares[key]

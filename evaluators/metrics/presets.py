@@ -220,15 +220,17 @@ def described() -> dict[str, str]:
     """Return PRESET -> what it is, and what it does not see, the default first."""
     order = sorted(PRESETS, key=lambda name: name != DEFAULT)
     return {
-        name: "; ".join(filter(None, (HELP.get(name) or PRESETS[name].reproduces, _unseen(name))))
+        name: "; ".join(
+            filter(
+                None,
+                (
+                    HELP.get(name) or PRESETS[name].reproduces,
+                    "" if PRESETS[name].protocol else contact_note(name),
+                ),
+            )
+        )
         for name in order
     }
-
-
-def _unseen(name: str) -> str:
-    return (
-        "" if PRESETS[name].protocol else contact_note(name)
-    )  # of benchmarks the contacts are those that they define
 
 
 def preset(name: str | Preset) -> Preset:

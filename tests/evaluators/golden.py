@@ -27,7 +27,7 @@ from evaluators.alpasim import (
     scene_score,
 )
 from evaluators.metrics.presets import Preset
-from scenarios.usdz import read_usdz_scene
+from tests.scenarios.usdz_scene import read_usdz_scene
 
 RUN = ("00000000-0000-4000-8000-00000000000a", "golden-dev")
 CASES = ("failed-rollout", "no-actors", "rails-stripped", "no-map", "no-road-edges")

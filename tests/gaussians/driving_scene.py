@@ -96,4 +96,6 @@ def driving_camera(width: int, height: int, yaw_rad: float = 0.0) -> PinholeCame
         [0, -1, 0],
     ]
     T_world_camera[:3, 3] = [0, 0, 1.6]
-    return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
+    focal = width / (2 * np.tan(np.deg2rad(65) / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return PinholeCamera.from_pose(width, height, K, T_world_camera)

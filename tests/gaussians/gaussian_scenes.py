@@ -107,3 +107,9 @@ HARD = {
     "needle of 10,000 pixels": needle(10_000, 2.0),
     "overflowing width": splats([0, 0, 5.0], [[np.exp(19.9), 1e-30, 1.0]], 0.5),
 }
+
+
+def covariances(cloud):
+    """Return ``(N, 3, 3)``: ``(R diag s)(R diag s)^T``, metres^2."""
+    factor = cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :]
+    return factor @ np.swapaxes(factor, 1, 2)

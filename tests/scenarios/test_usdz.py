@@ -16,7 +16,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios import usdz_archive
 from scenarios.load import load_scenario
-from scenarios.usdz import read_usdz, read_usdz_scene, usdz_scene_id
+from scenarios.usdz import read_usdz, usdz_scene_id
 from tests.scenarios.make_usdz import (
     LANE_M,
     START_US,
@@ -29,6 +29,7 @@ from tests.scenarios.make_usdz import (
     tables,
     write,
 )
+from tests.scenarios.usdz_scene import read_usdz_scene
 
 
 def changed(**parts: bytes | None):

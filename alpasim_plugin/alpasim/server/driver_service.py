@@ -311,7 +311,12 @@ class Driving:
                     f"{type(policy).__name__}: {problem}",
                     "simrun check policy finds all faults of a policy",
                 )
-            return self._answer(plan, ego.T_world_rig)
+            wires = [
+                _absolute(plan, xy_yaw, ego.T_world_rig)
+                for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)
+            ]
+            debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=wires[1:])
+            return egodriver_pb2.DriveResponse(trajectory=wires[0], debug_info=debug)
 
     def close(self) -> None:
         """Give back what the policy holds."""
@@ -365,14 +370,6 @@ class Driving:
             if abs(seen) > MOVING_MPS:
                 stated, turn = seen, float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
         return EgoState(now, pose, float(stated), float(accel), float(turn))
-
-    def _answer(self, plan: Plan, T_world_rig: F64) -> egodriver_pb2.DriveResponse:
-        wires = [
-            _absolute(plan, xy_yaw, T_world_rig)
-            for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)
-        ]
-        debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=wires[1:])
-        return egodriver_pb2.DriveResponse(trajectory=wires[0], debug_info=debug)
 
 
 def check_time(t_us: int, call: str) -> None:

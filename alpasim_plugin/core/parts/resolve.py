@@ -63,7 +63,7 @@ def entries(kind: KindName) -> Mapping[str, Entry]:
         InputError: Two packages claim one name.
     """
     taken = {name: target for name, (target, _) in BUILTIN[kind].items()}
-    others = installed_names(KINDS[kind].group, taken, kind)
+    others = installed_names(KINDS[kind].group, taken)
     known = {name: Entry(name, *part) for name, part in BUILTIN[kind].items()}
     return known | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
 

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.fixers.semantic_map.prepare import GROUP
 from alpasim_plugin.fixers.semantic_map.style import DEPTH_MAX_M, NEAR_M
 
@@ -24,13 +24,13 @@ BACK = FRONT + 3
 SHAPE = BACK + 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project(view, x, y, z):
     """Return the pixel (u, v) of a camera-frame point with z > 0."""
     return view[FX] * x / z + view[SKEW] * y / z + view[CX], view[FY] * y / z + view[CY]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_view(x, y, z, radius, view):
     """Return whether a sphere can reach the view: the depths between near and far, and the cone
     around the axis.
@@ -41,7 +41,7 @@ def _in_view(x, y, z, radius, view):
     return view[COS_HALF] <= 0.0 or across * view[COS_HALF] - z * view[SIN_HALF] <= radius
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _to_camera(pose, p):
     """Map a point of the scene into the camera's axes by the upper ``(3, 4)`` of a transform."""
     return (
@@ -51,7 +51,7 @@ def _to_camera(pose, p):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def strokes(ends, style, spheres, pose, view, out, count):
     """Project segments ``(S, 2, 3)`` into strokes after the first ``count``; return how many there
     are then. Beyond the capacity of ``out`` they are counted, not written.
@@ -98,7 +98,7 @@ def strokes(ends, style, spheres, pose, view, out, count):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _faces_away(a, b, c):
     """Return whether the camera lies behind a triangle that is wound to the left from its front."""
     ux = b[0] - a[0]
@@ -113,7 +113,7 @@ def _faces_away(a, b, c):
     return nx * a[0] + ny * a[1] + nz * a[2] >= 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _clip(raw, kept):
     """Clip a triangle ``(3, 4)`` of x, y, z, shade at the near plane (Sutherland and Hodgman);
     return how many corners ``kept`` holds.
@@ -135,7 +135,7 @@ def _clip(raw, kept):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shapes(corners, closed, shade, style, pose, view, out, count):
     """Project triangles ``(T, 3, 3)`` into shapes after the first ``count``; return how many there
     are then. Beyond the capacity of ``out`` they are counted, not written.

@@ -11,8 +11,8 @@ depend on the number of threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.fixers.semantic_map.kernels import (
     BACK,
     BIAS,
@@ -40,7 +40,7 @@ ALL = 15  # the mask of all samples
 SLACK = 0.4  # a sample lies at most so far from the centre, along an axis
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rows_of(strokes, shapes, stretch, height, stroke_rows, shape_rows):
     """Write the first and last image row that each stroke and shape can touch."""
     for i in range(strokes.shape[0]):
@@ -54,7 +54,7 @@ def rows_of(strokes, shapes, stretch, height, stroke_rows, shape_rows):
         shape_rows[i, 1] = int(min(max(shape[1], shape[5], shape[9]) + 1.0, height - 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pack(red, green, blue, fade):
     return np.uint32(
         np.uint32(red * fade + 0.5)
@@ -63,13 +63,13 @@ def _pack(red, green, blue, fade):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fade(inverse):
     """Return the share of colour and width that is left at a depth of 1 / ``inverse``."""
     return max(0.0, 1.0 - 1.0 / (inverse * DEPTH_MAX_M))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _touch(touched, line, begin, end):
     """Note the columns of a row of the band that were written."""
     if end >= 0:
@@ -77,7 +77,7 @@ def _touch(touched, line, begin, end):
         touched[line, 1] = max(touched[line, 1], end)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched):
     x0 = stroke[X0]
     y0 = stroke[Y0]
@@ -151,7 +151,7 @@ def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched)
         _touch(touched, row - band_row, begin, end)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
     x = shape[0:12:4]
     y = shape[1:12:4]
@@ -244,7 +244,7 @@ def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
         _touch(touched, row - band_row, begin, end)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw_bands(
     cursor, lines, boxes_edges, line_rows, edge_rows, shapes, shape_rows, stretch, image
 ):
@@ -276,7 +276,7 @@ def draw_bands(
         _resolve(band_row, end_row, depth, colour, touched, image)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _resolve(band_row, end_row, depth, colour, touched, image):
     """Average the samples of a band into the image and clear the buffers."""
     width = image.shape[1]

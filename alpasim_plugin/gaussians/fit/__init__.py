@@ -1,6 +1,6 @@
 """Reconstruct a scene: fit 3D Gaussians to posed views.
 
-`logged_views` or `photographs.read_views` give views, `start_from_depth` gives a start, and
+`logged_views` gives views, `start_from_depth` gives a start, and
 `loop.fit` the `Reconstruction`.
 """
 

@@ -8,24 +8,22 @@ through their converters, for example):
     "k1": -0.1,
      "ply_file_path": "points.ply",
      "frames": [{"file_path": "images/0000.png", "transform_matrix": [[...], [...], [...], [0, 0, 0,
-         1]], "t_us": 100000, "camera": "front", "sky_path": "sky/0000.png", "mask_path":
-         "masks/0000.png"}]}
+         1]], "t_us": 100000, "camera": "front"}]}
 
 ``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie:
 ``opencv`` is x right, y down, z forward; ``opengl`` is x right, y up, z back (what Instant-NGP and
 nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3; with
 ``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``,
 radians, may stand for the focal length. Pictures are freed of their distortion as they are read.
-Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``sky_path`` is
-white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path``
+Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
 names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,7 @@ from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes, read_json_object
 from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.reading.images import check_image, decode_image, picture_fault
-from alpasim_plugin.core.types import F64, U8, Bool
+from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply_element, read_ply_header
@@ -70,8 +68,6 @@ _KEYS = """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y 
     black_transparent"""
 KNOWN_KEYS = frozenset(_KEYS.split())
 RIGID = 1e-12  # a rotation this exact is taken as it is written
-
-ActorsAt = Callable[[int], Mapping[str, F64]]  # time in microseconds -> actor id to T_world_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,41 +141,6 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any]
     return document, [
         _picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)
     ]
-
-
-def read_views(
-    folder: Path, actors_at: ActorsAt | None = None
-) -> tuple[list[PosedView], GaussianCloud | None]:
-    """Read a folder of posed images at full size, in metres: ``axes`` must be there, because files
-    of both kinds look alike.
-
-    Args:
-        folder: Holds ``transforms.json`` and what it names.
-        actors_at: Poses of the actors at a frame's ``t_us``; None, or a frame without time, has no
-            actors.
-
-    Returns:
-        The views in the file's order; and the start cloud that its points give, None where it names
-        no points.
-
-    Raises:
-        InputError: A file or key is missing, or something in them cannot be: names the frame and
-            what was found.
-    """
-    document, pictures = read_pictures(folder)
-    if not pictures:
-        raise InputError(f"{folder / FILE}: no frames", "list at least one frame")
-    views = []
-    for picture in pictures:
-        sky, mask = (_flags(folder, picture, key) for key in ("sky_path", "mask_path"))
-        actors = (
-            actors_at(picture.t_us) if actors_at is not None and picture.t_us is not None else {}
-        )
-        views.append(replace(picture.view(), sky=sky, mask=mask, actors=actors))
-    points = document.get("ply_file_path")
-    return views, None if points is None else read_points(
-        inside(folder, folder / str(points), "ply_file_path")
-    )
 
 
 def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
@@ -347,18 +308,6 @@ def rigid_pose(value: Any, where: str) -> F64:
     if off > RIGID:  # what is written with a few digits is not quite a rotation
         T[:3, :3] = rotation
     return T
-
-
-def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:
-    if key not in picture.more:
-        return None
-    image = read_photograph(
-        inside(folder, _file(folder, picture.more, key, picture.where), picture.where),
-        picture.lens,
-        picture.where,
-        cv2.IMREAD_GRAYSCALE,
-    )
-    return np.asarray(picture.lens.straightened(image) > 127)
 
 
 def inside(folder: Path, path: Path, where: str) -> Path:

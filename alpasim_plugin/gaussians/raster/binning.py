@@ -10,8 +10,8 @@ CPU this beats the sort of all (tile, depth) pairs that GPU rasterisers use.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.core.kernels import inlined_kernel, kernel
 from alpasim_plugin.gaussians.constants import (
     HALF_WIDTH,
     RADIUS_X,
@@ -26,7 +26,7 @@ from alpasim_plugin.gaussians.constants import (
 from alpasim_plugin.gaussians.raster import simd as v
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _tile_span(low, high, n_tiles):
     """Return the first and one past the last tile whose pixel centres can lie between two
     coordinates.
@@ -42,7 +42,7 @@ def _tile_span(low, high, n_tiles):
     return np.int32(first), np.int32(last)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _ellipse_columns(records, at, row, tiles_x):
     """Return the first and one past the last tile of a tile row that a splat's ellipse can
     touch.
@@ -72,7 +72,7 @@ def _ellipse_columns(records, at, row, tiles_x):
     return _tile_span(records[at + U] - left, records[at + U] + right, tiles_x)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _tile_box(records, at, tiles_x, tiles_y):
     """Return the tiles of a splat's box: first and one past the last column, the same for rows."""
     left, right = _tile_span(
@@ -84,7 +84,7 @@ def _tile_box(records, at, tiles_x, tiles_y):
     return left, right, top, bottom
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _is_large(left, right, top, bottom):
     """Return whether a box has corners that its ellipse may leave empty: such splats are listed row
     by row, the others box by box.
@@ -92,7 +92,7 @@ def _is_large(left, right, top, bottom):
     return bottom - top > 2 and right - left > 2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _count_box(changes, stride, left, right, top, bottom):
     """Count a box of tiles at its four corners; `tile_offsets` adds up from there."""
     changes[top * stride + left] += 1
@@ -101,7 +101,7 @@ def _count_box(changes, stride, left, right, top, bottom):
     changes[bottom * stride + right] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram):
     """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
 
@@ -131,7 +131,7 @@ def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, box
                 _count_box(changes, stride, left, right, top, bottom)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tile_offsets(histogram, tiles_x, starts):
     """Turn the changes into each chunk's write positions; fill ``starts`` (tiles + 1); return the
     number of (splat, tile) pairs.
@@ -160,7 +160,7 @@ def tile_offsets(histogram, tiles_x, starts):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, lists):
     """Write each tile's list of records; chunks ascend and so do the ranks in a chunk, hence every
     list is in depth order.

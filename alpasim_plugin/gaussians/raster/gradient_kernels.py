@@ -20,8 +20,8 @@ whitened coordinates ``s, t`` of the exponent, which stay small for needles.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.core.kernels import float_kernel, kernel
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, Z
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.raster_kernels import (
@@ -38,7 +38,7 @@ from alpasim_plugin.gaussians.raster.raster_kernels import (
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3, sh_terms
 
 _f = np.float32
-_sh_terms = njit(cache=True, nogil=True, error_model="numpy")(sh_terms)
+_sh_terms = float_kernel(sh_terms)
 
 # Columns of a block in the backward pass: the above, then the sum S and the gradients of colour,
 # depth sum and alpha.
@@ -55,7 +55,7 @@ PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_T
 PAIR = 10
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth):
     """Load a tile's state; return the bit mask of blocks where anything was drawn and the position
     behind the last splat drawn.
@@ -82,7 +82,7 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
     return live, end
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
     """Walk a tile's splats from the back and write a row of ``pairs`` for each that was drawn."""
     zero = v.splat(_f(0.0))
@@ -153,7 +153,7 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
         pairs[row + PAIR_TT] = v.total(m_tt)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tile_gradients(
     cursor, tiles_x, starts, lists, records, kept, g_colour, g_alpha, g_depth, pairs
 ):
@@ -183,7 +183,7 @@ def tile_gradients(
         _tile_backward(starts[tile], end, lists, records, x0, y0, pixels, live, pairs)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def write_basis(basis, size, x, y, z):
     """Write ``size`` harmonics of a unit direction."""
     basis[0] = C0
@@ -193,7 +193,7 @@ def write_basis(basis, size, x, y, z):
             basis[k] = terms[k - 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def basis_gradient(weights, size, x, y, z):
     """Return the gradient with respect to x, y and z of the harmonics' sum weighted by
     ``weights``.
@@ -245,7 +245,7 @@ def basis_gradient(weights, size, x, y, z):
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def colour_splats(cursor, chunk_size, count, ids, means, centre, sh, records):
     """Write the colours of projected splats; called by each thread.
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from alpasim_plugin.core.kernels import float_kernel
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     CAM_FX,
@@ -63,44 +63,44 @@ _f = np.float32
 # Small vectors and matrices are tuples (of rows) with constant indices: they live in registers.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _dot(a, b):
     """Return the inner product of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _times(matrix, b):
     """Return a 3 x 3 matrix times a column."""
     return _dot(matrix[0], b), _dot(matrix[1], b), _dot(matrix[2], b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _transposed(matrix):
     """Return a 3 x 3 matrix with rows and columns swapped."""
     p, q, r = matrix
     return (p[0], q[0], r[0]), (p[1], q[1], r[1]), (p[2], q[2], r[2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _scaled(a, factor):
     """Return a 3-vector times a number."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _less(a, share, b):
     """Return ``a - share b`` of 3-vectors."""
     return a[0] - share * b[0], a[1] - share * b[1], a[2] - share * b[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _two_products(p, a, q, b):
     """Return ``p a + q b`` of two numbers and two 3-vectors."""
     return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _unit_quaternion(quaternions, i):
     """Return row i as w, x, y, z of length one, and one over its length, float64."""
     w = np.float64(quaternions[i, 0])
@@ -111,7 +111,7 @@ def _unit_quaternion(quaternions, i):
     return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _rotation(q):
     """Return the rotation matrix of a unit quaternion."""
     w, x, y, z = q
@@ -122,7 +122,7 @@ def _rotation(q):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def pack(means, log_scales, quaternions, logits, lane_means, geometry):
     """Write parameters into the lanes that `project_kernels.project_node` reads; Gaussians below
     the alpha cut get means of NaN.
@@ -168,7 +168,7 @@ def pack(means, log_scales, quaternions, logits, lane_means, geometry):
     return bad
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def sum_pairs(cursor, chunk_size, gaussian, starts, lists, pairs, records, sums):
     """Add up the pairs of each visible splat; called by each thread. The order, tile by tile, never
     depends on threads.
@@ -213,7 +213,7 @@ def sum_pairs(cursor, chunk_size, gaussian, starts, lists, pairs, records, sums)
                     sums[out + PAIR_R + channel] = _f(0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _shape_gradient(m, n, sums, at):
     """Return the gradients of (u, v), of row m and of row n from the moments of h."""
     mm = _dot(m, m)
@@ -238,7 +238,7 @@ def _shape_gradient(m, n, sums, at):
     return du, dv, _scaled(a, w11), _two_products(w12, a, w22, b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _quaternion_gradient(q, inverse_length, d):
     """Return the gradient of a quaternion from that of the rotation matrix of its unit form."""
     w, x, y, z = q
@@ -256,7 +256,7 @@ def _quaternion_gradient(q, inverse_length, d):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weights):
     """Write the gradient of a Gaussian's coefficients and return that of its unit view
     direction.
@@ -272,7 +272,7 @@ def _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weig
     return basis_gradient(weights, size, direction[0], direction[1], direction[2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@float_kernel
 def splat_gradients(
     cursor,
     chunk_size,

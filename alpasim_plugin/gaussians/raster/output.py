@@ -25,7 +25,7 @@ class RasterOutput:
         alpha: ``(H, W)`` float32, accumulated opacity 1 - T; a wall of opaque splats ends at 0.99,
             not 1.
         depth: ``(H, W)`` float32 metres along the optical axis, alpha-weighted mean over the splats
-            of the pixel; 0 where alpha is 0, so read it together with `depth_valid`. At silhouettes
+            of the pixel; 0 where alpha is 0, so read it together with `alpha`. At silhouettes
             it lies between the surfaces.
         stats: Counts of the frame: ``gaussians``, ``visible`` and, for the tiled backend,
             ``pairs``.
@@ -35,11 +35,6 @@ class RasterOutput:
     alpha: F32
     depth: F32
     stats: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def depth_valid(self) -> npt.NDArray[np.bool_]:
-        """Return ``(H, W)``: where anything was drawn, so that `depth` means something."""
-        return self.alpha > 0
 
     def surface_depth(self) -> F32:
         """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     BLOCK_REACH,
@@ -108,7 +109,7 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def colours_in_lanes(coefficients, width, index, out):
     """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes;
     lanes left over are zero.
@@ -130,7 +131,7 @@ def colours_in_lanes(coefficients, width, index, out):
                     out[at + k * 16] = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spheres_in_view(spheres, poses, camera):
     """Return for each part, given the bounding sphere of all its Gaussians, whether it may be
     seen.
@@ -144,23 +145,23 @@ def spheres_in_view(spheres, poses, camera):
 # Three vectors of sixteen lanes, one per axis, are a tuple.
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _load3(array, at):
     return v.load(array, at), v.load(array, at + 16), v.load(array, at + 32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row(pose, at):
     """Return three numbers of a pose."""
     return pose[at], pose[at + 1], pose[at + 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dot(a, b):
     return v.fma(a[0], b[0], v.fma(a[1], b[1], a[2] * b[2]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _jacobian_row(scale, slope, across, ahead):
     """Return a row of J R: ``scale (across - slope ahead)``."""
     return (
@@ -170,7 +171,7 @@ def _jacobian_row(scale, slope, across, ahead):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _times(row, rows):
     """Return a row times a matrix of three rows."""
     a, b, c = rows
@@ -181,7 +182,7 @@ def _times(row, rows):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes):
     """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask
     of those that reach the image.
@@ -204,7 +205,7 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes):
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cross(a, b):
     return (
         v.fnma(a[2], b[1], a[1] * b[2]),
@@ -213,7 +214,7 @@ def _cross(a, b):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _at_its_time(p, turn, shift, camera):
     """Return where points are, in camera axes, when the pixel that shows them is exposed.
 
@@ -238,7 +239,7 @@ def _at_its_time(p, turn, shift, camera):
     return x, y, v.maximum(z, 1e-3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of
     those that reach the image.
@@ -321,7 +322,7 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _colour_group(group, d, sh, sh_size, lanes):
     """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0
     below.
@@ -344,7 +345,7 @@ def _colour_group(group, d, sh, sh_size, lanes):
     v.store(lanes, B * 16, v.maximum(blue, 0.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_part(
     cursor,
     part,

@@ -18,9 +18,9 @@ below 2e-6, without range reduction.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import chebyshev
 
+from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -67,7 +67,7 @@ KEPT = 32
 CHUNK = 256  # splats of a tile that are taken at once, a multiple of 64
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pixel_of(tile_x, tile_y, block, pixel):
     """Return the image column and row of a pixel (0..15) of a tile's block (0..15)."""
     return tile_x * TILE + (block & 3) * 4 + (pixel & 3), tile_y * TILE + (block >> 2) * 4 + (
@@ -75,7 +75,7 @@ def pixel_of(tile_x, tile_y, block, pixel):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_centres(x0, y0, block):
     """Return the pixel centres of a tile's block, ``x`` and ``y``; ``x0, y0`` is that of the tile's
     first pixel.
@@ -85,7 +85,7 @@ def block_centres(x0, y0, block):
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def start_tile(state, x0, y0, width, height):
     """Reset the state of a tile and return the bit mask of blocks that hold a pixel of the
     image.
@@ -106,7 +106,7 @@ def start_tile(state, x0, y0, width, height):
     return live
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def whitened(records, at, x, y):
     """Return ``s`` and ``t`` at sixteen pixel centres: the splat's exponent is ``peak - s^2 -
     t^2``.
@@ -116,7 +116,7 @@ def whitened(records, at, x, y):
     return s, records[at + L22] * dy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def touched_blocks(records, at, x0, y0):
     """Return the bit mask of the sixteen blocks that a splat can touch; ``x0, y0`` is the centre of
     the tile's first pixel.
@@ -130,7 +130,7 @@ def touched_blocks(records, at, x0, y0):
     return v.bits(touched & in_columns & in_rows)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def falloff(y):
     """Return ``2^(8 y - 4)``, the opacity at an exponent between the cut and 0.5, not yet held to
     the largest alpha.
@@ -145,7 +145,7 @@ def falloff(y):
     return p * p
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blend_block(block, x, y, first, masks, near, state, kept, kept_at):
     """Blend the splats of a chunk that touch a block; returns whether its pixels are finished."""
     base = block * STATE
@@ -195,7 +195,7 @@ def _blend_block(block, x, y, first, masks, near, state, kept, kept_at):
     return finished
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def composite_tile(lists, start, end, records, x0, y0, state, live, kept, kept_at, near, masks):
     """Blend a tile's splats in order; ``x0, y0`` is the centre of its first pixel.
 
@@ -223,7 +223,7 @@ def composite_tile(lists, start, end, records, x0, y0, state, live, kept, kept_a
             return
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha, depth_sum):
     """Render tiles until none is left, without background; called by each thread.
 

@@ -42,7 +42,8 @@ def rasterize(
     Example:
         >>> import numpy as np
         >>> cloud = GaussianCloud([[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3)))
-        >>> out = rasterize(cloud, PinholeCamera.from_hfov(32, 16, 1.0), backend="reference")
+        >>> K = np.array([[30.0, 0, 16], [0, 30, 8], [0, 0, 1]])
+        >>> out = rasterize(cloud, PinholeCamera(32, 16, K, np.eye(4)), backend="reference")
         >>> out.rgb.shape, round(float(out.depth[8, 16]), 3)
         ((16, 32, 3), 5.0)
     """

@@ -241,7 +241,8 @@ def rasterize_gradient(
         >>> cloud = GaussianCloud([[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3)))
         >>> splats = Splats.from_cloud(cloud)
         >>> _ = splats.means.requires_grad_(True)
-        >>> out = rasterize_gradient(splats, PinholeCamera.from_hfov(32, 16, 1.0))
+        >>> K = np.array([[30.0, 0, 16], [0, 30, 8], [0, 0, 1]])
+        >>> out = rasterize_gradient(splats, PinholeCamera(32, 16, K, np.eye(4)))
         >>> out.alpha[:, :16].sum().backward()
         >>> bool(splats.means.grad[0, 0] < 0), out.screen.gradient_norm.shape
         (True, torch.Size([1]))

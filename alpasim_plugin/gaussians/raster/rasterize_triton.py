@@ -78,7 +78,13 @@ class UploadedClouds:
         factors = [cloud.rotations() * cloud.scales.astype(np.float64)[:, None] for cloud in clouds]
         self.factors = self._upload(_joined(factors, (3, 3)), np.float32)
         self.sh = self._upload(
-            _joined([_padded(cloud.sh, self.sh_size) for cloud in clouds], (self.sh_size, 3)),
+            _joined(
+                [
+                    np.pad(cloud.sh, ((0, 0), (0, self.sh_size - cloud.sh.shape[1]), (0, 0)))
+                    for cloud in clouds
+                ],
+                (self.sh_size, 3),
+            ),
             np.float32,
         )
         self.capacity = FIRST_CAPACITY
@@ -215,11 +221,6 @@ class UploadedClouds:
 def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:
     """Return arrays of rows of a shape as one, also where there is none."""
     return np.concatenate([np.zeros((0, *shape)), *arrays])
-
-
-def _padded(sh: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floating]:
-    """Return harmonics ``(N, K, 3)`` with zeros up to ``size`` coefficients."""
-    return np.pad(sh, ((0, 0), (0, size - sh.shape[1]), (0, 0)))
 
 
 def rasterize_triton(

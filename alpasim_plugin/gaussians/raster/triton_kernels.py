@@ -16,7 +16,6 @@ import triton.language as tl
 from alpasim_plugin.gaussians import constants, sh
 
 POSE = 13  # float64 per node: rotation node to camera by rows, camera centre in it, its 2D filter
-SPAN = 3  # int32 per block: number of the node, first Gaussian, number of Gaussians
 CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
 RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
 BOX = 4  # int32 per splat: first and last + 1 tile column, first and last + 1 tile row

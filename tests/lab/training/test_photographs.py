@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians.fit.photographs import read_views
 from alpasim_plugin.lab.training.photographs import read_photographs
 
 LENS = {
@@ -92,27 +91,6 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path)
                     round(v) - 4,
                 ]
                 assert np.abs(centre - [u, v]).max() < 0.4
-
-
-def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(
-    tmp_path,
-):
-    path = (
-        write(tmp_path, np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0]]))
-        / "transforms.json"
-    )
-    document = json.loads(path.read_text())
-    frames = [{**frame, "sky_path": frame["file_path"]} for frame in document["frames"][:2]]
-    path.write_text(json.dumps({**document, "axes": "opengl", "frames": frames}))
-    views, start = read_views(tmp_path)
-    assert start is None
-    for view, photograph in zip(views, read_photographs(tmp_path, 320).views, strict=True):
-        assert np.array_equal(view.rgb, photograph.rgb)
-        assert np.array_equal(view.camera.K, photograph.camera.K)
-        assert view.camera.cx != LENS["cx"]
-        assert np.array_equal(
-            view.sky, view.rgb[..., 0] > 127
-        )  # what lies over the picture is straightened with it
 
 
 @pytest.mark.parametrize(
