@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy
     from alpasim_plugin.runs.cell import make_renderer
     from alpasim_plugin.runs.rollout import run_rollout
-    from policies import make_policy
+    from policies.base import make_policy
     from scenarios.load import load_scenario
 
 __version__ = "0.1.0"
@@ -63,7 +63,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "load_scenario": "scenarios.load",
-        "make_policy": "policies",
+        "make_policy": "policies.base",
         "make_renderer": ".runs.cell",
         "run_rollout": ".runs.rollout",
         "serve_policy": ".alpasim.server.driver_service",

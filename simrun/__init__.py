@@ -40,8 +40,8 @@ if TYPE_CHECKING:
         score,
         series,
     )
-    from policies import check_policy, make_policy
-    from policies.base import plan_times
+    from policies.base import make_policy, plan_times
+    from policies.conformance import check_policy
     from scenarios.load import load_scenario
 
 HOMES = {
@@ -75,8 +75,8 @@ HOMES = {
         "score",
         "series",
     ],
-    "policies": ["check_policy", "make_policy"],
-    "policies.base": ["plan_times"],
+    "policies.base": ["make_policy", "plan_times"],
+    "policies.conformance": ["check_policy"],
     "scenarios.load": ["load_scenario"],
 }
 

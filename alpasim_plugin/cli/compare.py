@@ -16,8 +16,8 @@ from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.numbers import plural
 from evaluators.opening import read_run
-from evaluators.report import metric_lines
 from evaluators.report.tables import PairRow, pair_rows
+from evaluators.report.terminal import metric_lines
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
 

@@ -64,7 +64,8 @@ class Escaped:
 
 def first_screen(run: Run) -> list[Any]:
     """Return the one table of a run as lines for `show`."""
-    from evaluators.report import overview_lines, overview_of  # a listing needs no statistics
+    from evaluators.report.overview import overview_of
+    from evaluators.report.terminal import overview_lines
 
     return list(overview_lines(overview_of(run), Console().width))
 

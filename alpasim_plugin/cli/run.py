@@ -308,7 +308,7 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
 
 
 def _print_result(result: RunResult) -> None:
-    from evaluators.report import next_line  # what a run ends with is loaded while it is driven
+    from evaluators.report.terminal import next_line
 
     root = result.root
     run = read_run(root)

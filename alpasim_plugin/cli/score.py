@@ -19,7 +19,7 @@ from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import presets
 from evaluators.opening import read_run
-from evaluators.report import render_presets
+from evaluators.report.terminal import render_presets
 
 SHOWN_FAILURES = 5
 

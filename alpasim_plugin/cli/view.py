@@ -28,7 +28,7 @@ from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_run, read_so_far
-from evaluators.report import metric_lines
+from evaluators.report.terminal import metric_lines
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import DEFAULT_MB, MB, write_page
 

@@ -28,7 +28,7 @@ from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
-from policies import make_policy
+from policies.base import make_policy
 from scenarios.load import load_scenario
 
 BUDGET_S = 400.0  # for all sections

@@ -17,7 +17,7 @@ from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, REPORTS
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
-from evaluators.report import write_junit, write_report, write_summary_md
+from evaluators.report.ci import write_junit, write_summary_md
 from evaluators.report.flips import (
     FLIPS_NAME,
     Flip,
@@ -26,6 +26,7 @@ from evaluators.report.flips import (
     flip_entries,
     key_of_entry,
 )
+from evaluators.report.html import write_report
 from evaluators.viewer.cause import cause_of, write_cause
 from evaluators.viewer.cells import read_log
 from evaluators.viewer.page import write_flips_page

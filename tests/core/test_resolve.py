@@ -121,14 +121,14 @@ def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
     monkeypatch,
 ):
     home = "policies/simple.py"
-    digest = resolve("policy", "policies:ConstantVelocity").digest
+    digest = resolve("policy", "policies.simple:ConstantVelocity").digest
     whole = spec.code_digest
     monkeypatch.setattr(
         spec,
         "code_digest",
         lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""),
     )
-    assert resolve("policy", "policies:ConstantVelocity").digest != digest
+    assert resolve("policy", "policies.simple:ConstantVelocity").digest != digest
 
 
 def test_settings_in_brackets_make_another_arm_of_one_fixer():

@@ -19,7 +19,7 @@ from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import score
-from policies import make_policy
+from policies.base import make_policy
 
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402

@@ -13,8 +13,7 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2, yaw_of
 from alpasim_plugin.core.types import Plan, SensorSpec
-from policies import check_policy
-from policies.conformance import canned_scenario
+from policies.conformance import canned_scenario, check_policy
 from policies.simple import PurePursuit
 
 SCENARIO = canned_scenario()

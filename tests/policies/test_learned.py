@@ -11,8 +11,8 @@ import torch
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import inverse, se2, transform_points
 from alpasim_plugin.core.types import EgoState, Observation
-from policies import check_policy, make_policy
-from policies.conformance import STRAIGHT, observations
+from policies.base import make_policy
+from policies.conformance import STRAIGHT, check_policy, observations
 from policies.learned import Learned
 from policies.learned_input import (
     FOCAL_PX,

@@ -11,7 +11,7 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, inverse, se2, trajectory_from_poses, yaw_of
 from alpasim_plugin.core.types import EgoState, Observation, Plan, Route, Vehicle
-from policies import make_policy
+from policies.base import make_policy
 from policies.conformance import START_US, canned_scenario
 from tests.policies.policy_world import NO_ROUTE, to_world
 

@@ -20,8 +20,8 @@ from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
 from evaluators.numbers import DASH
 from evaluators.opening import read_run
-from evaluators.report import write_report
 from evaluators.report.ci import overview_md
+from evaluators.report.html import write_report
 from evaluators.report.overview import decided, overview_of, tone_of
 from evaluators.report.terminal import overview_lines
 from evaluators.statistics.paired import paired

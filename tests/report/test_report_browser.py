@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaluators.report import write_report
+from evaluators.report.html import write_report
 
 pytestmark = pytest.mark.slow
 

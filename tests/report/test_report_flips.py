@@ -9,8 +9,8 @@ import pytest
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import in_words, outcomes_of
 from evaluators.opening import Run, read_run
-from evaluators.report import write_report
 from evaluators.report.flips import find_flips, flip_rows
+from evaluators.report.html import write_report
 
 
 def rollout(renderer, seed=0, status="ok", **metrics: float):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from evaluators.report import write_report
 from evaluators.report.charts import Axes, round_ticks
+from evaluators.report.html import write_report
 from tests.report.make_run import Plan, make_run
 
 VOID = {"meta", "link", "img", "input", "br", "wbr"}

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.opening import read_run
-from evaluators.report import write_junit
-from evaluators.report.ci import clean, junit
+from evaluators.report.ci import clean, junit, write_junit
 
 
 def test_one_case_per_rollout_and_an_error_per_failure(usual_run):

@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.opening import read_run
-from evaluators.report import write_summary_md
-from evaluators.report.ci import CUT_NOTE, cut, escape, overview_md, table
+from evaluators.report.ci import CUT_NOTE, cut, escape, overview_md, table, write_summary_md
 from evaluators.report.overview import overview_of
 
 

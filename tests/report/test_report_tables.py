@@ -6,10 +6,10 @@ from typing import Any
 
 from evaluators.numbers import DASH
 from evaluators.opening import read_run
-from evaluators.report import metric_lines
 from evaluators.report.fixers import speed
 from evaluators.report.provenance import ledger
 from evaluators.report.tables import metric_rows, pair_rows
+from evaluators.report.terminal import metric_lines
 
 
 def entry(mean: float | None, **more: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from evaluators.report import write_report
+from evaluators.report.html import write_report
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ from urllib.parse import quote
 import pytest
 
 from evaluators.opening import read_run
-from evaluators.report import write_report
+from evaluators.report.html import write_report
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import write_page
 from tests.report.make_run import Plan

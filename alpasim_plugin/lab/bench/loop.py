@@ -30,7 +30,7 @@ from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.provenance import hardware, versions
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.rollout import run_rollout
-from policies import make_policy
+from policies.base import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 

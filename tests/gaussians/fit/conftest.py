@@ -13,8 +13,8 @@ from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
-from alpasim_plugin.gaussians.fit import PosedView, Start, start_from_depth
-from alpasim_plugin.gaussians.fit.views import seen_from
+from alpasim_plugin.gaussians.fit.start import Start, start_from_depth
+from alpasim_plugin.gaussians.fit.views import PosedView, seen_from
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb

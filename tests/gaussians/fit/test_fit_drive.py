@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.gaussians.fit import SplatRecipe, drive
+from alpasim_plugin.gaussians.fit import drive
 from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.loop import SplatFit
 from alpasim_plugin.gaussians.fit.model import Exposure
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth
 

@@ -13,12 +13,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, ssim
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.fit import (
-    SplatRecipe,
-    Start,
-    cloud_from_points,
-    start_from_depth,
-)
 from alpasim_plugin.gaussians.fit.model import (
     RowAdam,
     ScreenGradients,
@@ -26,8 +20,14 @@ from alpasim_plugin.gaussians.fit.model import (
     densify,
 )
 from alpasim_plugin.gaussians.fit.quality import SsimTarget
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import sky_of
-from alpasim_plugin.gaussians.fit.start import start_in_boxes
+from alpasim_plugin.gaussians.fit.start import (
+    Start,
+    cloud_from_points,
+    start_from_depth,
+    start_in_boxes,
+)
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.gaussians.fit.conftest import BOX, FAR, actor_pose
 from tests.gaussians.gaussian_scenes import covariances, random_cloud, random_rigid

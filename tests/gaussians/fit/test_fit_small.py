@@ -12,12 +12,10 @@ import pytest
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.fit import (
-    SplatRecipe,
-    Start,
-    loop,
-)
+from alpasim_plugin.gaussians.fit import loop
 from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.start import Start
 from tests.gaussians.fit.conftest import BOX, actor_pose, at, camera_at
 
 QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
