@@ -402,7 +402,7 @@ class ScenarioSpec(Part):
     scene_id: str | None = Field(
         default=None,
         max_length=100,
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$",
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*(@@[-+.0-9e]+)?$",
         description="Name of the scene; none: the file's folder and name.",
     )
     description: str = Field(default="", description="One sentence.")

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,6 +42,7 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
+from alpasim_plugin.runs.vary import BoundarySearch, Sweep, execute_sweep
 from evaluators import preset as find_preset
 from evaluators.numbers import plural
 from evaluators.opening import read_run
@@ -66,6 +68,8 @@ Examples:
 - `simrun --renderer clean,3dgs --executor 'ray?cores=2' suites/urban`
 
 - `simrun --renderer clean,3dgs --until-decided --metric offroad=0.1 suites/all`: stop as soon as it is decided whether 3dgs is worse than clean
+
+- `simrun --renderer clean --policy pure-pursuit --vary actors.cutter.s_m=4..40 hard/cut_in`: from which gap on it does not collide
 """
 
 
@@ -142,6 +146,10 @@ def run(
             metavar="NAME[=MARGIN]",
         ),
     ] = (),
+    vary: Annotated[
+        str | None,
+        Flag("Find where each variant starts to fail along a key.", metavar="KEY=LOW..HIGH"),
+    ] = None,
     repeat: Annotated[
         bool,
         Flag("Drive a rollout of each policy twice and compare the logs.", "--repeat"),
@@ -160,14 +168,20 @@ def run(
     refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
     if shard is not None:
         refs = shard_of(refs, shard)
-    plan = make_plan(
-        refs,
-        split_names(renderer),
-        split_policies(policy),
-        parse_seeds(seeds),
-        replace(options, fixer=of_fixer),
+    planned = partial(
+        make_plan,
+        renderers=split_names(renderer),
+        policies=split_policies(policy),
+        seeds=parse_seeds(seeds),
+        options=replace(options, fixer=of_fixer),
     )
-    plan = replace(plan, asked=scenarios)
+    sweep = None if vary is None else Sweep.parse(vary)
+    if sweep is not None and (len(refs) != 1 or until_decided or repeat or resume):
+        raise InputError(
+            f"--vary {vary}: takes one scene, and no --until-decided, --repeat or --resume",
+            "Name one scene and leave these options out.",
+        )
+    plan = replace(planned(refs), asked=scenarios)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
@@ -177,6 +191,10 @@ def run(
         plan = plan_of_two(plan, question)
     elif metric:
         raise InputError("--metric: without --until-decided", "Add --until-decided.")
+    search = None
+    if sweep is not None:
+        search = BoundarySearch(plan, sweep, planned)
+        plan = search.ceiling
     root = out or default_folder(plan)
     if dry_run:
         _print_plan(plan, root, thread_budget(workers, len(plan.cells), ray), as_json)
@@ -188,6 +206,17 @@ def run(
                 decided = execute_decision(
                     plan,
                     question,
+                    root,
+                    workers=workers,
+                    command=command,
+                    progress=progress,
+                    report=report,
+                    limit_s=time_limit,
+                    executor=ray,
+                )
+            elif search is not None:
+                result = execute_sweep(
+                    search,
                     root,
                     workers=workers,
                     command=command,

@@ -30,7 +30,7 @@ from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_run, read_so_far
 from evaluators.report.terminal import metric_lines
 from evaluators.viewer.cells import Wanted
-from evaluators.viewer.page import DEFAULT_MB, MB, write_page
+from evaluators.viewer.page import MB, write_page
 
 PAGE = "view.html"
 
@@ -63,7 +63,6 @@ def view(
         Path | None,
         Flag("The file; by default view.html in the run folder, or SCENE.png here.", also="-o"),
     ] = None,
-    max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
     as_json: Json = False,
 ) -> None:
     """Replay rollouts on an offline page, or draw a scenario.
@@ -89,7 +88,7 @@ def view(
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
     wanted = wanted_of(so_far.run.rollouts, cell, asked)
     page = out or root / PAGE
-    made = write_page(so_far.run, page, wanted, int(max_mb * MB))
+    made = write_page(so_far.run, page, wanted)
     facts = {
         "page": str(page),
         "bytes": made.size,

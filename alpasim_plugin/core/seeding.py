@@ -3,14 +3,18 @@
 The hashed key seeds a Philox counter-based generator. A stream depends on its key alone: not on
 call order, worker count or platform. The renderer's name is not part of the key of a shared
 component: all renderers get common random numbers, which reduces the variance of paired
-differences.
+differences. A scene at several values of a parameter keeps its streams: the value in its name is not
+part of the key.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 
 import numpy as np
+
+POINT = "@@"  # and a number in the name of a scene: a value of a varied parameter
 
 
 def derive_seed(scene_id: str, seed: int, component: str, step: int = 0) -> int:
@@ -32,5 +36,6 @@ def stream(scene_id: str, seed: int, component: str, step: int = 0) -> np.random
 
 
 def _digest(scene_id: str, seed: int, component: str, step: int) -> bytes:
-    text = f"{scene_id}\x1f{int(seed)}\x1f{component}\x1f{int(step)}"
+    scene = re.sub(POINT + r"[-+.0-9e]+", "", scene_id)
+    text = f"{scene}\x1f{int(seed)}\x1f{component}\x1f{int(step)}"
     return hashlib.blake2b(text.encode(), digest_size=32).digest()

@@ -43,7 +43,13 @@ from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
 SHORT_KEY = 4  # letters in the name of a run folder
-IN_SUMMARY = ("pool", "repeat", "exit_code", "alpasim")  # members of run.json in the summary too
+IN_SUMMARY = (
+    "pool",
+    "repeat",
+    "exit_code",
+    "alpasim",
+    "boundary",
+)  # members of run.json in the summary too
 
 
 class Progress(Protocol):

@@ -29,6 +29,7 @@ from evaluators.numbers import DASH, plural
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
+from evaluators.report.boundary import boundary_section
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, flip_bases, flip_rows
@@ -145,6 +146,7 @@ def context(run: Run) -> dict[str, Any]:
         "ending_tones": TONES,
         "shots": worst_change(run),
         "decision": decision_section(run),
+        "boundary": boundary_section(run.summary.get("boundary")),
         "gate": gate_section(run),
         "columns": tables.columns(run),
         "variant_colour": colours,

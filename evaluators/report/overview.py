@@ -247,7 +247,9 @@ def overview_of(run: Run) -> Overview:
     """Lay out the first screen of a run."""
     table = run.summary.get("outcomes") or outcome_table(run.rollouts)
     decision = read_decision(run.folder)
-    differences = {} if decision is not None else differences_of(run)
+    boundary = run.summary.get("boundary")
+    is_sequential = decision is not None or boundary is not None
+    differences = {} if is_sequential else differences_of(run)
     rows = tuple(_row(run, name, entry, differences) for name, entry in table.items())
     primary = run.table.shown(run.table.primary)
     return Overview(
@@ -256,7 +258,11 @@ def overview_of(run: Run) -> Overview:
         primary.words,
         scale_and_unit(primary, primary.unit)[1],
         primary.direction == "higher",
-        decided(rows) if decision is None else verdict_text(decision),
+        boundary["sentence"]
+        if boundary
+        else decided(rows)
+        if decision is None
+        else verdict_text(decision),
         _cautions(run),
     )
 

@@ -251,7 +251,7 @@ def _notes(
     failed = [cell for cell in cells if not cell.watchable]
     notes = []
     if too_many:
-        notes.append(f"No room for {_named(too_many)}. --max-mb makes room.")
+        notes.append(f"No room for {_named(too_many)}. --scene, --policy and --seed choose.")
     if left:
         why = "not chosen"
         if all(cell.interest == "quiet" for cell in left):
@@ -261,10 +261,7 @@ def _notes(
         notes.append(f"Every rollout failed, so that nothing is shown: {_named(failed)}.")
     if stride > 1:
         ordinal = ORDINALS.get(stride, f"{stride}th")
-        notes.append(
-            f"Every {ordinal} camera frame is kept: --max-mb makes room. "
-            "Poses, plans and metrics are whole."
-        )
+        notes.append(f"Every {ordinal} camera frame is kept. Poses, plans and metrics are whole.")
     return notes
 
 

@@ -1,0 +1,329 @@
+"""Sequential search along one parameter of a scene: drive the points of a grid that enclose where
+each variant starts to fail.
+
+Everything but the parameter stays as it is: the scene is the same, and so is the noise, since every
+point bears the scene's name with its value behind it (`core.seeding.POINT`). What is driven next
+follows from the outcomes alone, so the same command continues after any interruption.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.alpasim.client.child import end_children
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts import digest
+from alpasim_plugin.core.seeding import POINT
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
+from alpasim_plugin.log.run_folder.writer import writing
+from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
+from alpasim_plugin.runs.executors.choice import LOCAL, Executor
+from alpasim_plugin.runs.plan import Cell, RunPlan
+from alpasim_plugin.runs.run import (
+    Progress,
+    RunResult,
+    claim,
+    finish_run,
+    on_done,
+    write_run_info,
+)
+from alpasim_plugin.runs.summary import pool_of
+from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
+from evaluators.report.boundary import sentence_of
+from evaluators.statistics.boundary import (
+    MOST_POINTS,
+    STEPS,
+    Bracket,
+    boundary_of,
+    bracket_of,
+    difference_of,
+    next_points,
+)
+from evaluators.statistics.variants import Variant, usual_base, variants_of
+from scenarios.suite import ScenarioRef
+
+KIND = "vary"  # of run.json
+UNITS = {"mps": "m/s", "mps2": "m/s\u00b2", "m": "m", "s": "s", "us": "\u00b5s", "rad": "rad"}
+RANGE = re.compile(r"([A-Za-z_][\w.\-]*)=([^=]+?)\.\.([^=]+)")
+MakePlan = Callable[[Sequence[ScenarioRef]], RunPlan]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One parameter of a scene and its range.
+
+    Attributes:
+        key: Dotted key of the scenario file.
+        low, high: Ends of the range.
+    """
+
+    key: str
+    low: float
+    high: float
+
+    @classmethod
+    def parse(cls, text: str) -> Sweep:
+        """Read ``KEY=LOW..HIGH``.
+
+        Raises:
+            InputError: Another form, no numbers, or ``LOW`` is not below ``HIGH``.
+        """
+        example = "Write for example --vary actors.cutter.s_m=4..14."
+        match = RANGE.fullmatch(text.strip())
+        if match is None:
+            raise InputError(f"--vary {text}: not KEY=LOW..HIGH", example)
+        try:
+            low, high = float(match[2]), float(match[3])
+        except ValueError:
+            raise InputError(f"--vary {text}: an end is not a number", example) from None
+        if not -1e12 < low < high < 1e12:
+            raise InputError(f"--vary {text}: LOW is not below HIGH", example)
+        return cls(match[1], low, high)
+
+    def value(self, point: int) -> float:
+        """Return the value at a point of the grid; times in microseconds are whole numbers."""
+        value = self.low + (self.high - self.low) * point / STEPS
+        return float(round(value, 0 if self.key.endswith("_us") else 9))
+
+    @property
+    def unit(self) -> str:
+        """Give the unit that the key ends with; empty where it names none."""
+        return UNITS.get(self.key.rpartition("_")[2], "")
+
+
+@dataclass
+class BoundarySearch:
+    """The points driven so far, what follows from them, and which come next.
+
+    Attributes:
+        plan: The scene as written, with the keys of the whole run.
+        ceiling: The same with as many rollouts as the search drives at most.
+        driven: Manifests by the cell's folder.
+        cells: The cells driven so far.
+        scenes: Point -> plan of the scene with the parameter at that value.
+        unreachable: Point -> why the scene cannot be built there.
+    """
+
+    plan: RunPlan
+    sweep: Sweep
+    make: MakePlan
+    driven: dict[str, dict[str, Any]] = field(default_factory=dict)
+    cells: list[Cell] = field(default_factory=list)
+    scenes: dict[int, RunPlan] = field(default_factory=dict)
+    unreachable: dict[int, str] = field(default_factory=dict)
+    failed: dict[tuple[Variant, int], dict[int, bool]] = field(default_factory=dict)
+    stopped: str = ""
+
+    def __post_init__(self) -> None:
+        ref, sweep = self.plan.cells[0].ref, self.sweep
+        varied = digest([sweep.key, sweep.low, sweep.high, STEPS])
+        self.plan = replace(self.plan, question=varied)
+        self.ceiling = replace(self.plan, cells=self.plan.cells * MOST_POINTS, whole=self.plan)
+        self.own_id = self.plan.cells[0].scene.removesuffix(f"-seed{ref.seed}")
+        self.ref = ref
+        names = [(cell.renderer.name, cell.policy.name) for cell in self.plan.cells]
+        self.variants = variants_of(names)
+        self.failed = {(one, seed): {} for one in self.variants for seed in self.plan.seeds}
+        self.ends = self._reachable_ends()
+
+    def _reachable_ends(self) -> tuple[int, int]:
+        """Return the first and the last point at which the scene can be built."""
+        ends = [0, STEPS]
+        errors: list[InputError] = []
+        for point in ends:
+            try:
+                self._load(point)
+            except InputError as error:
+                errors.append(error)
+                self.unreachable[point] = error.message
+        if len(errors) == 2:
+            raise errors[0]
+        if not errors:
+            return 0, STEPS
+        bad, good = (0, STEPS) if 0 in self.unreachable else (STEPS, 0)
+        reached = good
+        while abs(reached - bad) > 1:
+            middle = (reached + bad) // 2
+            if self._is_reachable(middle):
+                reached = middle
+            else:
+                bad = middle
+        return min(reached, good), max(reached, good)
+
+    def _is_reachable(self, point: int) -> bool:
+        try:
+            self._load(point)
+        except InputError as error:
+            self.unreachable[point] = error.message
+        return point not in self.unreachable
+
+    def _load(self, point: int) -> RunPlan:
+        """Plan the rollouts of a point."""
+        if point not in self.scenes:
+            value = self.sweep.value(point)
+            written = f"{int(value)}" if value.is_integer() else f"{value!r}"
+            name = f"{self.own_id}{POINT}{written}"
+            more = (f"{self.sweep.key}={written}", f"scene_id={name}")
+            ref = replace(self.ref, overrides=(*self.ref.overrides, *more))
+            self.scenes[point] = self.make([ref])
+        return self.scenes[point]
+
+    def next_plan(self) -> RunPlan | None:
+        """Return the rollouts of the next round; None where the search has ended."""
+        if self.stopped:
+            return None
+        cells: list[Cell] = []
+        for (variant, seed), failed in self.failed.items():
+            points: list[int] = []
+            while not points:
+                asked = next_points(failed, self.ends, set(self.unreachable))
+                points = [point for point in asked if self._is_reachable(point)]
+                if not asked:
+                    break
+            for point in points:
+                cells += [
+                    cell
+                    for cell in self.scenes[point].cells
+                    if (cell.renderer.name, cell.policy.name, cell.seed)
+                    == (variant.renderer, variant.policy, seed)
+                ]
+        return self.plan_of(cells) if cells else None
+
+    def plan_of(self, cells: Sequence[Cell]) -> RunPlan:
+        """Return a plan of some cells with the keys of the whole run."""
+        known = {name: one for plan in self.scenes.values() for name, one in plan.scenarios.items()}
+        wanted = dict.fromkeys(cell.scene for cell in cells)
+        scenarios = {name: known[name] for name in wanted}
+        return replace(self.plan, cells=tuple(cells), scenarios=scenarios, whole=self.plan)
+
+    def add(self, cells: Sequence[Cell], manifests: Sequence[Mapping[str, Any]]) -> None:
+        """Take in the outcomes of a round."""
+        points = {plan.cells[0].scene: point for point, plan in self.scenes.items()}
+        for cell, manifest in zip(cells, manifests, strict=True):
+            self.cells.append(cell)
+            self.driven[cell.folder.as_posix()] = dict(manifest)
+            failed = _has_failed(manifest)
+            if failed is None:
+                self.stopped = f"{cell.folder.as_posix()} has no outcome"
+                continue
+            variant = Variant(cell.renderer.name, cell.policy.name)
+            self.failed[variant, cell.seed][points[cell.scene]] = failed
+
+    def record(self) -> dict[str, Any]:
+        """Return what ``summary.json`` holds of the search, as its member ``boundary``."""
+        values = {point: self.sweep.value(point) for point in range(STEPS + 1)}
+        found = {one: self._of_variant(one, values) for one in self.variants}
+        base = usual_base(self.variants, self.plan.options.baseline)
+        differences = {}
+        for variant, other in base.pairs(self.variants):
+            brackets, others = found[variant][1], found[other][1]
+            if brackets and others:
+                estimate = difference_of(brackets, others)
+                differences[variant.name] = {"baseline": other.name} | vars(estimate)
+        least, most = (values[point] for point in self.ends)
+        record: dict[str, Any] = {
+            "parameter": self.sweep.key,
+            "unit": self.sweep.unit,
+            "range": [self.sweep.low, self.sweep.high],
+            "reachable": [least, most],
+            "unreachable": {f"{values[k]:g}": self.unreachable[k] for k in self.unreachable},
+            "stopped": self.stopped,
+            "rollouts": len(self.driven),
+            "grid_rollouts": (STEPS + 1) * len(self.failed),
+            "variants": {one.name: facts for one, (facts, _) in found.items()},
+            "differences": differences,
+        }
+        return record | {"sentence": sentence_of(record)}
+
+    def _of_variant(
+        self, variant: Variant, values: Mapping[int, float]
+    ) -> tuple[dict[str, Any], list[Bracket]]:
+        """Return the facts of a variant, and the brackets of its seeds if all have one."""
+        seeds = {seed: self.failed[variant, seed] for seed in self.plan.seeds}
+        ended = {seed: bracket_of(failed, values) for seed, failed in seeds.items()}
+        outcomes = {
+            seed: [[values[point], failed[point]] for point in sorted(failed)]
+            for seed, failed in seeds.items()
+        }
+        facts: dict[str, Any] = {"outcomes": {str(seed): one for seed, one in outcomes.items()}}
+        brackets = [one for one in ended.values() if isinstance(one, Bracket)]
+        reasons = [one for one in ended.values() if isinstance(one, str)]
+        sides = {one.fails_below for one in brackets}
+        if self.stopped:
+            reasons.append("not finished")
+        elif len(sides) > 1:
+            reasons.append("fails on either side, by seed")
+        if reasons:
+            counted = [f"{why} in {reasons.count(why)} of {len(ended)} seeds" for why in reasons]
+            return facts | {"reason": "; ".join(dict.fromkeys(counted))}, []
+        side = "below" if sides.pop() else "above"
+        return facts | {"fails": side} | vars(boundary_of(brackets)), brackets
+
+
+def _has_failed(manifest: Mapping[str, Any]) -> bool | None:
+    """Tell whether a rollout had an outcome that counts as a failure; None where that is not
+    known.
+    """
+    if manifest["status"] != "ok":
+        return True if manifest["error"]["failure_class"] == POLICY_FAULT else None
+    metrics = manifest["metrics"]
+    measured = [metrics[name] for name in OUTCOMES if name in metrics]
+    if any(one["valid"] and one["value"] >= 0.5 for one in measured):
+        return True
+    known = {name: metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")}
+    return False if all(known.values()) else None
+
+
+def execute_sweep(
+    search: BoundarySearch,
+    root: Path,
+    workers: int | None,
+    command: Sequence[str],
+    progress: Progress,
+    *,
+    report: bool = True,
+    limit_s: float | None = None,
+    executor: Executor = LOCAL,
+) -> RunResult:
+    """Drive the points of a search until every boundary is enclosed, or none is there.
+
+    Args:
+        search: What is searched for.
+        root: The run folder; one process writes it at a time.
+        workers: As for a run; the results do not depend on them.
+        command: For ``run.json``.
+        progress: Shows rollouts.
+        report: Write ``report.html``.
+        limit_s: Seconds that one rollout may take.
+        executor: As for a run.
+
+    Raises:
+        InputError: The folder holds another run.
+        InfrastructureError: Another process writes the folder.
+    """
+    threads = thread_budget(workers, len(search.failed) * 2, executor)
+    how = HowToRun(threads, limit_s=limit_s, executor=executor)
+    with writing(root):
+        held = claim(root, search.plan, command, threads, False, progress.noticed)
+        progress.started(search.ceiling, root, threads)
+        began = time.perf_counter()
+        try:
+            while (plan := search.next_plan()) is not None:
+                search.add(
+                    plan.cells, execute(plan, root, how, on_done(progress), progress.noticed)
+                )
+        finally:
+            end_children()
+        manifests = list(search.driven.values())
+        took_s = time.perf_counter() - began
+        pool = {**how.stated, **pool_of(manifests, threads, took_s, held.get("pool"))}
+        write_run_info(root, search.plan_of(search.cells), command, threads)
+        write_run_json(root, read_run_json(root) | {"kind": KIND})
+        more = {"pool": pool, "boundary": search.record()}
+        summary = finish_run(root, manifests, more, report)
+    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])

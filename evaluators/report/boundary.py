@@ -1,0 +1,87 @@
+"""The boundary at which variants start to fail: its sentence, and its section in the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from evaluators.numbers import decimals, fixed
+from evaluators.report.charts import MUTED, VARIANT, Axes, Chart
+
+
+def sentence_of(record: Mapping[str, Any]) -> str:
+    """Say in one line where each variant starts to fail, and how far the boundaries differ.
+
+    Args:
+        record: The member ``boundary`` of ``summary.json``.
+    """
+    names = names_of(record)
+    texts = []
+    for name, facts in record["variants"].items():
+        if "value" in facts:
+            texts.append(f"{names[name]} fails {facts['fails']} {number(facts, record['unit'])}")
+        else:
+            texts.append(f"{names[name]} has no boundary: {facts['reason']}")
+    for name, facts in record["differences"].items():
+        other = names[facts["baseline"]]
+        difference = number(facts, record["unit"], sign=True)
+        texts.append(f"{names[name]} minus {other}: {difference}")
+    low, high = (f"{value:g}" for value in record["range"])
+    text = f"{record['parameter']} from {low} to {high}: {'; '.join(texts)}"
+    least, most = (f"{value:g}" for value in record["reachable"])
+    if (least, most) != (low, high):
+        text += f"; the scene can be built from {least} to {most} only"
+    share = 100 * record["rollouts"] / record["grid_rollouts"]
+    stopped = f", stopped: {record['stopped']}" if record["stopped"] else ""
+    return f"{text}; {record['rollouts']} rollouts, {share:.0f} % of a grid's{stopped}"
+
+
+def number(facts: Mapping[str, Any], unit: str, sign: bool = False) -> str:
+    """Write an estimate with its interval, such as ``6.4 m (6.1 to 6.8)``."""
+    values = [facts["value"], facts["low"], facts["high"]]
+    places = decimals(*values)
+    value, low, high = (fixed(one, places, sign=sign) for one in values)
+    return f"{value} {unit} ({low} to {high})".replace("  ", " ")
+
+
+def names_of(record: Mapping[str, Any]) -> dict[str, str]:
+    """Name variants by what they do not share: the renderer, the policy, or both."""
+    parts = [name.split("/") for name in record["variants"]]
+    for column in (0, 1):
+        if all(len(one) == 2 for one in parts) and len({one[1 - column] for one in parts}) == 1:
+            return {"/".join(one): one[column] for one in parts}
+    return {name: name for name in record["variants"]}
+
+
+def boundary_section(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Return the section of a run that searched for boundaries, None of any other."""
+    return None if record is None else {"title": record["sentence"], "charts": [chart(record)]}
+
+
+def chart(record: Mapping[str, Any]) -> Chart:
+    """Draw every driven point, a row for each variant and seed, with boundaries and intervals."""
+    axes, names = Axes(), names_of(record)
+    unit = f", {record['unit']}" if record["unit"] else ""
+    axes.labels = [f"{record['parameter']}{unit}", "variant, from below"]
+    for number_, (_, facts) in enumerate(record["variants"].items()):
+        colour = VARIANT[number_ % len(VARIANT)]
+        seeds = list(facts["outcomes"].values())
+        for row, outcomes in enumerate(seeds):
+            y = number_ + 0.6 * (row + 1) / (len(seeds) + 1) - 0.3
+            for has_failed, size in ((False, 3.0), (True, 6.0)):
+                at = [value for value, failed in outcomes if failed == has_failed]
+                shade = colour if has_failed else MUTED
+                axes.points(at, np.full(len(at), y), shade, size)
+        if "value" in facts:
+            level = np.array([number_ - 0.35, number_ + 0.35])
+            axes.band([facts["low"], facts["high"]], level[[0, 0]], level[[1, 1]], colour)
+            axes.line([facts["value"]] * 2, level, colour)
+    axes.limits = [None, (-0.6, len(names) - 0.4)]
+    listed = ", ".join(f"{i} {name}" for i, name in enumerate(names.values()))
+    note = (
+        f"Rows: {listed}. Large dots: the drive failed; small ones: it did not. "
+        "Line and band: the boundary and its interval of 95 %."
+    )
+    return axes.chart("Boundary", note)

@@ -1,0 +1,132 @@
+"""Where along one parameter of a scene a policy starts to fail: which points of a grid are driven
+next, the boundary of each seed, and their mean with its interval.
+
+A seed is a repeatable policy: its outcomes along the parameter are assumed to change once. Bisection
+then encloses the change between two neighbouring points of the grid, exactly for this seed. Over
+seeds the boundary is the mean of the middles, with Student's interval widened by half a bracket.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.stats
+
+STEPS = 64  # of the grid between both ends of the range
+FIRST_POINTS = 5  # driven before the bisection, both ends among them; they show a second change
+MOST_POINTS = 9  # that a seed drives: the first ones and four halvings
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """The change of outcome of one seed.
+
+    Attributes:
+        low, high: Values of the parameter between which the outcome changes.
+        fails_below: The drive fails at ``low`` and not at ``high``.
+    """
+
+    low: float
+    high: float
+    fails_below: bool
+
+    @property
+    def middle(self) -> float:
+        """Give the middle of both values."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half_width(self) -> float:
+        """Give half of their distance."""
+        return 0.5 * (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A boundary, or a difference of two, with its interval of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+def next_points(failed: Mapping[int, bool], ends: tuple[int, int], skipped: set[int]) -> list[int]:
+    """Return the points of the grid that a seed drives next; none where its search has ended.
+
+    Args:
+        failed: Point -> whether the drive failed there.
+        ends: The first and the last point.
+        skipped: Points at which the scene cannot be built.
+    """
+    first = np.linspace(*ends, FIRST_POINTS).round().astype(int).tolist()
+    asked = [point for point in dict.fromkeys(first) if point not in skipped]
+    if missing := [point for point in asked if point not in failed]:
+        return missing
+    changes = changes_of(failed)
+    if len(changes) != 1:
+        return []
+    low, high = changes[0]
+    inside = [point for point in range(low + 1, high) if point not in skipped]
+    return sorted(inside, key=lambda point: (abs(2 * point - low - high), point))[:1]
+
+
+def changes_of(failed: Mapping[int, bool]) -> list[tuple[int, int]]:
+    """Return the neighbouring driven points between which the outcome changes."""
+    points = sorted(failed)
+    return [(low, high) for low, high in pairwise(points) if failed[low] != failed[high]]
+
+
+def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Bracket | str:
+    """Return the bracket of a seed whose search has ended, or why there is none.
+
+    Args:
+        failed: Point -> whether the drive failed there.
+        values: Point -> value of the parameter.
+    """
+    changes = changes_of(failed)
+    if len(changes) > 1:
+        return "not monotone"
+    if not changes:
+        return "fails everywhere" if any(failed.values()) else "no failure"
+    low, high = changes[0]
+    return Bracket(values[low], values[high], failed[low])
+
+
+def boundary_of(brackets: Sequence[Bracket]) -> Estimate:
+    """Return the mean boundary of several seeds with its interval; of one seed its bracket.
+
+    Args:
+        brackets: One a seed, all of which fail on the same side.
+    """
+    return _mean(
+        [one.middle for one in brackets],
+        max(one.half_width for one in brackets),
+    )
+
+
+def difference_of(brackets: Sequence[Bracket], base: Sequence[Bracket]) -> Estimate:
+    """Return the mean difference of the boundaries of two variants, paired by seed.
+
+    Args:
+        brackets: One a seed.
+        base: Those of the baseline, in the same order of seeds.
+    """
+    pairs = list(zip(brackets, base, strict=True))
+    return _mean(
+        [one.middle - other.middle for one, other in pairs],
+        max(one.half_width + other.half_width for one, other in pairs),
+    )
+
+
+def _mean(values: Sequence[float], half_width: float) -> Estimate:
+    """Return a mean with Student's interval, widened by what the brackets leave open."""
+    mean = float(np.mean(values))
+    margin = half_width
+    if len(values) > 1:
+        quantile = scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1)
+        margin += float(quantile * np.std(values, ddof=1) / np.sqrt(len(values)))
+    return Estimate(mean, mean - margin, mean + margin)

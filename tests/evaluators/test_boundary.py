@@ -1,0 +1,65 @@
+"""Boundaries of simulated policies: the search, its intervals, and ranges without a boundary."""
+
+from __future__ import annotations
+
+import pytest
+
+from evaluators.statistics.boundary import (
+    MOST_POINTS,
+    STEPS,
+    Bracket,
+    boundary_of,
+    bracket_of,
+    difference_of,
+    next_points,
+)
+
+VALUES = {point: float(point) for point in range(STEPS + 1)}
+
+
+def searched(fails, skipped=(), ends=(0, STEPS)):
+    failed = {}
+    while points := next_points(failed, ends, set(skipped)):
+        failed |= {point: fails(point) for point in points}
+        assert len(failed) <= MOST_POINTS
+    return bracket_of(failed, VALUES), failed
+
+
+@pytest.mark.parametrize("truth", [0.5, 16.0, 31.7, 63.5])
+@pytest.mark.parametrize("fails_below", [True, False])
+def test_a_change_is_enclosed_between_neighbours(truth, fails_below):
+    found, _ = searched(lambda point: (point < truth) == fails_below)
+    assert found.high - found.low == 1
+    assert found.low <= truth <= found.high
+    assert found.fails_below == fails_below
+
+
+def test_a_range_without_a_boundary_is_not_bisected():
+    assert searched(lambda point: False) == ("no failure", dict.fromkeys(range(0, 65, 16), False))
+    assert searched(lambda point: True)[0] == "fails everywhere"
+    found, failed = searched(lambda point: point < 10 or point > 40)
+    assert (found, len(failed)) == ("not monotone", 5)
+
+
+def test_points_that_cannot_be_built_widen_the_bracket():
+    found, failed = searched(lambda point: point < 22, skipped={20, 21, 22})
+    assert (found.low, found.high) == (19, 23)
+    assert not {20, 21, 22} & set(failed)
+    found, failed = searched(lambda point: point < 40, ends=(9, STEPS))
+    assert min(failed) == 9
+    assert (found.low, found.high) == (39, 40)
+
+
+def test_one_seed_gives_its_bracket_and_several_students_interval():
+    one = Bracket(6.0, 6.5, True)
+    assert vars(boundary_of([one])) == {"value": 6.25, "low": 6.0, "high": 6.5}
+    several = boundary_of([Bracket(5.0, 5.5, True), one, Bracket(7.0, 7.5, True)])
+    # by hand: middles 5.25, 6.25, 7.25; t(0.975, 2) = 4.3027; s = 1; half a bracket is 0.25
+    assert several.value == pytest.approx(6.25)
+    assert several.high == pytest.approx(6.25 + 0.25 + 4.30265 / 3**0.5, abs=1e-4)
+
+
+def test_a_difference_is_paired_by_seed():
+    base = [Bracket(5.0, 5.5, True), Bracket(7.0, 7.5, True)]
+    other = [Bracket(4.0, 4.5, True), Bracket(6.0, 6.5, True)]
+    assert vars(difference_of(other, base)) == {"value": -1.0, "low": -1.5, "high": -0.5}

@@ -1,0 +1,92 @@
+"""Searches for a boundary over real rollouts: found, continued, out of range, and refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.log.run_folder.schema import SUMMARY
+from alpasim_plugin.runs.vary import Sweep
+
+DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1", "--images", "none"]
+SHORT = ["--set", "timing.duration_us=6000000", "--set", "environment.buildings=0"]
+GAP = ["--vary", "actors.cutter.s_m=10..30"]
+
+
+def drive(root, *words):
+    assert run_command([*DRIVE, *SHORT, *words, "hard/cut_in", "--out", str(root)]) == 0
+    return json.loads((root / SUMMARY).read_text())["boundary"]
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    root = tmp_path_factory.mktemp("vary") / "run"
+    return root, drive(root, *GAP)
+
+
+def test_the_boundary_of_a_gap_is_found_with_few_rollouts(searched):
+    root, found = searched
+    facts = found["variants"]["clean/pure-pursuit"]
+    assert facts["fails"] == "below"
+    assert facts["high"] - facts["low"] == pytest.approx(20 / 64)
+    assert 16 < facts["value"] < 18
+    assert found["rollouts"] == len(facts["outcomes"]["0"]) <= 0.4 * found["grid_rollouts"]
+    for name in ("report.html", "summary.md"):
+        assert "fails below" in (root / name).read_text()
+
+
+def test_an_interrupted_search_continues_to_the_same_boundary(searched, tmp_path, capsys):
+    root = shutil.copytree(searched[0], tmp_path / "again")
+    (root / SUMMARY).unlink()
+    removed = sorted((root / "rollouts/clean/pure-pursuit").iterdir())[-1]
+    shutil.rmtree(removed)
+    assert drive(root, *GAP) == searched[1]
+    assert removed.exists()
+
+
+def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_path):
+    found = drive(tmp_path / "run", "--vary", "actors.cutter.s_m=35..2000")
+    assert "no failure" in found["variants"]["clean/pure-pursuit"]["reason"]
+    assert found["reachable"][1] < 2000
+    assert found["unreachable"]
+
+
+@pytest.mark.parametrize(
+    ("vary", "named"),
+    [
+        ("actors.cuter.s_m=4..14", "cutter"),
+        ("actors.cutter.s_mm=4..14", "s_m"),
+        ("actors.cutter.s_m=14..4", "14..4"),
+        ("actors.cutter.s_m=a..b", "a..b"),
+        ("actors.cutter.s_m", "actors.cutter.s_m"),
+    ],
+)
+def test_a_parameter_or_range_that_is_none_is_refused_before_driving(vary, named, tmp_path, capsys):
+    words = [*DRIVE, "--vary", vary, "--dry-run", "hard/cut_in", "--out", str(tmp_path / "run")]
+    assert run_command(words) == 2
+    assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [["smoke/straight"], ["--repeat"], ["--until-decided"]])
+def test_a_search_takes_one_scene_and_no_other_question(more, tmp_path):
+    words = [*DRIVE, *GAP, *more, "--dry-run", "hard/cut_in", "--out", str(tmp_path / "run")]
+    assert run_command(words) == 2
+
+
+def test_a_point_keeps_the_noise_of_its_scene():
+    assert (
+        derive_seed("a-b@@4.5", 1, "x") == derive_seed("a-b", 1, "x") != derive_seed("a@@b", 1, "x")
+    )
+    assert derive_seed("a-b@@4.5-seed3", 1, "x") == derive_seed("a-b-seed3", 1, "x")
+
+
+def test_times_stay_whole():
+    sweep = Sweep.parse("actors.cutter.at_us=100..200")
+    assert all(sweep.value(point).is_integer() for point in range(65))
+    with pytest.raises(InputError):
+        Sweep.parse("seed=nan..3")
