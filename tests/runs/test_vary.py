@@ -14,12 +14,12 @@ from alpasim_plugin.log.run_folder.schema import SUMMARY
 from alpasim_plugin.runs.vary import Sweep
 
 DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1", "--images", "none"]
-SHORT = ["--set", "timing.duration_us=6000000", "--set", "environment.buildings=0"]
+PLAIN = ["--set", "environment.buildings=0"]
 GAP = ["--vary", "actors.cutter.s_m=10..30"]
 
 
 def drive(root, *words):
-    assert run_command([*DRIVE, *SHORT, *words, "hard/cut_in", "--out", str(root)]) == 0
+    assert run_command([*DRIVE, *PLAIN, *words, "hard/cut_in", "--out", str(root)]) == 0
     return json.loads((root / SUMMARY).read_text())["boundary"]
 
 
