@@ -36,6 +36,6 @@ def stream(scene_id: str, seed: int, component: str, step: int = 0) -> np.random
 
 
 def _digest(scene_id: str, seed: int, component: str, step: int) -> bytes:
-    scene = re.sub(POINT + r"[-+.0-9e]+", "", scene_id)
+    scene = re.sub(POINT + r"-?[0-9.]+(e[-+]?[0-9]+)?", "", scene_id)
     text = f"{scene}\x1f{int(seed)}\x1f{component}\x1f{int(step)}"
     return hashlib.blake2b(text.encode(), digest_size=32).digest()
