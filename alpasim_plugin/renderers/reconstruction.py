@@ -54,6 +54,7 @@ from alpasim_plugin.renderers.gaussian import (
     scene_of,
 )
 from alpasim_plugin.renderers.reconstruction_key import (
+    REFUSED_S,
     ReconstructionRecipe,
     read_model,
     recipe_of,
@@ -125,11 +126,20 @@ def reconstruction_renderer(
 ) -> Renderer:
     """Make the renderer ``3dgs``: the model of an imported drive, and otherwise what the scenario's
     degradation names.
+
+    Raises:
+        InputError: What is to be fitted is longer than `REFUSED_S`.
     """
     if scenario.model is not None:
         return ImportedRenderer(scenario, device, threads)
     if scenario.degradation.kind == "none":
         return CleanRenderer(scenario, seed, device, threads)
+    log_s = float(np.ptp(scenario.ego_log.t_us)) * 1e-6
+    if log_s > REFUSED_S:
+        raise InputError(
+            f"{scenario.scene_id}: 3dgs reconstructs at most {REFUSED_S:.0f} s, the log has {log_s:.0f} s",
+            "drive a part of it, or behind clean",
+        )
     return ReconstructionRenderer(scenario, device, threads)
 
 

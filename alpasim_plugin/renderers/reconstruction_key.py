@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 # worse; a lens counts as the pinholes that cover it.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
 LONGEST_S = 30.0  # a longer log gets the points and steps of so many seconds
+REFUSED_S = 120.0  # of a longer log next to nothing would be left
 FEWEST_VIEWS, MOST_VIEWS = 12, 180  # the latter by camera
 ACTOR_POINTS = 400  # by camera
 # A camera that looks along the road sees a surface for seconds, one that looks aside for less than

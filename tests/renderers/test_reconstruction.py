@@ -26,7 +26,12 @@ from alpasim_plugin.renderers.gaussian import (
     clear_cache,
     scene_of,
 )
-from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
+from alpasim_plugin.renderers.reconstruction import (
+    KIND,
+    ReconstructionRenderer,
+    ensure,
+    reconstruction_renderer,
+)
 from alpasim_plugin.renderers.reconstruction_build import misplaced
 from alpasim_plugin.renderers.reconstruction_key import (
     read_model,
@@ -227,6 +232,15 @@ def test_longer_logs_and_more_cameras_get_more_views_points_and_steps():
     for name in ("views", "points", "steps"):
         assert getattr(short, name) < getattr(long, name) < getattr(two, name)
         assert getattr(six, name) == 3 * getattr(two, name)
+
+
+def test_a_log_of_minutes_is_refused_before_anything_is_fitted():
+    scenario = street()
+    log = replace(scenario.ego_log, t_us=scenario.ego_log.t_us * 100)
+    with pytest.raises(
+        InputError,
+    ):
+        reconstruction_renderer(replace(scenario, ego_log=log), 0, "cpu", None)
 
 
 def turned_aside(name, yaw):
