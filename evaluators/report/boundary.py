@@ -64,7 +64,8 @@ def chart(record: Mapping[str, Any]) -> Chart:
     """Draw every driven point, a row for each variant and seed, with boundaries and intervals."""
     axes, names = Axes(), names_of(record)
     unit = f", {record['unit']}" if record["unit"] else ""
-    axes.labels = [f"{record['parameter']}{unit}", "variant, from below"]
+    listed = ", ".join(f"{i} {name}" for i, name in enumerate(names.values()))
+    axes.labels = [f"{record['parameter']}{unit}", listed]
     for number_, (_, facts) in enumerate(record["variants"].items()):
         colour = VARIANT[number_ % len(VARIANT)]
         seeds = list(facts["outcomes"].values())
@@ -79,7 +80,6 @@ def chart(record: Mapping[str, Any]) -> Chart:
             axes.band([facts["low"], facts["high"]], level[[0, 0]], level[[1, 1]], colour)
             axes.line([facts["value"]] * 2, level, colour)
     axes.limits = [None, (-0.6, len(names) - 0.4)]
-    listed = ", ".join(f"{i} {name}" for i, name in enumerate(names.values()))
     note = (
         f"Rows: {listed}. Large dots: the drive failed; small ones: it did not. "
         "Line and band: the boundary and its interval of 95 %."
