@@ -115,7 +115,7 @@ class BoundarySearch:
     driven: dict[str, dict[str, Any]] = field(default_factory=dict)
     cells: list[Cell] = field(default_factory=list)
     scenes: dict[int, RunPlan] = field(default_factory=dict)
-    unreachable: dict[int, str] = field(default_factory=dict)
+    unreachable: dict[int, InputError] = field(default_factory=dict)
     failed: dict[tuple[Variant, int], dict[int, bool]] = field(default_factory=dict)
     stopped: str = ""
 
@@ -133,19 +133,11 @@ class BoundarySearch:
 
     def _reachable_ends(self) -> tuple[int, int]:
         """Return the first and the last point at which the scene can be built."""
-        ends = [0, STEPS]
-        errors: list[InputError] = []
-        for point in ends:
-            try:
-                self._load(point)
-            except InputError as error:
-                errors.append(error)
-                self.unreachable[point] = error.message
-        if len(errors) == 2:
-            raise errors[0]
-        if not errors:
+        if self._is_reachable(0) and self._is_reachable(STEPS):
             return 0, STEPS
         bad, good = (0, STEPS) if 0 in self.unreachable else (STEPS, 0)
+        if not self._is_reachable(good):
+            raise self.unreachable[bad]
         reached = good
         while abs(reached - bad) > 1:
             middle = (reached + bad) // 2
@@ -159,7 +151,7 @@ class BoundarySearch:
         try:
             self._load(point)
         except InputError as error:
-            self.unreachable[point] = error.message
+            self.unreachable[point] = error
         return point not in self.unreachable
 
     def _load(self, point: int) -> RunPlan:
@@ -231,7 +223,9 @@ class BoundarySearch:
             "unit": self.sweep.unit,
             "range": [self.sweep.low, self.sweep.high],
             "reachable": [least, most],
-            "unreachable": {f"{values[k]:g}": self.unreachable[k] for k in self.unreachable},
+            "unreachable": {
+                f"{values[k]:g}": error.message for k, error in self.unreachable.items()
+            },
             "stopped": self.stopped,
             "rollouts": len(self.driven),
             "grid_rollouts": (STEPS + 1) * len(self.failed),
