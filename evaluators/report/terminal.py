@@ -111,6 +111,7 @@ def overview_lines(shown: Overview, width: int) -> list[Text]:
 
     A name that is too long for its column stands on a line of its own.
     """
+    width = max(width, LEAST_PLOT)  # a terminal may say that it has no columns
     badge, tone = shown.badge
     lines = [Text(badge, f"{STYLES[tone]} bold")]
     lines += [*(Text(line, "dim") for line in _wrapped(shown.context, width)), Text()]
@@ -177,7 +178,7 @@ def forest_lines(shown: Overview, width: int) -> list[Text]:
     beside = max((len(one.text) for _, one in found), default=0)
     names = [len(name) for name, _ in found if len(name) <= width - beside - LEAST_PLOT]
     name_width = max(names, default=0)
-    last = width - name_width - beside - 3
+    last = max(width - name_width - beside, LEAST_PLOT) - 3
 
     def place(value: float) -> int:
         return round(last * shown.share(value))

@@ -49,6 +49,7 @@ def opened(path):
         *("trbf_center", "trbf_scale", "motion_0", "omega_0"),  # spacetime Gaussians
         *("t", "scale_t", "rot_r_0", "f_t_0", "f_dc_3"),  # four-dimensional ones
         *("sg_axis_0", "beta", "metallic", "scale_3"),
+        *("object_motion_0", "instance_opacity", "label_scale", "identity", "red_0"),
     ],
 )
 def test_a_property_that_changes_the_drawing_is_refused_by_name(tmp_path, name):
@@ -56,12 +57,22 @@ def test_a_property_that_changes_the_drawing_is_refused_by_name(tmp_path, name):
         opened(model(tmp_path / "a.ply", {name: 0.5}))
 
 
-@pytest.mark.parametrize("name", ["red", "obj_dc_0", "semantic_12", "label", "instance_id"])
+@pytest.mark.parametrize(
+    "name", ["red", "obj_dc_0", "semantic_12", "label", "instance_id", "ins_feat_r2"]
+)
 def test_a_property_of_which_nothing_is_drawn_is_skipped(tmp_path, name):
     plain, _ = opened(model(tmp_path / "a.ply"))
     cloud, report = opened(model(tmp_path / "b.ply", {name: 0.5}))
     assert np.array_equal(cloud.scales, plain.scales)
     assert not report.notes
+
+
+@pytest.mark.parametrize("name", ["opacity", "scale_2"])
+def test_whole_numbers_are_no_logit_and_no_logarithm(tmp_path, name):
+    path = model(tmp_path / "a.ply", {name: 0.5}, without=name)
+    path.write_bytes(path.read_bytes().replace(b"float " + name.encode(), b"int " + name.encode()))
+    with pytest.raises(InputError, match=name):
+        opened(path)
 
 
 @pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])

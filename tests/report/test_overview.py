@@ -100,6 +100,15 @@ def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(tmp_path, 
     assert all(any(name in line for line in lines) for name in names)
 
 
+@pytest.mark.parametrize("width", [0, 1, 30])
+def test_a_terminal_narrower_than_the_plot_shows_every_difference(three, width):
+    shown = overview_of(read_run(three))
+    lines = [line.plain for line in overview_lines(shown, width)]
+    differences = [row.difference.text for row in shown.rows if row.difference is not None]
+    assert differences
+    assert all(any(line.endswith(text) for line in lines) for text in differences)
+
+
 def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
     three,
 ):

@@ -41,8 +41,8 @@ COLOURS = ("red", "green", "blue")
 # What other tools write beside it and nothing is drawn of: normals, colours of points, and features
 # by which Gaussians are grouped.
 _HARMLESS = re.compile(
-    r"n[xyz]|red|green|blue|(obj_dc|ins_feat|semantic|language|label|class|object|instance|segment|id)"
-    r"(_?\w*)?"
+    r"n[xyz]|red|green|blue|id|ins_feat_[rgb]2?|(obj_dc|ins_feat|semantic|language|language_feature)_\d+"
+    r"|(semantic|label|class|object|instance|segment)(_id)?"
 )
 # Elements beside a model: its training camera, as Apple's SHARP writes it.
 _BESIDE = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "version", "color_space"}
@@ -235,6 +235,13 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
         raise InputError(
             f"{header.path}, element {element.name!r}: properties that may change what is drawn: {some_of(unknown)}",
             "export a plain 3DGS model, of one time and without filters; or leave the properties out if nothing is drawn of them",
+        )
+    fields = element.dtype or np.dtype([])
+    whole = [name for name in ("opacity", *_SCALES) if name in have and fields[name].kind != "f"]
+    if whole:
+        raise InputError(
+            f"{header.path}, element {element.name!r}: whole numbers as {some_of(whole)}, which are a logit and logarithms",
+            "export a plain 3DGS model, with properties of type float",
         )
     n_rest = sum(name.startswith("f_rest_") for name in have)
     per_channel, left_over = divmod(n_rest, 3)
