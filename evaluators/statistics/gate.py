@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -443,6 +443,15 @@ def _of_suite(
         _suite_check(pair, change, rules.get(change.metric.name, UNNAMED), p, spec)
         for change, p in zip(changes, p_values, strict=True)
     ]
+    if any(check.cause == "regression" for check in checks):
+        # It decides; the rollouts that it cut short need not be compared.
+        checks = [
+            replace(
+                check,
+                binding=check.binding and bool(check.entry["n_cells"] or check.entry["missing"]),
+            )
+            for check in checks
+        ]
     named, others = checks[: len(rules)], checks[len(rules) :]
     if any(check.cause == "regression" for check in named):
         return named
@@ -463,9 +472,10 @@ def _suite_check(
         counts = {"worse": int(np.sum(change.beyond(change.margin)))}
         counts["better"] = int(np.sum(change.harms[0] < -change.margin - ROUNDING))
     n_equal = n_cells - int(np.sum(change.harms[0] != 0.0))
+    diff = 0.0 - change.mean if metric.direction == "higher" else change.mean
     entry = {
         "baseline": pair.label,
-        "diff": (0.0 - change.mean) if metric.direction == "higher" else change.mean,
+        "diff": diff if n_cells else None,
         "margin": change.margin,
         "max_new": max_new,
         "p_value": p,
@@ -489,7 +499,9 @@ def _suite_check(
     text, cause = change_text(entry, metric), CAUSES[verdict]
     is_missing = n_missing > spec.max_missing * (n_cells + n_missing)
     n_scenes = len({pair.side.scene[i] for i in np.flatnonzero(change.is_pair | change.is_cut)})
-    if is_missing or n_scenes < spec.min_scenes:
+    if is_missing or not n_cells:
+        cause = "incomplete"
+    if n_scenes < spec.min_scenes:
         cause = "incomplete"
         text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
     binding = rule.must_decide or is_missing or cause == "regression"

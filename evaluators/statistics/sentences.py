@@ -71,7 +71,9 @@ def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
     scale, unit = scale_and_unit(metric, metric.unit)
     counts = ", ".join(f"{n} {name}" for name, n in entry["counts"].items())
     parts = [f"{counts} of {plural(entry['n_cells'], 'pair')}"]
-    if not metric.is_flag:
+    if not entry["n_cells"]:
+        parts = ["no pair is compared"]
+    elif not metric.is_flag:
         mean, margin = entry["diff"] * scale, entry["margin"] * scale
         parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":

@@ -78,7 +78,7 @@ class Change:
 
     @property
     def mean(self) -> float:
-        """Give the mean of the first of `harms` over scenes; 0 where nothing is compared."""
+        """Give the mean of the first of `harms` over scenes; 0 where there is no pair."""
         return float(np.mean(self.by_scene(self.harms[0]))) if self.is_pair.any() else 0.0
 
     @property

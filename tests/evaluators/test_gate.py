@@ -203,6 +203,13 @@ def test_a_distance_that_an_event_cut_short_is_compared_with_none():
     assert code(short, spec=gate(max_new=1)) == 0
     ended = judged([*short(rows("clean")), *short(rows())], spec).checks[0]
     assert (ended.cause, ended.entry["n_short"], ended.entry["n_cells"]) == ("pass", 1, SCENES)
+    everywhere = add(1.0, "collision_any")
+    gone = judged([*everywhere(rows("clean")), *rows()], spec)
+    assert (gone.exit_code, gone.checks[0].cause) == (2, "incomplete")  # nothing was compared
+    assert gone.checks[0].entry["diff"] is None
+    assert "mean" not in gone.checks[0].text
+    assert "at least" not in gone.checks[0].text
+    assert code(everywhere, spec=spec) == 1  # the new event decides
     driven_on = judged([*rows("clean"), *short(rows())], spec, preset="nuplan")
     assert driven_on.exit_code == 0  # its rollouts go on after an event
 
