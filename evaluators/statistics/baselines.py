@@ -162,14 +162,14 @@ def read_baseline(path: Path) -> Baseline:
         return baseline_of(read_run(path))
     content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
     check_seal(content, path, APPROVE)
-    content.pop(DIGEST, None)
-    names = set(Baseline.__dataclass_fields__)
+    names = {*Baseline.__dataclass_fields__, DIGEST}
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: not a baseline of version {SCHEMA_VERSION}",
+            f"{path}: not a baseline of version {SCHEMA_VERSION} with its digest",
             "Write one with simrun gate RUN --write-baseline FILE, or name the earlier run's folder.",
         )
     do = "restore the file or write it again"
+    del content[DIGEST]
     as_shape(StoredBaseline, content, path, do)
     for i, row in enumerate(content["rows"]):
         as_shape(BaselineRow, row, f"{path}, row {i}", do)

@@ -160,6 +160,11 @@ def test_a_run_passes_against_its_own_stored_baseline_and_a_worse_one_fails(
         run_command(["gate", str(runs["few"]), "--gate", gate_file, "--baseline-file", str(stored)])
         == 2
     )  # scenes missing
+    content = json.loads(stored.read_text())
+    del content["sha256"]
+    stored.write_text(json.dumps(content))
+    judged = ["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]
+    assert run_command(judged) == 2
     capsys.readouterr()
 
 
