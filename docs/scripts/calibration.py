@@ -1,7 +1,7 @@
 """Measure how often the rules of docs/statistics.md are wrong and how often they decide, beside
 classical tests, and write the tables into that page.
 
-    python docs/scripts/calibration.py [--repeats N]
+    python docs/scripts/calibration.py [--repeats N] [--part NAME]
 
 Differences are drawn scene by scene. "Wrong" is how often a rule answers although its answer is
 false, with the truth as near to it as it can be; "right" is how often it answers where that is
@@ -26,7 +26,7 @@ from evaluators.metrics import METRICS
 from evaluators.statistics.betting import Draws, Plan, bet_sizes, log_capital
 from evaluators.statistics.bounded import mean_interval
 from evaluators.statistics.intervals import TAIL, exact_rate, t_interval
-from evaluators.statistics.paired import compare, reach_of
+from evaluators.statistics.paired import compare, flag_interval, reach_of
 from evaluators.statistics.verdicts import ALPHA, sign_flip, sign_test
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -196,11 +196,17 @@ def intervals(repeats: int) -> list[str]:
     def once(g: np.random.Generator, n: int) -> F64:
         return (g.random(n) < 0.1).astype(np.float64)
 
+    def always(g: np.random.Generator, n: int) -> F64:
+        chance = np.where(g.random(n) < 0.1, 1.0, 0.05)
+        return (g.random((n, 10)) < chance[:, None]).astype(np.float64)
+
     for words, metric, truth, draw in (
         ("progress, one drive in ten stops early", PROGRESS, 0.94, stops),
         ("metres, 2 % of scenes by 3 m", METRES, 0.17, jumps),
         ("rate of 10 %, 1 seed", RATE, 0.1, once),
         ("rate of 10 %, 5 seeds, correlated", RATE, 0.1, rate),
+        ("rate, 10 seeds, always in 10 % of scenes, 5 % in others", RATE, 0.145, always),
+        ("difference of that rate from 0", None, 0.145, always),
     ):
         cells = []
         for n in scenes:
@@ -208,11 +214,17 @@ def intervals(repeats: int) -> list[str]:
             drawn = [draw(g, n) for _ in range(repeats)]
             held = []
             for x in drawn:
-                low, high = mean_interval(x, metric).bounds or (0.0, 0.0)
+                if metric is None:
+                    of_cells = np.repeat(np.arange(n), x.shape[1])
+                    found = flag_interval(x.ravel(), of_cells)
+                else:
+                    found = mean_interval(x.reshape(n, -1).mean(axis=1), metric)
+                low, high = found.bounds or (0.0, 0.0)
                 held.append(low <= truth <= high)
             by_t = []
             for x in drawn:
-                low, high = t_interval(x).bounds or (float(x[0]),) * 2
+                means = x.reshape(n, -1).mean(axis=1)
+                low, high = t_interval(means).bounds or (float(means[0]),) * 2
                 by_t.append(low <= truth <= high)
             cells.append(f"{share(held)} / {share(by_t)}")
         lines.append(f"| {words} | " + " | ".join(cells) + " |")
@@ -249,9 +261,12 @@ def betting(repeats: int) -> list[str]:
 def main() -> None:
     """Write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parts = {part.__name__: part for part in (differs, verdicts, intervals, betting)}
     parser.add_argument("--repeats", type=int, default=2000)
-    repeats = parser.parse_args().repeats
-    for part in (differs, verdicts, intervals, betting):
+    parser.add_argument("--part", choices=list(parts), action="append", help="default: all")
+    arguments = parser.parse_args()
+    repeats = arguments.repeats
+    for part in [parts[name] for name in arguments.part or parts]:
         table = "\n".join(part(repeats))
         begin, end = f"<!-- begin {part.__name__} -->", f"<!-- end {part.__name__} -->"
         for page in PAGES:

@@ -22,12 +22,12 @@ import math
 import numpy as np
 import scipy  # its submodules load on first use
 
+from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import F64, MetricInfo
 from evaluators.statistics.intervals import (
     TAIL,
     Interval,
     mean_of,
-    rate_interval,
     t_interval,
     within,
 )
@@ -119,6 +119,27 @@ def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
     """
     x = np.clip(np.asarray(values, dtype=np.float64), least, most)
     return -upper_bound(-x, -least), upper_bound(x, most)
+
+
+def rate_interval(means: F64) -> Interval:
+    """Return the interval of a rate from the rate of each scene ``(G,)``: `mean_bounds` within [0,
+    1]; never without width.
+
+    With one seed a scene it is that of Clopper and Pearson. With several it allows for scenes that
+    always have the event and were not drawn, which the spread between scenes does not show.
+
+    Raises:
+        EvaluatorError: A value outside [0, 1].
+    """
+    n, p = len(means), float(np.mean(means))
+    if means.min() < 0.0 or means.max() > 1.0:
+        raise EvaluatorError(
+            f"{n} scene means: values from {means.min():g} to {means.max():g}",
+            "give rates as fractions in [0, 1]",
+        )
+    if n < 2:
+        return Interval(p, reason=f"needs at least two scenes, found {n}")
+    return Interval(p, *mean_bounds(means, 0.0, 1.0), method="mean of scenes from 0 to 1")
 
 
 def mean_interval(means: F64, metric: MetricInfo) -> Interval:

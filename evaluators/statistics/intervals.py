@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
-from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import F64, I64, Bool
 
 Z95 = 1.96
@@ -147,33 +146,6 @@ def n_clusters(clusters: I64) -> int:
     clusters, from 0 up.
     """
     return int(np.count_nonzero(np.bincount(clusters)))
-
-
-def rate_interval(means: F64) -> Interval:
-    """Return the interval of a rate from the rate of each scene ``(G,)``, always within [0, 1].
-
-    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1
-    - p) (delta method; the logit interval of survey statistics, with scenes as sampling units).
-    Below `FEW_SCENES` scenes, and where scenes are equal, so that no spread is known, the bounds
-    are those of Clopper and Pearson: p G events in G trials, as if the seeds of a scene were copies.
-
-    Raises:
-        EvaluatorError: A value outside [0, 1].
-    """
-    n, p = len(means), float(np.mean(means))
-    if means.min() < 0.0 or means.max() > 1.0:
-        raise EvaluatorError(
-            f"{n} scene means: values from {means.min():g} to {means.max():g}",
-            "give rates as fractions in [0, 1]",
-        )
-    if n < 2:
-        return Interval(p, reason=f"needs at least two scenes, found {n}")
-    if n < FEW_SCENES or are_alike(means):
-        return Interval(p, *exact_rate(p * n, n), method="exact, scenes as trials")
-    error = float(np.std(means, ddof=1)) / n**0.5 / (p * (1 - p))
-    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error
-    low, high = scipy.special.expit(scipy.special.logit(p) + np.array([-half, half]))
-    return Interval(p, float(low), float(high), method="t on scenes, logit scale")
 
 
 def exact_rate(k: float, n: int) -> tuple[float, float]:

@@ -36,7 +36,6 @@ from evaluators.statistics.intervals import (
     mean_of,
     n_clusters,
     paired_rate,
-    rate_interval,
     scaled,
     t_interval,
     within,
@@ -374,7 +373,7 @@ def flag_interval(delta: F64, scenes: I64) -> Interval:
     and their scenes; never without width.
 
     The rates of cells that gained and that lost the event get their own intervals
-    (`rate_interval`), which are joined by the method of variance estimates recovery (Zou and
+    (`mean_bounds`), which are joined by the method of variance estimates recovery (Zou and
     Donner, Statistics in Medicine 27, 2008). Below `FEW_SCENES` scenes it is Tango's interval, with
     scenes as pairs.
     """
@@ -387,7 +386,7 @@ def flag_interval(delta: F64, scenes: I64) -> Interval:
         bounds = paired_rate(n * up, n * down, n)
         return Interval(up - down, *bounds, note=note, method="Tango, scenes as pairs")
     (up_low, up_high), (down_low, down_high) = (
-        rate_interval(rates).bounds or (0.0, 1.0) for rates in (gained, lost)
+        mean_bounds(rates, 0.0, 1.0) for rates in (gained, lost)
     )
     low = max(up - down - math.hypot(up - up_low, down_high - down), -1.0)
     high = min(up - down + math.hypot(up_high - up, down - down_low), 1.0)

@@ -22,13 +22,12 @@ from alpasim_plugin.log.run_folder.sides import (
     reason_of,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.statistics.bounded import mean_interval
+from evaluators.statistics.bounded import mean_interval, rate_interval
 from evaluators.statistics.intervals import (
     cluster_means,
     mean_of,
     n_clusters,
     normal_half_width,
-    rate_interval,
 )
 from evaluators.statistics.paired import Table, compare_pairs, pairs_within
 

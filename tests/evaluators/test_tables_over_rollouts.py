@@ -12,12 +12,11 @@ from scipy import stats
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators import aggregate, censoring, paired
 from evaluators.metrics import METRICS
-from evaluators.statistics.bounded import mean_interval
+from evaluators.statistics.bounded import mean_interval, rate_interval
 from evaluators.statistics.intervals import (
     cluster_means,
     exact_rate,
     normal_half_width,
-    rate_interval,
     t_interval,
 )
 from evaluators.statistics.summary import numbers
@@ -104,7 +103,7 @@ def test_a_rate_of_zero_gets_exact_bounds_over_scenes():
     found = entry([[0.0, 0.0]] * 10, "collision_at_fault")
     assert (found["mean"], found["ci95"], found["n_events"]) == (0.0, 0.0, 0)
     assert found["ci95_clustered"] == pytest.approx([0.0, 1 - 0.025 ** (1 / 10)])
-    assert found["ci95_clustered_method"] == "exact, scenes as trials"
+    assert found["ci95_clustered_method"] == "mean of scenes from 0 to 1"
     assert entry([[1.0]] * 4, "offroad")["ci95_clustered"] == pytest.approx([0.025 ** (1 / 4), 1.0])
 
 
@@ -358,7 +357,7 @@ def test_coverage_of_the_clustered_interval_and_under_coverage_of_the_papers(cor
         naive += abs(hits.mean() - 0.1) <= half
         one = rate_interval(cluster_means(hits, scenes)[0])
         by_scene += one.low <= 0.1 <= one.high
-    assert 0.91 <= by_scene / repeats <= 0.97
+    assert by_scene / repeats >= 0.94
     if correlation == 0.8:
         assert naive / repeats < 0.82
 
