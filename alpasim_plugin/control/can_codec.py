@@ -185,8 +185,6 @@ class Codec:
             full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (
                 1 << length
             )
-        if checksum is not None:
-            full[checksum] = 0
         data = bytearray(message.encode(full, strict=False))
         if checksum is not None:
             position = _byte_of(message, checksum)
@@ -281,7 +279,10 @@ def _check(codec: Codec, database: Path, part: Sent | Received) -> None:
     odd = next((name for name, one in found.items() if not one.scale), None)
     if isinstance(part, Received) and not part.scale:
         odd = part.signal
-    odd = odd or next((name for name in whole if found[name].is_float), None)
+    if part.counter is not None and odd is None:
+        one = found[part.counter]
+        if one.is_float or one.is_signed or (one.scale, one.offset) != (1, 0):
+            odd = part.counter
     if part.checksum is not None and odd is None:
         one = found[part.checksum]
         first = one.start % 8 == (7 if one.byte_order == "big_endian" else 0)
@@ -289,7 +290,7 @@ def _check(codec: Codec, database: Path, part: Sent | Received) -> None:
     if odd is not None:
         raise InputError(
             f"{where}, signal {odd}: it cannot carry what the map wants of it",
-            "use a signal with a scale; counters of whole numbers, checksums of one whole byte",
+            "use a signal with a scale; unsigned counters of scale 1 and offset 0, checksums of one whole byte",
         )
     fixed = part.enabled if isinstance(part, Received) else {}
     multiplexed(message, [*signals, *whole], fixed, where)

@@ -135,6 +135,21 @@ def test_messages_longer_than_8_bytes_are_sent_as_can_fd(tmp_path):
     assert not opened(tmp_path, EGO, CMD)[0].uses_fd
 
 
+COUNTED = "{message: EGO, period_us: 10000, signals: {SPEED: speed_kph}, counter: COUNT}"
+COUNT = 'COUNT : 16|4@1{} "" ECU'
+
+
+@pytest.mark.parametrize("odd", ["- (1,0) [0|0]", "+ (2,0) [0|30]", "+ (1,1) [1|16]"])
+def test_a_counter_is_unsigned_and_counts_from_0_by_1(tmp_path, odd):
+    codec, _ = opened(
+        tmp_path, message(257, "EGO", 4, SPEED, COUNT.format("+ (1,0) [0|15]")), CMD, send=COUNTED
+    )
+    frames = [codec.encode(codec.map.send[0], {"speed_kph": 1.0}) for _ in range(17)]
+    assert [frame.data[2] for frame in frames] == [*range(16), 0]
+    with pytest.raises(InputError, match="signal COUNT"):
+        opened(tmp_path, message(257, "EGO", 4, SPEED, COUNT.format(odd)), CMD, send=COUNTED)
+
+
 TWO = message(
     257,
     "EGO",
