@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,7 +36,7 @@ from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import split_names
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.log.run_folder.reader import last_output
-from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
+from alpasim_plugin.log.run_folder.schema import LOCK, OUTPUT_NAME
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.executors.choice import parse_executor
@@ -197,6 +199,8 @@ def run(
         plan = search.ceiling
     root = out or default_folder(plan)
     if dry_run:
+        with suppress(FileNotFoundError):
+            os.lstat(root / LOCK)  # raises where no such folder can be
         _print_plan(plan, root, thread_budget(workers, len(plan.cells), ray), as_json)
         return
     command = ["simrun", *sys.argv[1:]]

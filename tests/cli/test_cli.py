@@ -133,6 +133,10 @@ def test_a_dry_run_counts_without_running(tmp_path, capsys):
     assert plan["rollouts"] == 2 * 3 * len(plan["scenes"])
     assert plan["camera_frames"] > 0
     assert not (tmp_path / "out").exists()
+    (tmp_path / "file").touch()
+    for name in ("n" * 300, "file"):
+        command[-2] = str(tmp_path / name)
+        assert run_command(command) == 2
 
 
 def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path, capsys):
