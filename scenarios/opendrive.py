@@ -36,6 +36,7 @@ from scenarios.opendrive_road import (
     gap_m,
     lane_borders,
     lane_key,
+    missing_m,
     reference_line,
     road_points,
     sided,
@@ -49,6 +50,7 @@ FLATTENING = 1.0 / 298.257223563
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
 MAX_OFFSET_M = LATERAL_OFFSET_M.high
+MAX_MISSING_M = 1.0  # by which a reference line may be shorter than its road; it is extended
 MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
     **dict.fromkeys(
@@ -289,6 +291,21 @@ def read_lanes(
         )
     linked, link_notes = following(odr, lanes)
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
+    unlike = []
+    for road in odr.roads:
+        missing = missing_m(road) if road.records else 0.0
+        if missing > MAX_MISSING_M:
+            raise files.fail(
+                f"{where}, road {road.road_id}",
+                f"a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
+                "correct the length of the road, or add the records that lack",
+            )
+        if abs(missing) > JOIN_M:
+            unlike.append(f"{road.road_id} ({-missing:+.2f} m)")
+    if unlike:
+        notes.append(
+            f"{len(unlike)} reference lines are not as long as their road: {some_of(unlike)}"
+        )
     gaps = {road.road_id: gap_m(road) for road in odr.roads}
     apart = [f"{key} ({gap:.2f} m)" for key, gap in gaps.items() if gap > JOIN_M]
     if apart:

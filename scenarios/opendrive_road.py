@@ -144,6 +144,11 @@ def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
     return out
 
 
+def missing_m(road: Road) -> float:
+    """Return by how many metres the reference line of a road ends before the road does."""
+    return road.length_m - max(one.s_m + one.length_m for one in road.records)
+
+
 def gap_m(road: Road) -> float:
     """Return the largest distance, metres, between the end of a record of a road's reference line
     and the start of the next one.
@@ -342,6 +347,9 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     roads = tuple(_road(files, where, element) for element in root.findall("road"))
     if not roads:
         raise files.fail(where, "a map without roads", "use a map with at least one road")
+    road_id, n_roads = Counter(road.road_id for road in roads).most_common(1)[0]
+    if n_roads > 1:
+        raise files.fail(where, f"{n_roads} roads of id {road_id!r}", "give every road its own id")
     connections = tuple(
         Connection(
             j.get("id", ""),
@@ -370,6 +378,12 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
         )
     kinds = sorted({j.get("type", "default") for j in root.findall("junction")} - {*JUNCTIONS})
     notes += [f"junctions of type {kind} are not driven through" for kind in kinds]
+    both_ways = sum(
+        lane.get("type") == "bidirectional" or lane.get("direction") == "both"
+        for lane in root.iter("lane")
+    )
+    if both_ways:
+        notes.append(f"lanes for both directions are driven in one only: {both_ways}")
     shapes = len(root.findall(".//lateralProfile/shape"))
     notes += [f"{shapes} cross section shapes of the map are not used"] if shapes else []
     geo = "" if reference is None else (reference.text or "").strip()
@@ -491,6 +505,11 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
 
     road_m = number(element, "length")
     MAP_ROAD_M.check(road_m, here, "length")
+    rule = element.get("rule", "RHT")
+    if rule.upper() not in ("RHT", "LHT"):
+        raise files.fail(
+            here, f"rule = {rule!r}", "use RHT or LHT, the side on which traffic keeps"
+        )
 
     def geometry(record: Element) -> Geometry:
         shape = next((child for child in record if child.tag in KINDS), None)
@@ -574,7 +593,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         str(element.get("id")),
         road_m,
         element.get("junction", "-1"),
-        element.get("rule") == "LHT",
+        rule.upper() == "LHT",
         records,
         cubics(element.find("elevationProfile"), "elevation"),
         cubics(element.find("lateralProfile"), "superelevation"),

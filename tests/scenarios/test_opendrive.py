@@ -184,6 +184,7 @@ def test_lanes_are_linked_along_sections_roads_and_junctions():
     assert found.lanes["2.0.-1"].is_intersection
 
 
+LINE = '<geometry s="0" x="0" y="0" hdg="0" length="100"><line/></geometry>'
 NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
 
 
@@ -202,6 +203,9 @@ NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
         ("OpenDRIVE", road(right=lane(-1)).replace('id="-1"', 'id="x"'), "<lane> with id = 'x'"),
         ("OpenDRIVE", road(right=lane(-1), view=NO_SHAPE), "a <geometry> of []"),
         ("OpenDRIVE", road(right=lane(-1, kind="sidewalk")), "without a lane for vehicles"),
+        ("OpenDRIVE", road(right=lane(-1), i=7) + road(right=lane(-1), i=7), "'7'"),
+        ("OpenDRIVE", road(right=lane(-1), more='rule="left"'), "'left'"),
+        ("OpenDRIVE", road(right=lane(-1), view=LINE, length=101.5), "1.5 m"),
     ],
 )
 def test_what_is_no_usable_map_is_refused(root, content, found):
@@ -388,8 +392,27 @@ def test_cars_of_another_simulator_drive_in_the_lanes(shared_data):
     assert max(best) < 0.6  # some lane there runs its way, and it is in its middle
 
 
-def test_with_left_hand_traffic_lanes_run_the_other_way():
-    found = lanes_of(road(left=lane(1), right=lane(-1), more='rule="LHT"'))
+@pytest.mark.parametrize("length", [60.0, 100.5])
+def test_a_road_not_as_long_as_its_reference_line_is_noted(length):
+    def notes(metres):
+        odr = parsed(road(right=lane(-1), view=LINE, length=metres, i="a7"))
+        return lane_map_of(FILES, "map.xodr", odr, np.eye(4))[1]
+
+    assert not notes(100.0)
+    assert any(f"a7 ({100 - length:+.2f} m)" in note for note in notes(length))
+
+
+@pytest.mark.parametrize(
+    "both", [lane(-1, kind="bidirectional"), lane(-1).replace("level", 'direction="both" level')]
+)
+def test_a_lane_for_both_directions_is_noted(both):
+    assert any("both directions" in note for note in parsed(road(right=both)).notes)
+    assert not parsed(road(right=lane(-1))).notes
+
+
+@pytest.mark.parametrize("rule", ["LHT", "lht"])
+def test_with_left_hand_traffic_lanes_run_the_other_way(rule):
+    found = lanes_of(road(left=lane(1), right=lane(-1), more=f'rule="{rule}"'))
     np.testing.assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
     np.testing.assert_allclose(
         found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12
