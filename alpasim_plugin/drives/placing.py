@@ -29,6 +29,7 @@ from scenarios.recorded import SourceFiles
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
 MOST_MPS, MOST_MPS2 = 100.0, 50.0  # speed and acceleration that no car has
+LEAST_MPS = 0.05  # the top speed of a drive whose times are in another unit
 MOST_STEP_MPS = 10.0  # a smaller change of speed may be an error of the poses
 OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median
 LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
@@ -135,6 +136,11 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     accel = 2 * change / (dt_s[1:] + dt_s[:-1])
     jumps = np.flatnonzero((accel > MOST_MPS2) & (change > MOST_STEP_MPS))
     fast = int(np.argmax(speed))
+    if speed[fast] < LEAST_MPS:
+        raise InputError(
+            f"{pictures[fast].where}: at most {speed[fast]:.2g} m/s in {dt_s.sum():.4g} s, slower than any car drives",
+            "check the unit of the times (t_us: microseconds) and of the poses",
+        )
     if speed[fast] > MOST_MPS:
         at, found = fast + 1, f"{speed[fast]:.0f} m/s"
     elif len(jumps):

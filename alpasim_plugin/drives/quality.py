@@ -8,11 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
+from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.types import F32, F64, U8
@@ -212,9 +214,9 @@ def _page(
         f", whose sides are known to {boxes['uncertainty_m']} m (median)" if boxes["boxes"] else ""
     )
     sections = [
-        f"# Quality of {drive.scene_id}",
+        f"# Quality of {escape(drive.scene_id)}",
         "## What is missing or assumed",
-        "\n".join(f"- {note}" for note in notes),
+        "\n".join(f"- {escape(note)}" for note in notes),
         f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
         f"| photographs | number | PSNR, dB | SSIM |\n|---|---|---|---|\n{rows}".rstrip(),
         "## Coverage of the lower half of the picture",
@@ -235,5 +237,6 @@ def _page(
         "## Photograph above, reconstruction below",
     ]
     for use, row, name in shown:
-        sections += [f"{use}, {row.name}: {row.psnr_db:.2f} dB", f"![{row.name}]({name})"]
+        title = escape(row.name)
+        sections += [f"{use}, {title}: {row.psnr_db:.2f} dB", f"![{title}]({quote(name)})"]
     return "\n\n".join(sections) + "\n"
