@@ -156,10 +156,11 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         for one in images
     ]
     names = sorted({str(shot.camera) for shot in shots})
-    every: list[Picture] = []
-    for name in names:
-        mine = [one for one in shots if one.camera == name]
-        every += sorted(mine, key=lambda one: int(one.t_us or 0)) if times_us else timed(mine)
+    every = (
+        sorted(shots, key=lambda one: (str(one.camera), int(one.t_us or 0)))
+        if times_us
+        else timed([[one for one in shots if one.camera == name] for name in names])
+    )
     reference = next((names_of[one.number] for one in images if one.camera == front_camera), None)
     front = next((name for name in names if "front" in name), reference or names[0])
     centres = np.array([shot.T_world_camera[:3, 3] for shot in every])

@@ -12,16 +12,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import natural_order, parsing, read_bytes, read_text, real
+from alpasim_plugin.core.reading import (
+    natural_order,
+    parsing,
+    read_bytes,
+    read_text,
+    real,
+    some_of,
+)
 from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.drives.source import PERIOD_US, SourceDrive
+from alpasim_plugin.drives.source import PERIOD_US, SourceDrive, name_numbers
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
 
@@ -63,17 +70,29 @@ def read_kitti(folder: Path) -> SourceDrive:
     projections, unknown = _projections(folder / "calib.txt")
     poses, pictures = _poses(folder), []
     notes = [f"calib.txt: unknown rows are not read: {', '.join(unknown)}"] if unknown else []
-    for name, side in ((left, "left"), (right, "right")):
-        if not os.path.isdir(folder / name):
-            notes.append(f"no {name}: no second camera to judge the fit by")
-            continue
-        files = [path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES]
-        files.sort(key=lambda path: natural_order(path.name))
-        taken, note = _matched(folder, name, files, len(poses))
-        notes += note
+    sides = {left: "left", right: "right"}
+    files = {
+        name: sorted(
+            (path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES),
+            key=lambda path: natural_order(path.name),
+        )
+        for name in sides
+        if os.path.isdir(folder / name)
+    }
+    if right not in files:
+        notes.append(f"no {right}: no second camera to judge the fit by")
+    times = _times(folder, len(poses))
+    for name, rows in _rows_of_poses(folder, files, len(poses)).items():
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")
-        times = _times(folder, len(poses))
-        for i, path in enumerate(taken):
+        spare = [path.name for i, path in zip(rows, files[name], strict=True) if i >= len(poses)]
+        if spare:
+            notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
+        alone = len(poses) - len(rows) + len(spare)
+        if alone:
+            notes.append(f"{name}: {alone} of {len(poses)} poses have no photograph")
+        for i, path in zip(rows, files[name], strict=True):
+            if i >= len(poses):
+                continue
             lens = Lens(*check_image(read_bytes(path), path), K)
             pictures.append(
                 Picture(
@@ -82,7 +101,7 @@ def read_kitti(folder: Path) -> SourceDrive:
                     poses[i] @ T_left_camera,
                     f"{folder}, photograph {i}",
                     times[i],
-                    side,
+                    sides[name],
                     {},
                 )
             )
@@ -102,30 +121,29 @@ def read_kitti(folder: Path) -> SourceDrive:
     )
 
 
-def _matched(
-    folder: Path, name: str, files: list[Path], poses: int
-) -> tuple[list[Path], list[str]]:
-    """Return the pictures that have poses; a few more of either are dropped and said, many are
-    another drive's.
+def _rows_of_poses(
+    folder: Path, files: Mapping[str, Sequence[Path]], poses: int
+) -> dict[str, list[int]]:
+    """Return which row has the pose of each photograph, by folder: the number of its name, counted
+    from 0 or, in a part of a drive, from its first photograph; else its place among as many.
+
+    Raises:
+        InputError: Nothing says which pose belongs to a photograph, or many belong to none.
     """
-    spare = len(files) - poses
-    if not spare:
-        return files, []
-    if abs(spare) > max(2, poses // 10):
-        raise InputError(
-            f"{folder / name}: {len(files)} photographs and {poses} poses",
-            "give the poses of these very photographs, one row each",
-        )
-    if spare < 0:
-        return files, [
-            f"{poses} poses for {len(files)} photographs in {name}: the last {-spare} poses were dropped"
-        ]
-    names = ", ".join(path.name for path in files[poses:])
-    return files[:poses], [
-        f"{poses} poses for {len(files)} photographs in {name}: the last was dropped ({names})"
-        if spare == 1
-        else f"{poses} poses for {len(files)} photographs in {name}: the last {spare} were dropped ({names})"
-    ]
+    numbers = {name: name_numbers(paths) for name, paths in files.items()}
+    every = {number for column in numbers.values() for number in column}
+    first = min(every, default=0) if max(every, default=0) >= poses else 0
+    numbered = all(numbers.values()) and (first == 0 or max(every) - first + 1 == poses)
+    for name, paths in files.items():
+        spare = abs(len(paths) - poses)
+        if spare > (max(2, poses // 10) if numbered else 0):
+            raise InputError(
+                f"{folder / name}: {len(paths)} photographs and {poses} poses",
+                "give the poses of these very photographs, or name them by their rows, from 0",
+            )
+    if not numbered:
+        return {name: list(range(poses)) for name in files}
+    return {name: [number - first for number in column] for name, column in numbers.items()}
 
 
 def _numbers(words: str, where: str, count: int) -> list[float]:

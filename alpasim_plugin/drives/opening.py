@@ -14,7 +14,7 @@ from alpasim_plugin.core.reading import contents, natural_order, parsing, real, 
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
-from alpasim_plugin.drives.source import Points, SourceDrive, in_order
+from alpasim_plugin.drives.source import Points, SourceDrive, in_order, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
@@ -87,21 +87,21 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         notes.append(f"keys of {FILE} that are not read: {some_of(unknown)}")
     names = sorted({one.camera or "front" for one in there})
     front = next((name for name in names if "front" in name), names[0])
-    pictures: list[Picture] = []
-    for name in names:
-        mine = [replace(one, camera=name) for one in listed if (one.camera or "front") == name]
-        if all(one.t_us is None for one in mine):
-            mine, note = in_order(mine)
-            notes.append(note)
-        if any(one.t_us is None for one in mine):
-            bad = next(one for one in mine if one.t_us is None)
-            raise InputError(
-                f"{bad.where}: no t_us, which other photographs have",
-                "give every photograph its time, or none",
-            )
-        pictures += sorted(
-            (one for one in mine if one.file in files), key=lambda one: int(one.t_us or 0)
+    every = [replace(one, camera=one.camera or "front") for one in listed]
+    without = [one for one in every if one.t_us is None]
+    if len(without) == len(every):
+        ordered = [in_order([one for one in every if one.camera == name]) for name in names]
+        every = timed([mine for mine, _ in ordered])
+        notes += [note for _, note in ordered]
+    elif without:
+        raise InputError(
+            f"{without[0].where}: no t_us, which other photographs have",
+            "give every photograph its time, or none",
         )
+    pictures = sorted(
+        (one for one in every if one.file in files),
+        key=lambda one: (str(one.camera), int(one.t_us or 0)),
+    )
     kept = tuple(
         sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"})
     )

@@ -4,8 +4,10 @@ checks that all of them pass.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ JUMP = (
 LEAST_M = 1.0
 FEWEST, MOST = 8, 400  # photographs of a camera
 PERIOD_US = 100_000  # between photographs without times
+LONGEST = 36_000  # steps between the numbers of names that count time: an hour
 SAME_LENGTH = 0.01  # paths that differ by less are equally long
 
 
@@ -181,9 +184,48 @@ def _unit_change(steps: F64) -> tuple[int, float] | None:
     return None
 
 
-def timed(pictures: Sequence[Picture]) -> list[Picture]:
-    """Return pictures without times as taken one after another, `PERIOD_US` apart."""
-    return [replace(one, t_us=i * PERIOD_US) for i, one in enumerate(pictures)]
+def timed(cameras: Sequence[Sequence[Picture]]) -> list[Picture]:
+    """Return photographs without times with the times at which they were taken.
+
+    The numbers of their names count time, `PERIOD_US` for the usual step: photographs of one number
+    have one time, and gaps stay. Without such numbers, those of a camera follow one another.
+
+    Args:
+        cameras: The photographs of each, as they were taken.
+
+    Raises:
+        InputError: Nothing says which photographs of the cameras belong together.
+    """
+    numbers = [name_numbers([one.file for one in camera]) for camera in cameras]
+    every = sorted({number for column in numbers for number in column})
+    steps = sorted(after - before for before, after in pairwise(every))
+    step = steps[len(steps) // 2] if steps else 1
+    if not set.intersection(*map(set, numbers)) or every[-1] - every[0] > LONGEST * step:
+        counts = [len(camera) for camera in cameras]
+        if len(set(counts)) > 1:
+            raise InputError(
+                f"{cameras[0][0].where}: no times, and cameras of {counts} photographs whose names share no numbers",
+                "give each photograph its time (t_us), or photographs of one time names of one number",
+            )
+        numbers = [list(range(count)) for count in counts]
+        every, step = numbers[0], 1
+    return [
+        replace(one, t_us=round((number - every[0]) * PERIOD_US / step))
+        for camera, column in zip(cameras, numbers, strict=True)
+        for one, number in zip(camera, column, strict=True)
+    ]
+
+
+def name_numbers(files: Sequence[Path]) -> list[int]:
+    """Return the number in each name that changes from name to name; nothing where there is no such
+    number, more than one, or one that does not increase.
+    """
+    names = [re.findall(r"\d+", file.stem) for file in files]
+    columns = [column for column in zip(*names, strict=False) if len(set(column)) > 1]
+    if len({len(name) for name in names}) > 1 or len(columns) != 1:
+        return []
+    numbers = [int(digits) for digits in columns[0]]
+    return numbers if all(before < after for before, after in pairwise(numbers)) else []
 
 
 def in_order(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
@@ -197,8 +239,8 @@ def in_order(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
     name, rate = pictures[0].camera, 1_000_000 // PERIOD_US
     if named < (1 - SAME_LENGTH) * listed:
         note = f"in the order of their names: in the file's order the path is {listed / max(named, 1e-12):.1f} times as long"
-        return timed(by_name), f"no times: photographs of {name} are taken {note}; {rate} a second"
-    return timed(pictures), (
+        return by_name, f"no times: photographs of {name} are taken {note}; {rate} a second"
+    return list(pictures), (
         f"no times: photographs of {name} are taken in the file's order, {rate} a second"
     )
 

@@ -6,6 +6,7 @@ Every file is made here; photographs are left out where they do not matter.
 from __future__ import annotations
 
 import json
+import re
 import struct
 from typing import Any
 
@@ -17,9 +18,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import check_motion, place
+from alpasim_plugin.drives.quality import _page
 from alpasim_plugin.drives.source import Points, checked
 from alpasim_plugin.drives.splat import _in_frame
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from alpasim_plugin.gaussians.fit.quality import Comparison
 from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street
 
 STEP_M = 1.2
@@ -43,12 +46,12 @@ def transforms(folder, names, order=None, **keys: Any):
     return folder
 
 
-def colmap(model, names, points=True, camera=""):
+def colmap(model, names, points=True, camera="", places=None):
     model.mkdir(parents=True)
     lens = camera or f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 160 54"
     (model / "cameras.txt").write_text(f"# cameras\n7 {lens}\n")
     rows = []
-    for i, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
+    for i, (name, pose) in enumerate(zip(names, places or poses(len(names)), strict=True)):
         back = np.linalg.inv(pose)
         numbers = [*quat_from_matrix(back[:3, :3]), *back[:3, 3]]
         rows.append(f"{i + 1} {' '.join(map(repr, map(float, numbers)))} 7 {name}")
@@ -205,6 +208,104 @@ def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path):
     (folder / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="'axes'"):
         read_source(folder, photographs=False)
+
+
+def test_a_pose_of_kitti_belongs_to_the_number_of_a_photograph(tmp_path):
+    folder = kitti(tmp_path / "a", row("P2", 180) + row("P3", 180))
+    (folder / "image_3").mkdir()
+    for path in (folder / "image_2").iterdir():
+        (folder / "image_3" / path.name).write_bytes(path.read_bytes())
+    (folder / "image_2/4.png").unlink()
+    left, right = read_source(folder).of("left"), read_source(folder).of("right")
+    assert [one.file.stem for one in left] == ["0", "1", "2", "3", "5", "6", "7"]
+    by_time = {one.t_us: one for one in right}
+    for one in left:
+        assert by_time[one.t_us].file.name == one.file.name
+        assert np.array_equal(by_time[one.t_us].T_world_camera, one.T_world_camera)
+    for i, path in enumerate(sorted((folder / "image_2").iterdir())):
+        path.rename(path.with_stem(f"photograph-{'abcdefg'[i]}"))
+    with pytest.raises(InputError, match="image_2"):
+        read_source(folder)
+
+
+def test_a_part_of_kitti_keeps_the_numbers_of_the_whole(tmp_path):
+    folder = kitti(tmp_path / "a", row("P2", 180))
+    for path in (folder / "image_2").iterdir():
+        path.rename(path.with_stem(f"{100 + int(path.stem):06d}"))
+    (folder / "image_2/000103.png").unlink()
+    assert along(read_source(folder)) == [round(STEP_M * i, 3) for i in (0, 1, 2, 4, 5, 6, 7)]
+    (folder / "image_2/000107.png").unlink()
+    with pytest.raises(InputError, match="6 photographs and 8 poses"):
+        read_source(folder)
+
+
+def two_cameras(folder, names, form):
+    """Write a drive of two cameras at one place, without times; the side one's names by number."""
+    photographs = [
+        *((f"front/{i:04d}.png", pose) for i, pose in enumerate(poses(13))),
+        *((f"side/{name}.png", poses(13)[i]) for i, name in names.items()),
+    ]
+    if form == "transforms":
+        frames = [
+            {"file_path": name, "transform_matrix": pose.tolist(), "camera": name.split("/")[0]}
+            for name, pose in photographs
+        ]
+        folder.mkdir()
+        document = {"axes": "opencv", **LENS, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(document))
+    else:
+        names, places = zip(*photographs, strict=True)
+        colmap(folder / "sparse/0", names, places=places)
+    return folder
+
+
+@pytest.mark.parametrize("form", ["transforms", "colmap"])
+def test_photographs_of_one_number_have_one_time(tmp_path, form):
+    names = {i: f"{i:04d}" for i in range(13) if i not in (0, 7)}
+    drive = read_source(two_cameras(tmp_path / "a", names, form), photographs=False)
+    assert [one.t_us for one in drive.of("front")] == [100_000 * i for i in range(13)]
+    assert [one.t_us for one in drive.of("side")] == [100_000 * i for i in names]
+    unnumbered = {i: f"x{'abcdefghijklm'[i]}" for i in names}
+    with pytest.raises(InputError, match=r"\[13, 11\]"):
+        read_source(two_cameras(tmp_path / "b", unnumbered, form), photographs=False)
+    unnumbered = {i: f"x{'abcdefghijklm'[i]}" for i in range(13)}
+    drive = read_source(two_cameras(tmp_path / "c", unnumbered, form), photographs=False)
+    assert [one.t_us for one in drive.of("side")] == [100_000 * i for i in range(13)]
+
+
+def test_gaps_in_the_numbers_of_photographs_are_gaps_in_time(tmp_path):
+    names = [f"frame_{5 * i + (40 if i > 6 else 0):05d}.png" for i in range(13)]
+    drive = read_source(transforms(tmp_path / "a", names), photographs=False)
+    assert [one.t_us // 100_000 for one in drive.pictures] == [*range(7), *range(15, 21)]
+
+
+def test_times_in_nanoseconds_are_refused(tmp_path):
+    folder = transforms(tmp_path / "a", [f"{i}.png" for i in range(13)], unit="m")
+    document = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(document["frames"]):
+        frame["t_us"] = 100_000_000 * i
+    (folder / "transforms.json").write_text(json.dumps(document))
+    drive = read_source(folder, photographs=False)
+    with pytest.raises(InputError, match="m/s"):
+        check_motion(drive, place(drive, street_points(drive)))
+
+
+def test_the_page_of_a_drive_holds_no_markup_of_its_files(tmp_path):
+    folder = transforms(tmp_path / "a\x1b[2J", ["1.png", "2.png"], **{"<img src=x>\u202e": 1})
+    drive = read_source(folder, photographs=False)
+    grey = np.zeros((4, 4, 3), np.uint8)
+    shown = [("held-out", Comparison("<b>\x1b", grey, grey, 30.0, 0.9), "pictures/<b>\x1b.jpg")]
+    quality = {
+        "photographs": {},
+        "coverage": [],
+        "notes": drive.notes,
+        "fitted": 2,
+        "obstacles": {"boxes": 0, "cleared_cells": 0},
+        "ground": None,
+    }
+    page = _page(drive, quality, shown)
+    assert not re.search("[<\x1b\u202e]", page)
+    assert "&lt;img src=x&gt;" in page
 
 
 def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path):
