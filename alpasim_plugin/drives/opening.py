@@ -85,9 +85,14 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     unknown = sorted({key for one in listed for key in one.more} - KNOWN_KEYS)
     if unknown:
         notes.append(f"keys of {FILE} that are not read: {some_of(unknown)}")
-    names = sorted({one.camera or "front" for one in there})
+    folders = {one.file: os.path.relpath(one.file.parent, folder) for one in listed}
+    if len(set(folders.values())) == 1 or len({one.name for one in folders}) == len(folders):
+        folders = dict.fromkeys(folders, "front")  # one camera does not use a name twice
+    every = [
+        replace(one, camera=one.camera or folders[one.file].replace(os.sep, "-")) for one in listed
+    ]
+    names = sorted({str(one.camera) for one in every if one.file in files})
     front = next((name for name in names if "front" in name), names[0])
-    every = [replace(one, camera=one.camera or "front") for one in listed]
     without = [one for one in every if one.t_us is None]
     if len(without) == len(every):
         ordered = [in_order([one for one in every if one.camera == name]) for name in names]
