@@ -28,6 +28,7 @@ from evaluators.metrics.table import LEFT_ROUTE_M
 DIRECTION_M = 1.0
 # what a recording does within this distance of its first or last position is standing there
 STAND_M = 0.5
+SAME_M = 1e-6  # distances that differ by no more are equal
 FOUND_M = 2.0  # a path that was left is found again where it is this near
 
 
@@ -77,22 +78,28 @@ def followed(path: F64, distance_m: F64, s: F64, points: F64, first_m: float) ->
         first_m: Arc length about which the first one is sought.
 
     Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one
-    before. A point that has left the path there by `LEFT_ROUTE_M` finds it again wherever it comes
+    before; of equally near ones it is the one ahead, so that a path that turns back on itself is
+    followed back. A point that has left the path there by `LEFT_ROUTE_M` finds it again wherever it comes
     within `FOUND_M` of it and moves its way: it has skipped what lies between.
     """
     lengths = arc_lengths(path)
     moved = np.diff(points, axis=0, prepend=points[:1])
     out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*moved.T)
     reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, lengths, first_m))))
-    leaps = np.flatnonzero(np.abs(np.diff(s, prepend=first_m)) > reach_m)
+    step_m = np.diff(s, prepend=first_m)
+    leaps = np.flatnonzero((step_m > reach_m) | (step_m < -SAME_M))
     for k in range(int(leaps[0]), len(s)) if len(leaps) else ():
         before = float(out[k - 1]) if k else first_m
         low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(lengths[-1]))
-        inner = path[np.searchsorted(lengths, low, "right") : np.searchsorted(lengths, high)]
-        ends = _at(path, lengths, low)[None], _at(path, lengths, high)[None]
-        away_m, within_m = to_path(np.concatenate([ends[0], inner, ends[1]]), points[[k]])
-        out[k] = low + within_m[0]
-        if away_m[0] >= LEFT_ROUTE_M and distance_m[k] <= FOUND_M:
+        found = []
+        for start in (low, min(before, high)):
+            inner = path[np.searchsorted(lengths, start, "right") : np.searchsorted(lengths, high)]
+            ends = _at(path, lengths, start)[None], _at(path, lengths, high)[None]
+            away_m, within_m = to_path(np.concatenate([ends[0], inner, ends[1]]), points[[k]])
+            found.append((float(away_m[0]), start + float(within_m[0])))
+        nearest, ahead = found
+        out[k] = (ahead if ahead[0] <= nearest[0] + SAME_M else nearest)[1]
+        if nearest[0] >= LEFT_ROUTE_M and distance_m[k] <= FOUND_M:
             along = _at(path, lengths, s[k] + FOUND_M) - _at(path, lengths, s[k] - FOUND_M)
             out[k] = s[k] if along @ moved[k] > 0.0 else out[k]
     return out

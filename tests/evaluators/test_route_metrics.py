@@ -277,6 +277,17 @@ def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_
         assert rollout_values(score(log, scene(TWO_LANES, log), "strict"))["progress"].value < 0.06
 
 
+def test_a_recording_that_turns_back_on_itself_is_followed_out_and_back():
+    x = np.concatenate([np.linspace(0.0, 20.0, 41), np.linspace(20.0, 0.0, 41)[1:]])
+    path = track(x, 0.0)
+    turned = np.append(x[:61], np.full(20, x[60]))
+    for ego_x, want in ((x, 1.0), (0.0 * x, 0.0), (np.maximum.accumulate(x), 0.5), (turned, 0.75)):
+        for aside_m in (0.0, 0.4):
+            found = scored(rollout(track(ego_x, aside_m), log=path))["progress"].value
+            assert found[-1] == pytest.approx(want, abs=1e-6)
+            assert np.diff(found).min() >= 0.0
+
+
 def test_a_closed_loop_starts_at_its_start_and_ends_at_its_end():
     angle = np.linspace(0.0, 2 * np.pi, 301)
     path = track(30 * np.sin(angle), 30 - 30 * np.cos(angle))
