@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.blame import raised
+from alpasim_plugin.core.blame import defined, raised
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.core.interfaces import Policy
@@ -457,10 +457,12 @@ def _drive(
     """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
     plans: list[Plan] = []
+    method = "reset"
     try:
         policy.reset(
             0, Route(np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)]))
         )
+        method = "act"
         for step, observation in enumerate(observations(situation, cameras)):
             began = time.perf_counter()
             plans.append(policy.act(observation))
@@ -469,7 +471,8 @@ def _drive(
     except SimrunError as error:
         return f"the policy failed: {error.message}"
     except Exception as error:  # whatever a foreign policy raises is a result of the check
-        return f"the policy raised in query {len(plans) + 1}: {raised(error)}"
+        said = raised(error, defined(policy, method))
+        return f"the policy raised in query {len(plans) + 1}: {said}"
     return plans
 
 

@@ -313,8 +313,10 @@ def _run(args: list[str]) -> int:
             from alpasim_plugin.core.reading.files import wanted_of
 
             problem = error.__cause__.errors()[0]
-            wanted = f"{problem['input']!r}, wanted {wanted_of(problem)}"
-            message = message.replace(error.message, wanted)
+            found = f"{problem['input']!r}, wanted {wanted_of(problem)}"
+            if problem["type"] == "value_error":  # a choice, whose error says all of it
+                found = str(problem["ctx"]["error"])
+            message = message.replace(error.message, found)
         refused_by = getattr(error, "ctx", None)  # errors of options have one
         verb = refused_by.command_path if refused_by else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error

@@ -41,7 +41,7 @@ def show(as_json: bool, facts: Mapping[str, Any], *lines: Any) -> None:
         if isinstance(line, str):
             say(line)
         else:
-            Console().print(Escaped(line))
+            Console(emoji=False).print(Escaped(line))
 
 
 class Escaped:
@@ -74,9 +74,9 @@ class Progress(progress.Progress):
     """Progress on standard error: a bar on a terminal, lines on a pipe; silent, only warnings."""
 
     def __init__(self, silent: bool = False) -> None:
-        console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+        console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
         super().__init__(
-            progress.TextColumn("{task.description}"),
+            progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
             progress.MofNCompleteColumn(),
             progress.TimeElapsedColumn(),

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -167,7 +168,16 @@ def run(
     ray = parse_executor(executor)
     find_preset(options.preset)
     of_scene, of_fixer = split_overrides(overrides)
-    refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
+    listed: dict[tuple[ScenarioRef, ...], str] = {}
+    for item in scenarios:
+        found = tuple(expand(item, of_scene, source))
+        if found in listed:
+            raise InputError(
+                f"scenarios {listed[found]} and {item}: they are the same",
+                "Name every scenario once.",
+            )
+        listed[found] = item
+    refs = list(chain.from_iterable(listed))
     if shard is not None:
         refs = shard_of(refs, shard)
     planned = partial(

@@ -23,32 +23,34 @@ TRACEBACK = "Correct that line; --debug, and output.log of a rollout, have the t
 
 
 @contextmanager
-def blaming(kind: type[SimrunError], name: str) -> Iterator[None]:
+def blaming(kind: type[SimrunError], name: str, called: str = "") -> Iterator[None]:
     """Blame a part for whatever it raises in the block, a `SimrunError` and damaged kernels
-    excepted.
+    excepted. See `raised` for ``called``.
     """
     try:
         yield
     except SimrunError:
         raise
     except Exception as error:
-        own = kind(f"{name}: {raised(error)}", TRACEBACK)
+        own = kind(f"{name}: {raised(error, called)}", TRACEBACK)
         raise (damaged_kernels(error) or own) from error
 
 
-def raised(error: BaseException) -> str:
+def raised(error: BaseException, called: str = "") -> str:
     """Name an error and the last line of the user's code in its traceback: neither simrun's, nor
     that of a library which the user's code called.
 
-    Where all code is simrun's or a library's, it is the line that simrun called, or simrun's last.
+    Where all code is simrun's or a library's, it is the line that simrun called, or ``called``, as
+    `defined` gives it: a call that does not fit the user's method never enters it. Without that it
+    is simrun's last.
     """
     frames = traceback.extract_tb(error.__traceback__)
     outside = [frame for frame in frames if not frame.filename.startswith((*OWN_CODE, *PYTHON))]
     users = [frame for frame in outside if not any(part in frame.filename for part in LIBRARIES)]
     chosen = [*outside[:1], *users[-1:]]
-    if not chosen and not isinstance(error, SyntaxError):
+    if not chosen and not called and not isinstance(error, SyntaxError):
         chosen = frames[-1:]
-    where = ""
+    where = called
     if chosen:
         where = f" at {chosen[-1].filename}:{chosen[-1].lineno}, in {chosen[-1].name}"
     text = re.sub(r"simrun_file_\w{12}", "the file", str(error))  # as a file is imported

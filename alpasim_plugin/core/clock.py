@@ -48,8 +48,8 @@ class Clock:
                 )
         if self.n_steps < 1:
             raise InputError(
-                f"{self.start_us}..{self.end_us} us at {self.rates.control_us} us a step: not a single control step fits",
-                "use a longer log or a shorter control period",
+                f"{self.end_us - self.start_us} microseconds to drive, and a control step takes {self.rates.control_us}: not a single control step fits",
+                "give timing.duration_us in microseconds, from one control step up, or use a longer log",
             )
 
     @property

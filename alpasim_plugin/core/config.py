@@ -409,8 +409,15 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
 
 def _nearest(name: str, choices: Sequence[str]) -> str:
     """Return a hint that names the nearest of the valid choices, and all of them."""
+    return f"{guess(name, choices)}valid: {', '.join(choices)}"
+
+
+def guess(name: str, choices: Collection[str]) -> str:
+    """Return the beginning of a hint that names the choice nearest to a name; empty where none is
+    near.
+    """
     near = _like(name, choices)
-    return f"{f'did you mean {near!r}? ' if near else ''}valid: {', '.join(choices)}"
+    return "" if near is None else f"did you mean {near!r}? "
 
 
 def _like(name: str, choices: Collection[str]) -> str | None:

@@ -32,13 +32,13 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
         return []
     kind = RendererError if is_own(renderer) else RendererFault
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
-    with blaming(kind, name):
+    where = defined(renderer, "render")
+    with blaming(kind, name, where):
         frames = list(renderer.render_batch(requests))
     problem = f"{len(frames)} frames for {len(requests)} requests"
     if len(frames) == len(requests):
         problem = "; ".join(filter(None, map(_frame_problem, frames, requests)))
     if problem:
-        where = defined(renderer, "render")
         raise kind(
             f"{name}: {problem}{where}", "Correct the renderer; its contract is types.Frame."
         )
@@ -98,7 +98,7 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     Raises:
         PolicyError: The policy raised.
     """
-    with blaming(PolicyError, type(policy).__name__):
+    with blaming(PolicyError, type(policy).__name__, defined(policy, "reset")):
         policy.reset(seed, route)
 
 
@@ -110,9 +110,10 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
             does not start now.
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
-    with blaming(PolicyError, name):
+    where = defined(policy, "act")
+    with blaming(PolicyError, name, where):
         plan = policy.act(observation)
     found = plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError(f"{name}: {found}{defined(policy, 'act')}", CHECK)
+        raise PolicyError(f"{name}: {found}{where}", CHECK)
     return plan

@@ -12,6 +12,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from alpasim_plugin.core.config import guess
 from alpasim_plugin.core.errors import InputError
 
 
@@ -244,6 +245,6 @@ def preset(name: str | Preset) -> Preset:
     if name not in PRESETS:
         raise InputError(
             f"name {name!r}: no preset has that name",
-            f"known: {', '.join(PRESETS)}",
+            f"{guess(name, PRESETS)}known: {', '.join(PRESETS)}",
         )
     return PRESETS[name]

@@ -158,7 +158,7 @@ class Overview:
         if len(self.rows) == 1:
             n, total = self.rows[0].n_failed, plural(self.rows[0].n_rollouts, "rollout")
         if n == 0:
-            return f"none of {total} fails", "better"
+            return f"no failure in {total}", "better"
         return f"{n} of {total} fail{'s' if n == 1 else ''}", "worse"
 
     @property

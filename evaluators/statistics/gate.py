@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import Document, load_yaml, validate
+from alpasim_plugin.core.config import Document, guess, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
@@ -170,7 +170,7 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
             raise document.error(
                 ("metrics", name),
                 f"no metric {name!r}",
-                "simrun list metrics prints the known ones",
+                f"{guess(name, known)}simrun list metrics prints the known ones",
             ) from error
         if rule.margin == 0.0 and facts.direction == "none":
             problem = f"a margin of 0 for {name!r}, which has no better side"
@@ -181,7 +181,8 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
             problem = f"max_new for {name!r}, which is no event"
             raise document.error(("metrics", name, "max_new"), problem, "give a margin")
     if spec.preset is not None and spec.preset not in PRESETS:
-        raise document.error(("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
+        hint = f"{guess(spec.preset, PRESETS)}known: {', '.join(PRESETS)}"
+        raise document.error(("preset",), f"preset {spec.preset!r}", hint)
 
 
 Kind = Literal["margin", "limit"]

@@ -33,7 +33,14 @@ from alpasim_plugin.log.run_folder.schema import (
     WHY_NAME,
     cell_name,
 )
-from evaluators.metrics.outcomes import OUTCOMES, first_failure, in_words, outcomes_of
+from evaluators.metrics.outcomes import (
+    OUTCOMES,
+    SHORT_OF_END,
+    ending_of,
+    first_failure,
+    in_words,
+    outcomes_of,
+)
 from evaluators.opening import Run
 from evaluators.report.rollouts import clock_zero_us
 from evaluators.viewer.cells import lens_data, read_log
@@ -170,7 +177,7 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -
         _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
     ]
     outcomes = outcomes_of(rollout)
-    outcome = in_words(outcomes)
+    outcome = in_words(outcomes) if outcomes else ending_of(rollout)
     breaches, notes = _checked(run, rollout)
     sentences = list(breaches)
     if not rollout.ok:
@@ -178,8 +185,10 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -
         said = last_output(run.folder / rollout.path / OUTPUT_NAME)
         sentences = [*(sentences or [rollout.failure]), *said]
     sentences += [*behind_others(run, rollout), *notes]
-    if log is not None and rollout.ok and failed_us is not None:
-        sentences += plan_facts(log, failed_us, outcomes, _met(run, rollout))
+    if log is not None and rollout.ok:
+        ended_us = int(log.ego.t_us[-1]) if outcome == SHORT_OF_END else failed_us
+        if ended_us is not None:
+            sentences += plan_facts(log, ended_us, outcomes, _met(run, rollout))
     for one in partings:
         at_s = (one.t_us - start_us) * 1e-6
         sentences.append(

@@ -21,12 +21,13 @@ BRAKES = 0.9  # share of the ego's speed below which a plan brakes
 
 
 def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: str) -> list[str]:
-    """Return what the plans before a failure were, the most telling first.
+    """Return what the plans before a failure, or before an end short of the path's, were: the most
+    telling first.
 
     Args:
         log: The log, up to the failure at least.
-        failed_us: When it failed.
-        outcomes: Names of its outcomes.
+        failed_us: When it failed, or ended.
+        outcomes: Names of its outcomes; none of a drive that ended short.
         met: The road user of a collision; empty where there is none.
     """
     plans = [
@@ -38,13 +39,14 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
         return []
     if met in log.actors:
         return _towards(log, plans, log.actors[met], failed_us)
-    if outcomes & {"stalled", "braked_without_cause"}:
+    if not outcomes or outcomes & {"stalled", "braked_without_cause"}:
         reaches = [float(np.hypot(*_ahead(plan, 2_000_000))) < STANDS_M for plan in plans]
-        said = f"stands: less than {STANDS_M} m in two seconds"
+        event = "failure" if outcomes else "end"
+        said = f"before the {event} stands: less than {STANDS_M} m in two seconds"
     else:
         reaches = [_beside_m(plan) > AWAY_M for plan in plans]
         most_m = max(_beside_m(plan) for plan in plans)
-        said = f"leads away from the route: up to {most_m:.1f} m beside it in two seconds"
+        said = f"before the failure leads away from the route: up to {most_m:.1f} m beside it in two seconds"
     return _since(plans, reaches, failed_us, said)
 
 
@@ -56,7 +58,7 @@ def _since(
     if first == len(plans):
         return []
     before_s = (failed_us - plans[first].now_us) * 1e-6
-    return [f"Every plan of the last {before_s:.1f} s before the failure {said}."]
+    return [f"Every plan of the last {before_s:.1f} s {said}."]
 
 
 def _towards(
@@ -64,7 +66,7 @@ def _towards(
 ) -> list[str]:
     """Say since when plans lead into a road user, and when the first one brakes."""
     leads = [_leads_into(log, plan.trajectory, actor) for plan in plans]
-    facts = _since(plans, leads, failed_us, f"leads into {actor.actor_id}")
+    facts = _since(plans, leads, failed_us, f"before the failure leads into {actor.actor_id}")
     driven = speeds(log.ego)
     for plan in plans:
         speed = float(np.interp(plan.now_us, log.ego.t_us, driven))

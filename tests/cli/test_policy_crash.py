@@ -4,9 +4,14 @@ the check finds it.
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import PolicyError
+from alpasim_plugin.core.parts.source import load
+from alpasim_plugin.core.types import Route
+from alpasim_plugin.runs.guards import reset_policy
 from policies.conformance import check_policy
 
 LATE = """
@@ -39,6 +44,17 @@ def test_the_check_drives_long_enough_to_find_a_policy_that_raises_after_a_while
     fault, *_ = check_policy(late).failures
     assert "in query 19: IndexError: list index out of range" in fault
     assert "late.py:16" in fault
+
+
+def test_a_call_that_does_not_fit_is_blamed_on_the_method_of_the_policy(tmp_path):
+    path = tmp_path / "short.py"
+    path.write_text(LATE.replace("def reset(self, seed, route)", "def reset(self)"))
+    fault, *_ = check_policy(f"{path}:Late").failures
+    assert f"{path}:7" in fault
+    made = load(f"{path}:Late", "policy")
+    policy = made.__new__(made)
+    with pytest.raises(PolicyError, match=f"{path}:7"):
+        reset_policy(policy, 0, Route(np.zeros((2, 3))))
 
 
 def test_the_terminal_has_file_line_and_the_end_of_the_traceback(late, tmp_path, capfd):

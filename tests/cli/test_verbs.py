@@ -9,8 +9,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 from alpasim_plugin.cli.main import PANELS, load_verb
+from alpasim_plugin.cli.output import Progress, show
 
 REPO = Path(__file__).resolve().parents[2]
 OWN = [verb for panel in PANELS.values() for verb in panel]
@@ -94,3 +96,13 @@ def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels():
         ).stdout.strip()
         == "set()"
     )
+
+
+def test_the_name_of_a_class_is_no_emoji(capsys):
+    Progress().say("check of mine.py:Feet: at 10 m/s")
+    table = Table("policy")
+    table.add_row("mine.py:Feet: at")
+    show(False, {}, table)
+    captured = capsys.readouterr()
+    assert ":Feet:" in captured.err
+    assert ":Feet:" in captured.out

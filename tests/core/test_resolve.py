@@ -43,6 +43,15 @@ def test_a_module_that_raises_is_told_with_what_it_raised(tmp_path):
         resolve("policy", f"{file}:Mine")
 
 
+def test_a_file_without_its_class_leads_to_its_classes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("class Mine: ...\n")
+    for name in ("mine.py", "mine"):
+        with pytest.raises(InputError) as caught:
+            resolve("policy", name)
+        assert "mine.py:Mine" in caught.value.hint
+
+
 def test_the_digest_follows_imports_wherever_they_stand(tmp_path):
     package = tmp_path / "pack"
     package.mkdir()

@@ -395,7 +395,7 @@ def test_shipped_gates_load_by_name(name):
             ":2:",
             "did you mean 'min_scenes'?",
         ),
-        ("version: 1\nmetrics:\n  offraod: {margin: 0.1}\n", ":3:", "no metric 'offraod'"),
+        ("version: 1\nmetrics:\n  offraod: {margin: 0.1}\n", ":3:", "did you mean 'offroad'?"),
         ("version: 1\nmetrics:\n  offroad: {margin: -0.1}\n", ":3:", "greater than or equal to 0"),
         (
             "version: 1\nmetrics:\n  offroad: {must_decide: false}\n",
@@ -404,7 +404,11 @@ def test_shipped_gates_load_by_name(name):
         ),
         ("version: 1\nmetrics:\n  dist_traveled_m: {margin: 0}\n", ":3:", "no better side"),
         ("version: 1\nmetrics:\n  progress: {max_new: 1}\n", ":3:", "which is no event"),
-        ("version: 1\npreset: papr\nmetrics: {offroad: {margin: 0.1}}\n", ":2:", "known: paper"),
+        (
+            "version: 1\npreset: papr\nmetrics: {offroad: {margin: 0.1}}\n",
+            ":2:",
+            "did you mean 'paper'?",
+        ),
         ("version: 2\nmetrics: {offroad: {margin: 0.1}}\n", ":1:", "version"),
         (
             "version: 1\npopulation: scenes\nmetrics: {progress: {min: 0.5}}\n",

@@ -18,6 +18,7 @@ from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.run import execute_run
+from evaluators.metrics.outcomes import SHORT_OF_END
 from evaluators.opening import read_run
 from evaluators.viewer.cause import cause_of, failed_at
 from scenarios.suite import expand
@@ -76,6 +77,14 @@ class Right(ByRoute):
     def act(self, observation):
         plan = super().act(observation)
         return replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+
+
+class Stands(Right):
+    """Never sets off."""
+
+    def act(self, observation):
+        plan = super().act(observation)
+        return replace(plan, xy=0 * plan.xy, yaw=0 * plan.yaw)
 
 
 class Raises(Right):
@@ -180,6 +189,18 @@ def test_a_rollout_that_broke_off_shows_its_error(tmp_path, capsys):
         page = Path(found["page"]).read_text()
         assert text in page
         assert bool(queries_of(page)) == some
+
+
+def test_a_drive_that_ended_short_says_so_and_that_its_plans_stand(tmp_path, capsys):
+    (tmp_path / "bend.yaml").write_text(BEND.replace("3_000_000", "1_000_000"))
+    plan = make_plan(
+        expand(str(tmp_path / "bend.yaml")), (GREY,), (f"{HERE}:Stands",), (0,), RunOptions()
+    )
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
+    assert run_command(["why", str(rollout(tmp_path / "run", "Stands")), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["outcome"] == SHORT_OF_END
+    assert any("before the end stands" in line for line in found["found"])
 
 
 def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(

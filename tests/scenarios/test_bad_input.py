@@ -94,7 +94,7 @@ def swap(old, new):
             "rates.control_us = 0",
             "greater than or equal to 1000",
         ),
-        (swap("6000000", "50000"), ":7:10", "not a single control step fits", "longer log"),
+        (swap("6000000", "50000"), ":7:10", "not a single control step fits", "timing.duration_us"),
         (
             GOOD.replace("6000000}", "600000, warmup_us: 600000}"),
             ":7:31",

@@ -4,7 +4,6 @@ resolved part.
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import os
 import re
@@ -16,7 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from alpasim_plugin.core.config import Document, apply_overrides, validate
+from alpasim_plugin.core.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration, require_methods
 from alpasim_plugin.core.lazy import installed, installed_names
@@ -80,20 +79,19 @@ def find(kind: KindName, name: str) -> Entry:
     raise _unknown(kind, name, known)
 
 
-def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
-    if name.endswith(".py"):
-        return _classless(kind, Path(name))
+def _unknown(kind: str, name: str, known: Collection[str]) -> InputError:
+    file = Path(name if name.endswith(".py") else f"{name}.py")
+    if name.endswith(".py") or os.path.isfile(file):
+        return _classless(kind, file)
     for other in ("renderer", "fixer", "policy", "controller"):
         if name in entries(other):
             option = "renderer" if other == "fixer" else other
             return InputError(
                 f"name {name!r}: a {other}, not a {kind}", f"Write --{option} {name}."
             )
-    near = difflib.get_close_matches(name, known, n=1)
-    guess = f"did you mean {near[0]!r}? " if near else ""
     return InputError(
         f"name {name!r}: no {kind} has that name",
-        f"{guess}known: {', '.join(known)}; or name one of your own as package.module:Class",
+        f"{guess(name, known)}known: {', '.join(known)}; or name one of your own as package.module:Class",
     )
 
 
@@ -105,7 +103,9 @@ def _classless(kind: str, file: Path) -> InputError:
     if not classes:
         return InputError(f"{file}: it has no class", f"Write the {kind} as a class in it.")
     named = " or ".join(f"{file}:{name}" for name in classes)
-    return InputError(f"{file}: a file without a class of it", f"Name its {kind}: {named}.")
+    return InputError(
+        f"{file}: a file, and not which of its classes is the {kind}", f"Name its {kind}: {named}."
+    )
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
