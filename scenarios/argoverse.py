@@ -22,6 +22,7 @@ from alpasim_plugin.core.geometry import (
     se3,
     wrap_angle,
 )
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import (
@@ -231,7 +232,7 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
     return mean(padded), mean(row + 0.5), mean(column + 0.5)
 
 
-def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> dict[str, Any]:
+def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> JsonObject:
     layer = document.get(key) if isinstance(document, dict) else None
     if not isinstance(layer, dict) or not all(isinstance(v, dict) for v in layer.values()):
         raise files.fail(
@@ -241,7 +242,7 @@ def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> dict[str,
 
 
 def _line(
-    files: SourceFiles, where: str, raw: dict[str, Any], key: str, origin: F64, least: int
+    files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64, least: int
 ) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
     try:

@@ -18,6 +18,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_array, write_json
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.reading.files import as_shape
@@ -300,7 +301,7 @@ def _rows(values: Any, width: int = 3) -> F64:
     return np.array(values, dtype=np.float64).reshape(-1, width)
 
 
-def _map_document(lane_map: LaneMap) -> dict[str, Any]:
+def _map_document(lane_map: LaneMap) -> JsonObject:
     return {
         "lanes": [
             {name: _plain(getattr(lane, name)) for name in _Lane.__annotations__}
@@ -320,11 +321,11 @@ def _plain(value: Any) -> Any:
 def _map_of(document: _Map) -> LaneMap:
     lanes = {}
     for lane in document["lanes"]:
-        fields: dict[str, Any] = {**lane, "successors": tuple(lane["successors"])}
+        fields: JsonObject = {**lane, "successors": tuple(lane["successors"])}
         for name in ("centre", "left", "right"):
             fields[name] = None if fields[name] is None else _rows(fields[name])
         lanes[lane["lane_id"]] = Lane(**fields)
-    lines: dict[str, Any] = {name: tuple(map(_rows, document[name])) for name in LINES}
+    lines: JsonObject = {name: tuple(map(_rows, document[name])) for name in LINES}
     markings = tuple(Marking(_rows(one["xyz"]), one["paint"]) for one in document["markings"])
     return LaneMap(lanes, **lines, markings=markings)
 

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lens import rays_of
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
@@ -85,7 +86,7 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
     return tuple(cameras)
 
 
-def _sensors(archive: Archive) -> tuple[str, dict[str, Any]]:
+def _sensors(archive: Archive) -> tuple[str, JsonObject]:
     """Return where a scene's calibration stands, and its sensors by name; none where it has none."""
     member = next((name for name in TABLES if name in archive), None)
     if member is None:
@@ -132,7 +133,7 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
     )
 
 
-def _lens_numbers(properties: dict[str, Any]) -> F64:
+def _lens_numbers(properties: JsonObject) -> F64:
     if properties.get("Model") != "ftheta":
         raise ValueError(f"camera model {properties.get('Model')!r}")
     coefficients = [float(v) for v in str(properties["polynomial"]).split()]
@@ -145,7 +146,7 @@ def _lens_numbers(properties: dict[str, Any]) -> F64:
     return np.array([*size, *coefficients, *[0.0] * (6 - len(coefficients)), float(backward)])
 
 
-def mount(sensor: dict[str, Any]) -> F64:
+def mount(sensor: JsonObject) -> F64:
     """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by
     the estimated corrections.
     """

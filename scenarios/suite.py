@@ -10,13 +10,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import yaml
 from pydantic import Field
 
 from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.parts import names as part_names
 from alpasim_plugin.core.reading import read_text, real
@@ -121,7 +122,7 @@ class SuiteItem(Part):
     seeds: tuple[Annotated[int, within(SEED)], ...] = Field(
         default=(), max_length=int(SEEDS.high), description="Scene seeds; none: the file's own."
     )
-    set: dict[str, Any] = Field(default={}, description="Dotted key to value, as --set would.")
+    set: JsonObject = Field(default={}, description="Dotted key to value, as --set would.")
 
 
 class SuiteSpec(Part):
@@ -222,7 +223,7 @@ def _locate(text: str, base: Path | None) -> Path:
     raise unknown(text, "scenario or suite", names)
 
 
-def _head(path: Path) -> dict[str, Any]:
+def _head(path: Path) -> JsonObject:
     """Return a file's plain data, or nothing where it is not a mapping."""
     data = load_yaml(path).data
     return data if isinstance(data, dict) else {}

@@ -8,12 +8,13 @@ for all frames.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NotRequired
+from typing import Literal, NotRequired
 
 import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.types import CameraSpec, LensModel
@@ -49,7 +50,7 @@ def read_transforms(path: Path) -> tuple[CameraSpec, ...]:
         InputError: A key is missing or cannot be, or a camera has two frames.
     """
     document = read_json_object(path, do_this=DO_THIS)
-    frames = as_shape(list[dict[str, Any]], document.get("frames"), f"{path}, frames", DO_THIS)
+    frames = as_shape(list[JsonObject], document.get("frames"), f"{path}, frames", DO_THIS)
     cameras: dict[str, CameraSpec] = {}
     for i, frame in enumerate(frames):
         camera = _camera({**document, **frame}, f"{path}, frame {i}")
@@ -62,7 +63,7 @@ def read_transforms(path: Path) -> tuple[CameraSpec, ...]:
     return tuple(cameras.values())
 
 
-def _camera(document: dict[str, Any], where: str) -> CameraSpec:
+def _camera(document: JsonObject, where: str) -> CameraSpec:
     frame = as_shape(_Frame, document, where, DO_THIS)
     kind: Literal["opencv", "fisheye"] = (
         "fisheye" if frame.get("camera_model") == "OPENCV_FISHEYE" else "opencv"

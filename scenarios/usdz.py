@@ -28,12 +28,12 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import quat_from_matrix, transform_points
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_wide
@@ -191,7 +191,7 @@ class _Rig:
                 f"{len(rigs) if isinstance(rigs, list) else 0} rigs",
                 "give exactly one rig trajectory",
             )
-        self._rig: dict[str, Any] = rigs[0]
+        self._rig: JsonObject = rigs[0]
         poses = self._array(self._rig, "T_rig_worlds", (-1, 4, 4))
         times = self._array(self._rig, "T_rig_world_timestamps_us", (-1,))
         t_us = times.astype(np.int64)
@@ -269,7 +269,7 @@ class _Rig:
         )
         return Vehicle(Box(*(float(round(v, 6)) for v in size)), float(round(centre[0], 6))), notes
 
-    def _array(self, owner: dict[str, Any], key: str, shape: tuple[int, ...]) -> F64:
+    def _array(self, owner: JsonObject, key: str, shape: tuple[int, ...]) -> F64:
         try:
             raw = owner[key]
             # Times are integers beyond float32; float64 holds microseconds since 1970 exactly.

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from alpasim_plugin.core.config import parse
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.reading.files import check_names, open_regular
@@ -98,10 +99,10 @@ class Archive:
             text = data.decode("utf-8")
         return parse(text, where).data
 
-    def table(self, member: str) -> list[dict[str, Any]]:
+    def table(self, member: str) -> list[JsonObject]:
         """Read a parquet member as rows."""
         where = f"{self.path}, {member}"
         table = parse_parquet(self.read(member), where, do_this="fetch the file again")
         with parsing(where, "fetch the file again", "no readable parquet"):
-            rows: list[dict[str, Any]] = table.to_pylist()
+            rows: list[JsonObject] = table.to_pylist()
         return rows

@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
 from scenarios.recorded import MAX_REACH_M
@@ -87,8 +88,8 @@ class _Row:
     """One row of a table: where it stands, its key and its content; null structs are empty."""
 
     where: str
-    key: dict[str, Any]
-    own: dict[str, Any]
+    key: JsonObject
+    own: JsonObject
 
     @property
     def map_id(self) -> str | None:
@@ -280,7 +281,7 @@ def table_ids(names: Sequence[str]) -> dict[str, str]:
 
 def _row(
     map_id: str | None, label: str, own: Mapping[str, Any], kind: str | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     return {
         "key": {"label_class_id": label, "map_id": map_id, "map_id_version": "0", "kind": kind},
         label: dict(own),
@@ -288,12 +289,12 @@ def _row(
     }
 
 
-def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, Any]]:
+def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject]:
     """Return a row per lane and kind of neighbour; AlpaSim's routes follow NEXT_LANE and end where
     it is missing.
     """
     before = predecessors(lanes)
-    out: list[dict[str, Any]] = []
+    out: list[JsonObject] = []
     for key, lane in lanes.items():
         found: dict[str, tuple[str | None, ...]] = {
             "NEXT_LANE": tuple(lane.successors),
@@ -322,7 +323,7 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, 
     ]
 
 
-def _signs(lane_map: LaneMap) -> list[dict[str, Any]]:
+def _signs(lane_map: LaneMap) -> list[JsonObject]:
     signs = [
         _row(f"sign{i}", "traffic_sign", {"center": _point(pose[:3, 3]), "category": "UNKNOWN"})
         for i, (pose, _) in enumerate(lane_map.signs)
@@ -334,7 +335,7 @@ def _signs(lane_map: LaneMap) -> list[dict[str, Any]]:
 
 def _wait_lines(
     lane_map: LaneMap, lanes: Mapping[str, Lane], ids: Mapping[str, str]
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return a row per stop line, with the lane whose end it is nearest to in its id."""
     keys = list(lanes)
     ends = shapely.points(np.array([lane.centre[-1, :2] for lane in lanes.values()]))
@@ -362,7 +363,7 @@ def _point(xyz: F64) -> dict[str, float]:
     return dict(zip("xyz", xyz.tolist(), strict=True))
 
 
-def _parquet(name: str, rows: Sequence[dict[str, Any]], clip_id: str) -> bytes:
+def _parquet(name: str, rows: Sequence[JsonObject], clip_id: str) -> bytes:
     for row in rows:
         row["key"]["clip_id"] = clip_id
     schema = pa.schema([("key", _KEY), (name, _OWN[name]), ("version", pa.int64())])

@@ -13,7 +13,6 @@ import uuid
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -22,6 +21,7 @@ from alpasim_plugin import __version__
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -121,7 +121,7 @@ def alpasim_cameras(cameras: tuple[CameraSpec, ...]) -> dict[str, CameraSpec]:
     return {FRONT_WIDE if camera.name == main else camera.name: camera for camera in cameras}
 
 
-def _metadata(scenario: Scenario, cameras: list[str]) -> dict[str, Any]:
+def _metadata(scenario: Scenario, cameras: list[str]) -> JsonObject:
     return {
         "scene_id": scenario.scene_id,
         "version_string": f"simrun-{__version__}",
@@ -139,7 +139,7 @@ def _metadata(scenario: Scenario, cameras: list[str]) -> dict[str, Any]:
     }
 
 
-def _rig(scenario: Scenario, cameras: Mapping[str, CameraSpec]) -> dict[str, Any]:
+def _rig(scenario: Scenario, cameras: Mapping[str, CameraSpec]) -> JsonObject:
     log = scenario.ego_log
     frames = {name: frame_times(scenario, camera) for name, camera in cameras.items()}
     return {
@@ -163,7 +163,7 @@ def _rig(scenario: Scenario, cameras: Mapping[str, CameraSpec]) -> dict[str, Any
     }
 
 
-def rig_box(vehicle: Vehicle) -> dict[str, Any]:
+def rig_box(vehicle: Vehicle) -> JsonObject:
     """Return the ego's box in the rig, as ``rig_trajectories.json`` holds it."""
     box = vehicle.box
     size = [box.length_m, box.width_m, box.height_m]

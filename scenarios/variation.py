@@ -17,6 +17,7 @@ from typing import Any
 
 from alpasim_plugin.core.config import Document, apply_overrides, dotted, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.seeding import stream
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
@@ -110,7 +111,7 @@ def _varied(
     """Return the document with the variations and the sample of this seed written into it, except
     for keys that an override fixes.
     """
-    chosen: dict[str, Any] = {}
+    chosen: JsonObject = {}
     for key, rule in spec.variations.items():
         rng = stream(scene_id, spec.seed, f"scenario/variation/{key}")
         if isinstance(rule, RangeSpec):
@@ -166,7 +167,7 @@ def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[A
     }
 
 
-def _flat(part: Any, loc: tuple[str | int, ...]) -> dict[str, Any]:
+def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
     """Return dotted keys and plain values of a specification; actors go by their ids."""
     if isinstance(part, Part):
         names = set(type(part).model_fields) - (

@@ -15,6 +15,7 @@ from rich import progress
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
 from alpasim_plugin.core.stage import stages_in
@@ -135,7 +136,7 @@ class Progress(progress.Progress):
         self.ended.set()
         super().stop()
 
-    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+    def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
         """Count a rollout and print its result; on a terminal only failures."""
         task = self.tasks[-1]
         self.printed_s = time.monotonic()
@@ -230,7 +231,7 @@ def fixer_labels(plan: RunPlan) -> list[str]:
     return lines
 
 
-def describe(manifest: dict[str, Any], reused: bool) -> str:
+def describe(manifest: JsonObject, reused: bool) -> str:
     """Return one line with a rollout's result."""
     names = [manifest["renderer"], manifest["policy"], manifest["scene"]]
     cell = f"{' '.join(names)} seed {manifest['seed']}"

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ import torch
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
@@ -99,7 +99,7 @@ def import_drive(
     camera_height_m: float | None = None,
     lane_map: Path | None = None,
     report: Report | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Make a scenario of a recorded drive.
 
     Args:
@@ -154,7 +154,7 @@ def _built(
     camera_height_m: float | None,
     map_file: Path | None,
     tell: Report,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
@@ -197,7 +197,7 @@ def write_folder(
     views: Mapping[str, Sequence[PosedView]],
     exposures: Mapping[str, tuple[float, float, float]],
     tell: Report,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Find what stands in a model, measure it, and write everything of an imported drive but its
     photographs.
 
@@ -256,7 +256,7 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
     return digest.hexdigest()
 
 
-def finished(out: Path, key: str) -> dict[str, Any]:
+def finished(out: Path, key: str) -> JsonObject:
     """Return the quality of a finished import, or refuse another thing in its place."""
     if not os.path.isfile(out / SCENARIO_FILE) or not os.path.isfile(out / KEY_FILE):
         raise InputError(
@@ -268,7 +268,7 @@ def finished(out: Path, key: str) -> dict[str, Any]:
             f"{out}: it holds another import",
             "name another folder, or remove this one first",
         )
-    quality: dict[str, Any] = read_json(out / "quality.json")
+    quality: JsonObject = read_json(out / "quality.json")
     return quality
 
 

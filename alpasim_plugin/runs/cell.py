@@ -19,6 +19,7 @@ from alpasim_plugin.control import Controller
 from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import FaultOfPart, SimrunError
 from alpasim_plugin.core.interfaces import Policy, Renderer
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
@@ -117,7 +118,7 @@ def run_cell(
     threads: int,
     builder: PartsBuilder = build_parts,
     load: Callable[[ScenarioRef], Scenario] | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Run and score one cell and return its manifest. The manifest is written last: a folder
     without one is unfinished.
 
@@ -158,8 +159,8 @@ def is_copied(manifest: Mapping[str, Any]) -> bool:
 
 
 def copy_cell(
-    cell: Cell, options: RunOptions, root: Path, threads: int, original: dict[str, Any]
-) -> dict[str, Any]:
+    cell: Cell, options: RunOptions, root: Path, threads: int, original: JsonObject
+) -> JsonObject:
     """Copy the rollout of a policy without a camera into the cell of another renderer and return
     the manifest. It is neither driven nor scored again; its film is rendered.
 
@@ -191,7 +192,7 @@ def copy_cell(
 
 
 @contextmanager
-def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator[dict[str, Any]]:
+def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator[JsonObject]:
     """Clear the folder of a rollout, yield its manifest, and write it after the block; what the
     block raises becomes the rollout's failure.
     """
@@ -230,7 +231,7 @@ def _render_film(
     write_film(folder, scenario, renderer)
 
 
-def _begun(cell: Cell) -> dict[str, Any]:
+def _begun(cell: Cell) -> JsonObject:
     """Return what the manifest of a rollout begins with."""
     return {
         **cell.names,
@@ -260,14 +261,14 @@ def _drive(
     return recorder
 
 
-def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
+def _facts_of(parts: RolloutParts, has_fixer: bool) -> JsonObject:
     """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the
     fixer.
     """
     rendered = dict(complete(parts.renderer, Renderer).facts())
     driven = dict(complete(parts.policy, Policy).facts())
     has_camera = bool(complete(parts.policy, Policy).sensors)
-    facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}, "has_camera": has_camera}
+    facts: JsonObject = {"fixer": rendered if has_fixer else {}, "has_camera": has_camera}
     if rendered and not has_fixer:
         facts["renderer_facts"] = rendered
     if driven:
@@ -275,9 +276,9 @@ def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
     return facts
 
 
-def _failure(error: Exception, folder: Path) -> dict[str, Any]:
+def _failure(error: Exception, folder: Path) -> JsonObject:
     """Return what the manifest says of a rollout that failed; called where the error is handled."""
-    facts: dict[str, Any] = {"status": "failed", "traceback": traceback.format_exc()}
+    facts: JsonObject = {"status": "failed", "traceback": traceback.format_exc()}
     if isinstance(error, OSError):
         error = disk_error(folder, error)
     if isinstance(error, SimrunError):
@@ -309,14 +310,12 @@ def _log_traceback(error: Exception, folder: Path) -> None:
         log.write(text)
 
 
-def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:
+def failed_manifest(cell: Cell, error: SimrunError) -> JsonObject:
     """Return the manifest of a rollout that was never driven to its end."""
     return _begun(cell) | {"status": "failed", "error": error.as_dict(), "wall_s": None}
 
 
-def rescore_cell(
-    cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]
-) -> dict[str, Any]:
+def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: JsonObject) -> JsonObject:
     """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged
     table; return the new manifest.
     """
@@ -362,7 +361,7 @@ def find_rollout_state(
     return state.action, state
 
 
-def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
+def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> JsonObject:
     rows, facts = score_log(
         folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
     )

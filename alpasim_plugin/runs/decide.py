@@ -17,6 +17,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
@@ -196,7 +197,7 @@ class _SequentialTest:
     plan: RunPlan
     question: Question
     driven: int = 0  # scenes, the first of the order
-    manifests: dict[str, dict[str, Any]] = field(default_factory=dict)
+    manifests: dict[str, JsonObject] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)  # binding metrics of which a pair has no value
     state: State = State(0, "open", ())
@@ -227,7 +228,7 @@ class _SequentialTest:
         self.driven += len(batch)
         return [cell for scene in batch for cell in self.plan.cells if cell.scene == scene]
 
-    def add(self, cells: Sequence[Cell], manifests: Sequence[dict[str, Any]]) -> None:
+    def add(self, cells: Sequence[Cell], manifests: Sequence[JsonObject]) -> None:
         """Take in a batch and analyse all scenes so far."""
         folders = [cell.folder.as_posix() for cell in cells]
         self.manifests |= dict(zip(folders, manifests, strict=True))

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
@@ -32,9 +32,9 @@ from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
-OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
-Job = tuple[Cell, dict[str, Any] | None]  # with the manifest of the rollout that it is a copy of
-Done = Iterator[tuple[Cell, dict[str, Any]]]
+OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
+Job = tuple[Cell, JsonObject | None]  # with the manifest of the rollout that it is a copy of
+Done = Iterator[tuple[Cell, JsonObject]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class HowToRun:
     executor: Executor = LOCAL
 
     @property
-    def stated(self) -> dict[str, Any]:
+    def stated(self) -> JsonObject:
         """Give what ``run.json`` says of the executor; nothing for a run on this machine."""
         return {} if self.executor.is_local else {"executor": str(self.executor)}
 
@@ -103,7 +103,7 @@ def execute(
     how: HowToRun,
     on_done: OnDone,
     notify: Callable[[str], None],
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Run every unfinished cell and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
@@ -118,7 +118,7 @@ def execute(
         on_done: Called with each manifest.
         notify: Called with one line for each damaged rollout.
     """
-    manifests: dict[Path, dict[str, Any]] = {}
+    manifests: dict[Path, JsonObject] = {}
     todo: list[Cell] = []
     copies: list[tuple[Cell, Cell]] = []  # with the rollout that each is a copy of
     originals: dict[tuple[str, str, int], Cell] = {}
@@ -178,7 +178,7 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
     work = partial(_work, plan.options, root, threads)
 
-    def written(job: Job) -> dict[str, Any] | None:
+    def written(job: Job) -> JsonObject | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
         action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
@@ -187,7 +187,7 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-def _work(options: RunOptions, root: Path, threads: int, job: Job) -> dict[str, Any]:
+def _work(options: RunOptions, root: Path, threads: int, job: Job) -> JsonObject:
     """Drive or copy a cell in a worker of this machine."""
     cell, original = job
     with shown_in(root / STAGES):
@@ -196,7 +196,7 @@ def _work(options: RunOptions, root: Path, threads: int, job: Job) -> dict[str, 
         return copy_cell(cell, options, root, threads, original)
 
 
-def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
+def _lost(cell: Cell, root: Path, lost: Lost) -> JsonObject:
     """Write the manifest of a rollout whose workers died, or that was ended since it took too
     long.
     """

@@ -10,6 +10,7 @@ from typing import Any
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.spec import BUILTIN
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
@@ -53,7 +54,7 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
 
 def check_policies(
     plan: RunPlan, known: Mapping[str, Any], how: HowToRun, noticed: Callable[[str], None]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return what `policies.conformance.check_policy` finds in each policy of the user's own: its
     digest, and by ``breaches`` and ``notes`` a name and a sentence each.
 
@@ -73,7 +74,7 @@ def check_policies(
     """
     shipped = {target for target, _ in BUILTIN["policy"].values()}
     scenarios = list(plan.scenarios.values())
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     todo: list[PartSpec] = []
     for policy in plan.policies:
         before = known.get(policy.name)
@@ -104,7 +105,7 @@ def check_policies(
     return found
 
 
-def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> dict[str, Any] | InputError:
+def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> JsonObject | InputError:
     """Check one policy, in a worker."""
     try:
         with parts_print_to_stderr():

@@ -11,9 +11,10 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TypedDict
 
 from alpasim_plugin import __version__
+from alpasim_plugin.core.json_types import JsonObject
 
 PACKAGES = (
     "numpy",
@@ -57,7 +58,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def hardware() -> dict[str, Any]:
+def hardware() -> JsonObject:
     """Return the processor, the cores that this process may use, memory and operating system."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = (
@@ -195,7 +196,7 @@ def _no_filters(folder: Path | None) -> list[str]:
     ]
 
 
-def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def fixers(manifests: Sequence[JsonObject]) -> JsonObject:
     """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and
     ``frames``; ``blocks`` unless the mode is ``frame``.
 
@@ -206,7 +207,7 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     Args:
         manifests: Of finished rollouts of one policy.
     """
-    out: dict[str, Any] = {}
+    out: JsonObject = {}
     for name in dict.fromkeys(m["renderer"] for m in manifests):
         facts = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
         if not facts:

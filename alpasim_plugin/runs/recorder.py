@@ -18,6 +18,7 @@ import numpy as np
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
@@ -122,8 +123,8 @@ class Recorder:
         self._keep_frames = keep_frames
         self._versions = dict(versions or {})
         self._times = StageTimes()
-        self._frames: list[dict[str, Any]] = []
-        self._debug: list[dict[str, Any]] = []
+        self._frames: list[JsonObject] = []
+        self._debug: list[JsonObject] = []
         self._film: list[U8] = []
         self._film_camera = ""
         self._film_period_us = 0
@@ -250,7 +251,7 @@ class Recorder:
         """Read the finished log back."""
         return read_asl(self.folder / LOG_NAME, images=images)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Return counts and stage times for the manifest."""
         events = Counter(event for frame in self._frames for event in frame["events"].split())
         return {

@@ -19,6 +19,7 @@ import numpy as np
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.reading import read_json, real
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
@@ -30,7 +31,7 @@ from evaluators.viewer.cells import Logs, WatchedCell
 from evaluators.viewer.pictures import NO_FRAMES, Source, sources
 
 Rgb = tuple[float, float, float]
-Message = dict[str, Any]
+Message = JsonObject
 Item = tuple[int, str, Message, Message]  # time in microseconds, topic, schema, message
 
 SCHEMAS: dict[str, Message] = read_json(Path(__file__).with_name("foxglove.json"))
@@ -64,7 +65,7 @@ def require_mcap() -> Any:
     return require_library("mcap.writer", "--mcap", "install the extra [mcap], or pip install mcap")
 
 
-def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> dict[str, Any]:
+def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObject:
     """Write a cell of a run as a recording.
 
     Args:

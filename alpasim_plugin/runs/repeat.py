@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import scratch_folder
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
@@ -22,7 +23,7 @@ def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
 
 def repeat_rollout(
     plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
-) -> dict[str, Any]:
+) -> JsonObject:
     """Drive the shortest finished rollout of each policy again and compare the two logs.
 
     Times that depend on the clock are no part of the comparison. Rollouts whose latency is measured
@@ -58,7 +59,7 @@ def repeat_rollout(
     return min(found, key=lambda result: (False, None, True).index(result["repeatable"]))
 
 
-def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> dict[str, Any]:
+def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonObject:
     folder = root / cell.folder
     with scratch_folder(root / "repeat") as scratch:
         again = run_cell(cell, plan.options, scratch, threads)
@@ -97,5 +98,5 @@ def repeat_line(repeat: Mapping[str, Any]) -> str:
     return f"NOT repeatable: {cell} was driven twice and differs first in {difference['component']}{step}"
 
 
-def _not_compared(reason: str) -> dict[str, Any]:
+def _not_compared(reason: str) -> JsonObject:
     return {"repeatable": None, "reason": reason}

@@ -8,6 +8,7 @@ from typing import Any
 
 from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.images import smaller
@@ -115,7 +116,7 @@ def write_flips(run_dir: Path | Run) -> Path:
     return root / FLIPS_NAME
 
 
-def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
+def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
     if not (flip.base.ok and flip.other.ok):
         return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
@@ -131,7 +132,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     found = first_divergence(one.plans, other.plans)
     if found is None:
         return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
-    divergence: dict[str, Any] = {
+    divergence: JsonObject = {
         "t_us": found.t_us,
         "after_us": found.t_us - one.render_start_us,
         "gap_m": round(found.gap_m, 4),

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import Scenario
@@ -59,7 +60,7 @@ class Progress(Protocol):
         """Announce the run."""
         ...
 
-    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+    def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
         """Announce one rollout."""
         ...
 
@@ -75,7 +76,7 @@ class RunResult:
     """Result of a run."""
 
     root: Path
-    summary: dict[str, Any]
+    summary: JsonObject
     n_rollouts: int
     n_failed: int
 
@@ -90,10 +91,10 @@ class RunResult:
         return self.outcome.exit_code
 
 
-def on_done(progress: Progress) -> Callable[[dict[str, Any], bool], None]:
+def on_done(progress: Progress) -> Callable[[JsonObject, bool], None]:
     """Return what notes in a manifest whether its rollout was reused, and then announces it."""
 
-    def done(manifest: dict[str, Any], reused: bool) -> None:
+    def done(manifest: JsonObject, reused: bool) -> None:
         manifest["reused"] = reused
         progress.rollout_done(manifest, reused)
 
@@ -156,7 +157,7 @@ def execute_run(
             checks = check_policies(plan, known, how, progress.noticed)
             manifests = execute(plan, root, how, on_done(progress), progress.noticed)
             wall_s = time.perf_counter() - began
-            more: dict[str, Any] = {
+            more: JsonObject = {
                 "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))},
                 "policy_checks": checks,
             }
@@ -170,8 +171,8 @@ def execute_run(
 
 
 def finish_run(
-    root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True
-) -> dict[str, Any]:
+    root: Path, manifests: Sequence[JsonObject], more: Mapping[str, Any], report: bool = True
+) -> JsonObject:
     """Write the tables and the reports of a run whose rollouts are done; return the summary.
 
     ``summary.json`` is the last of the tables: a run folder without it is unfinished.
@@ -206,9 +207,9 @@ def finish_run(
 def summary_of_run(
     root: Path,
     info: Mapping[str, Any],
-    manifests: Sequence[dict[str, Any]],
+    manifests: Sequence[JsonObject],
     tables: Path | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write the tables of a run, by default into its folder, and return the summary."""
     return write_summary(
         root,
@@ -229,13 +230,13 @@ def claim(
     threads: Threads,
     resume: bool,
     noticed: Callable[[str], None],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write ``run.json`` and the scene files, or check that the folder holds this run.
 
     Returns:
         What ``run.json`` said before; empty for a new folder, or where it was damaged.
     """
-    held: dict[str, Any] = {}
+    held: JsonObject = {}
     if os.path.exists(root / RUN_INFO):
         try:
             held = read_run_json(root)
@@ -301,7 +302,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
     )
 
 
-def origin_of(command: Sequence[str]) -> dict[str, Any]:
+def origin_of(command: Sequence[str]) -> JsonObject:
     """Return what ``run.json`` says of how a run folder came about: command, version, time, the
     user's project.
     """
@@ -313,7 +314,7 @@ def origin_of(command: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> dict[str, Any]:
+def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> JsonObject:
     return {
         "source": scenario.source,
         "ref": vars(ref) | {"path": str(Path(ref.path).absolute())},

@@ -10,6 +10,7 @@ from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import file_sha256, real
@@ -41,10 +42,10 @@ class ScoreResult:
     """Result of scoring: the run folder, its summary and the process exit code."""
 
     root: Path
-    summary: dict[str, Any]
+    summary: JsonObject
     exit_code: int
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the result for JSON."""
         return {"out": str(self.root), "exit_code": self.exit_code, "summary": self.summary}
 
@@ -57,7 +58,7 @@ def execute_score(
     evaluators: Sequence[PartSpec],
     root: Path | None,
     command: Sequence[str],
-    on_done: Callable[[dict[str, Any]], None],
+    on_done: Callable[[JsonObject], None],
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
     aggregation.
@@ -88,7 +89,7 @@ def execute_score(
         _check_key(root, key)
         unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
-        more: dict[str, Any] = {}
+        more: JsonObject = {}
         error: EvaluatorError | None = None
         if settings is not None:
             more["alpasim"], error = _aggregate(scores, preset, settings, root / AGGREGATE)
@@ -117,7 +118,7 @@ def _check_key(root: Path, key: str) -> None:
 
 def _aggregate(
     scores: Sequence[LogScore], preset: Preset, settings: EvalSettings, folder: Path
-) -> tuple[dict[str, Any], EvaluatorError | None]:
+) -> tuple[JsonObject, EvaluatorError | None]:
     """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files.
 
     An error of the scene score leaves the values of the rollouts.
@@ -149,7 +150,7 @@ def _aggregate(
             )
         manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
         manifest["scene_score"] = mark and {"failure_reason": mark.failure_reason}
-    facts: dict[str, Any] = {
+    facts: JsonObject = {
         "folder": AGGREGATE,
         "files": [],
         "skipped": "",
@@ -171,7 +172,7 @@ def _write_aggregate(
     folder: Path,
     reduced: Sequence[Any],
     marks: dict[int, SceneScore] | None,
-    failed: Sequence[dict[str, Any]],
+    failed: Sequence[JsonObject],
     settings: EvalSettings,
 ) -> list[str]:
     """Write AlpaSim's files and return their names; without ``marks`` no summary."""

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.reading import real, some_of
 from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
@@ -41,7 +41,7 @@ SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")
 class LogScore:
     """Result of one log."""
 
-    manifest: dict[str, Any]
+    manifest: JsonObject
     scored: ScoredRollout | None  # None if the log could not be scored
 
 
@@ -90,7 +90,7 @@ def score_logs(
     preset: Preset,
     evaluators: Sequence[PartSpec],
     root: Path,
-    on_done: Callable[[dict[str, Any]], None],
+    on_done: Callable[[JsonObject], None],
 ) -> list[LogScore]:
     """Score every log against its scene and write its steps.
 
@@ -123,7 +123,7 @@ def _score(
     names: set[str],
 ) -> LogScore:
     name = real(log).parent.name
-    manifest: dict[str, Any] = {
+    manifest: JsonObject = {
         "renderer": UNKNOWN,
         "policy": UNKNOWN,
         "scene": UNKNOWN,
@@ -257,12 +257,12 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
     return None, None
 
 
-def _failed(manifest: dict[str, Any], error: SimrunError, root: Path, taken: set[str]) -> LogScore:
+def _failed(manifest: JsonObject, error: SimrunError, root: Path, taken: set[str]) -> LogScore:
     manifest |= {"status": "failed", "error": error.as_dict(), "path": _folder(manifest, taken)}
     return LogScore(manifest, None)
 
 
-def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
+def _folder(manifest: JsonObject, taken: set[str]) -> str:
     """Return the folder of a log's results, relative to the run folder; logs with the same names
     get numbers.
     """

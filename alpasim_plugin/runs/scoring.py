@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.types import (
     F64,
@@ -35,7 +36,7 @@ def score_log(
     scenario: Scenario,
     preset: str,
     evaluators: Sequence[PartSpec] | None = None,
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+) -> tuple[list[JsonObject], JsonObject]:
     """Read a log and score it as `tabulate` does; the scores depend on the written log alone.
 
     Raises:
@@ -51,7 +52,7 @@ def tabulate(
     series: Sequence[MetricSeries],
     preset: str | Preset,
     frames: Sequence[Mapping[str, Any]] = (),
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+) -> tuple[list[JsonObject], JsonObject]:
     """Flatten a scored rollout for the tables.
 
     Args:
@@ -105,7 +106,7 @@ def tabulate(
     }
 
 
-def _row(t_us: int | None, metric: str, value: Any, why_missing: str = "") -> dict[str, Any]:
+def _row(t_us: int | None, metric: str, value: Any, why_missing: str = "") -> JsonObject:
     is_missing = value is None
     return {
         "t_us": t_us or 0,
@@ -123,7 +124,7 @@ def _speeds(t_us: I64, xyz: F64) -> F64:
     return np.asarray(np.linalg.norm(np.gradient(xyz[:, :2], seconds, axis=0), axis=1))
 
 
-def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
+def _placed(rollout: RolloutLog, reduction: Reduction) -> list[JsonObject]:
     """Return the events with the position of the ego's box centre."""
     placed = []
     for event in reduction.events:

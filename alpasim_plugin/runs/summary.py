@@ -14,6 +14,7 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
@@ -40,14 +41,14 @@ SPEEDS = (
 
 def write_summary(
     root: Path,
-    manifests: Sequence[dict[str, Any]],
+    manifests: Sequence[JsonObject],
     preset: str,
     baseline: str | None,
     more: Mapping[str, Any],
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
     tables: Path | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
     Args:
@@ -88,19 +89,19 @@ def write_summary(
     return summary
 
 
-def _of_policies(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    found: dict[str, list[dict[str, Any]]] = {}
+def _of_policies(manifests: Sequence[JsonObject]) -> dict[str, list[JsonObject]]:
+    found: dict[str, list[JsonObject]] = {}
     for manifest in manifests:
         found.setdefault(manifest["policy"], []).append(manifest)
     return found
 
 
-def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _speeds(manifests: Sequence[JsonObject]) -> JsonObject:
     renderers = list(dict.fromkeys(m["renderer"] for m in manifests))
     return {name: speed([m for m in manifests if m["renderer"] == name]) for name in renderers}
 
 
-def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def speed(manifests: Sequence[JsonObject]) -> JsonObject:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
     A frame's time is the sum of all stages of the loop between two frames; the time of a block is
@@ -160,7 +161,7 @@ def resample_durations(durations: Sequence[float], frames: int) -> F64:
 
 
 def pool_of(
-    manifests: Sequence[dict[str, Any]],
+    manifests: Sequence[JsonObject],
     threads: Threads,
     wall_s: float,
     before: Mapping[str, Any] | None,
@@ -181,7 +182,7 @@ def pool_of(
     }
 
 
-def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[str, Any]:
+def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObject:
     """Return the numbers of all rollouts of some runs, such as the parts of a night, in the form of
     ``summary.json``.
 
@@ -240,7 +241,7 @@ def _joined(infos: Mapping[Path, Mapping[str, Any]], metrics: Sequence[str]) -> 
     return known
 
 
-def _info_of(run: Path) -> dict[str, Any]:
+def _info_of(run: Path) -> JsonObject:
     """Return a run's description.
 
     Raises:

@@ -17,6 +17,7 @@ from typing import Any
 
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
@@ -112,7 +113,7 @@ class BoundarySearch:
     plan: RunPlan
     sweep: Sweep
     make: MakePlan
-    driven: dict[str, dict[str, Any]] = field(default_factory=dict)
+    driven: dict[str, JsonObject] = field(default_factory=dict)
     cells: list[Cell] = field(default_factory=list)
     scenes: dict[int, RunPlan] = field(default_factory=dict)
     unreachable: dict[int, InputError] = field(default_factory=dict)
@@ -206,7 +207,7 @@ class BoundarySearch:
             variant = Variant(cell.renderer.name, cell.policy.name)
             self.failed[variant, cell.seed][points[cell.scene]] = failed
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Return what ``summary.json`` holds of the search, as its member ``boundary``."""
         values = {point: self.sweep.value(point) for point in range(STEPS + 1)}
         found = {one: self._of_variant(one, values) for one in self.variants}
@@ -218,7 +219,7 @@ class BoundarySearch:
                 estimate = difference_of(brackets, others)
                 differences[variant.name] = {"baseline": other.name} | vars(estimate)
         least, most = (values[point] for point in self.ends)
-        record: dict[str, Any] = {
+        record: JsonObject = {
             "parameter": self.sweep.key,
             "unit": self.sweep.unit,
             "range": [self.sweep.low, self.sweep.high],
@@ -236,7 +237,7 @@ class BoundarySearch:
 
     def _of_variant(
         self, variant: Variant, values: Mapping[int, float]
-    ) -> tuple[dict[str, Any], list[Bracket]]:
+    ) -> tuple[JsonObject, list[Bracket]]:
         """Return the facts of a variant, and the brackets of its seeds if all have one."""
         seeds = {seed: self.failed[variant, seed] for seed in self.plan.seeds}
         ended = {seed: bracket_of(failed, values) for seed, failed in seeds.items()}
@@ -244,7 +245,7 @@ class BoundarySearch:
             seed: [[values[point], failed[point]] for point in sorted(failed)]
             for seed, failed in seeds.items()
         }
-        facts: dict[str, Any] = {"outcomes": {str(seed): one for seed, one in outcomes.items()}}
+        facts: JsonObject = {"outcomes": {str(seed): one for seed, one in outcomes.items()}}
         brackets = [one for one in ended.values() if isinstance(one, Bracket)]
         reasons = [one for one in ended.values() if isinstance(one, str)]
         sides = {one.fails_below for one in brackets}

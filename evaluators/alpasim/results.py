@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, MetricInfo, MetricSeries
 from evaluators.alpasim.settings import SceneScoreSettings
 from evaluators.metrics.presets import Preset
@@ -312,7 +313,7 @@ def results_summary(
     failed: Sequence[Mapping[str, Any]],
     sweeps: Mapping[str, float | int | None],
     settings: SceneScoreSettings,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return ``results-summary.json``: one entry per counted rollout, failed ones after them, then
     the row over sweeps.
 
@@ -354,8 +355,8 @@ def results_summary(
         settings.progress_saturation_threshold,
         settings.min_gt_distance_for_full_score_m,
     )
-    overall: dict[str, Any] = {key: _number(value) for key, value in sweeps.items()}
-    out: dict[str, Any] = {
+    overall: JsonObject = {key: _number(value) for key, value in sweeps.items()}
+    out: JsonObject = {
         "schema_version": SCHEMA_VERSION,
         "scene_score_enabled": settings.enabled,
         "rollouts": entries,
@@ -375,7 +376,7 @@ def results_summary(
 
 def _entry(
     rollout: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]
-) -> dict[str, Any]:
+) -> JsonObject:
     ids = {
         "run_uuid": run_uuid,
         "run_name": rollout.of.run_name,

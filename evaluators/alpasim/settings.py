@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.core.config import load_yaml, validate
+from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics.presets import ALPASIM, Preset
 
 
@@ -94,8 +95,8 @@ class EvalSettings(_Part):
         False  # accepted; a driver's pickled bytes are never opened here
     )
     run_in_runtime: bool = True
-    vec_map: dict[str, Any] = {}
-    video: dict[str, Any] = {}
+    vec_map: JsonObject = {}
+    video: JsonObject = {}
 
     def preset(self, version: Preset = ALPASIM) -> Preset:
         """Return the preset of a version of AlpaSim with these settings."""

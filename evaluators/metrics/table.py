@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.image_metrics import BLACK_MAX
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
 from evaluators.scores.table import BENCHMARKS
@@ -144,7 +145,7 @@ class MetricTable(Mapping[str, MetricInfo]):
                 )
         return MetricTable({**self._metrics, **metrics})
 
-    def as_dict(self) -> dict[str, dict[str, Any]]:
+    def as_dict(self) -> dict[str, JsonObject]:
         """Return METRIC -> the facts that are not their defaults, for ``run.json``."""
         plain = asdict(UNKNOWN)
         always = ("unit", "direction", "aggregation", "help")
@@ -164,7 +165,7 @@ class MetricTable(Mapping[str, MetricInfo]):
         """
         stored = {}
         for name, facts in (info.get("metrics") or {}).items():
-            known: dict[str, Any] = {
+            known: JsonObject = {
                 key: value for key, value in facts.items() if key in _FIELDS
             }  # this version may not know all
             if "limits" in known:

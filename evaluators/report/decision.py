@@ -4,10 +4,9 @@ the report.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.numbers import decimals, fixed, labelled, scale_and_unit
 from evaluators.opening import Run
@@ -44,7 +43,7 @@ def guarantee(decision: Decision) -> list[str]:
     ]
 
 
-def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[dict[str, Any]]:
+def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[JsonObject]:
     """Return the printed numbers of each metric at the last interim analysis."""
     if not decision["looks"]:
         return []
@@ -92,7 +91,7 @@ def decision_lines(decision: Decision) -> list[str]:
     ]
 
 
-def decision_section(run: Run) -> dict[str, Any] | None:
+def decision_section(run: Run) -> JsonObject | None:
     """Return the section of a run that a decision ended, None of any other.
 
     Raises:

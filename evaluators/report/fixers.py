@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from alpasim_plugin.core.json_types import JsonObject
 from evaluators.numbers import Cell, duration, finite, fixed, missing, plural, short
 from evaluators.opening import Run
 
@@ -29,7 +30,7 @@ COLUMNS = (  # head, what it means
 TIMES = ("ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms")
 
 
-def fixer_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def fixer_rows(summary: Mapping[str, Any]) -> list[JsonObject]:
     """Lay out the fixers of a run: ``renderer``, ``trained``, and ``cells`` in the order of
     `COLUMNS`.
     """
@@ -97,7 +98,7 @@ class Speed:
         pool: Workers, frames per second and wall time of the run.
     """
 
-    rows: tuple[dict[str, Any], ...]
+    rows: tuple[JsonObject, ...]
     stages: tuple[str, ...]
     pool: str
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
@@ -37,11 +38,11 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
     return path
 
 
-def worst_of(checks: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def worst_of(checks: Sequence[Mapping[str, Any]]) -> list[JsonObject]:
     """Return the pairs that did worst in every check that did not pass, once each, those of a shown
     regression first; ``checks`` are those of `GateVerdict.as_dict`.
     """
-    pairs: dict[tuple[Any, ...], dict[str, Any]] = {}
+    pairs: dict[tuple[Any, ...], JsonObject] = {}
     for check in sorted(checks, key=lambda check: check["cause"] != "regression"):
         if check["cause"] != "pass":
             of = {name: check[name] for name in ("metric", "renderer", "policy")}
@@ -57,7 +58,7 @@ def _content(run: Run) -> str:
     )
 
 
-def gate_section(run: Run) -> dict[str, Any] | None:
+def gate_section(run: Run) -> JsonObject | None:
     """Return what the report shows of the last gate that judged these rollouts; None without one.
 
     Raises:

@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from alpasim_plugin.core.json_types import JsonObject
 from evaluators.numbers import Cell, finite, fixed, interval, missing
 from evaluators.opening import Run
 
@@ -32,7 +33,7 @@ LEDGER_COLUMNS = (  # key, head, what it means
 )
 
 
-def provenance(run: Run) -> dict[str, Any]:
+def provenance(run: Run) -> JsonObject:
     """Return what is needed to make the run again, and what it did not model, from ``run.json``."""
     info = run.info
     project = info.get("project") or {}
@@ -72,7 +73,7 @@ def _pairs(value: Any) -> list[tuple[str, str]]:
     return [(key, one if isinstance(one, str) else json.dumps(one)) for key, one in texts.items()]
 
 
-def failure_rows(run: Run) -> tuple[list[dict[str, Any]], int]:
+def failure_rows(run: Run) -> tuple[list[JsonObject], int]:
     """List failed rollouts with message and hint.
 
     Returns:
@@ -93,7 +94,7 @@ def failure_rows(run: Run) -> tuple[list[dict[str, Any]], int]:
     return rows, len(failed) - len(rows)
 
 
-def ledger(run: Run, rates: tuple[str, ...]) -> list[dict[str, Any]]:
+def ledger(run: Run, rates: tuple[str, ...]) -> list[JsonObject]:
     """Lay out the censoring ledger; empty where the summary has none.
 
     Args:
@@ -129,7 +130,7 @@ def _count(value: Any) -> Cell:
     return missing("not counted") if number is None else Cell(fixed(number, 0), sort=number)
 
 
-def invalid_rows(run: Run) -> list[dict[str, Any]]:
+def invalid_rows(run: Run) -> list[JsonObject]:
     """List every metric that is invalid in some rollouts of a renderer, and why."""
     rows = []
     for renderer, entry in (run.summary.get("censoring") or {}).items():

@@ -15,6 +15,7 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
@@ -53,11 +54,11 @@ def table_of_run(run: Run) -> RolloutTable:
     )
 
 
-def rows_of_run(run: Run) -> list[dict[str, Any]]:
+def rows_of_run(run: Run) -> list[JsonObject]:
     """Return one flat row per planned rollout: key, status, and METRIC with METRIC_valid."""
     rows = []
     for rollout in run.rollouts:
-        row: dict[str, Any] = {
+        row: JsonObject = {
             "renderer": rollout.renderer,
             "policy": rollout.policy,
             "scene": rollout.scene,
@@ -77,10 +78,10 @@ class StoredBaseline(TypedDict):
 
     preset: str
     scenes: dict[str, str]
-    weights: dict[str, Any]
-    rows: list[dict[str, Any]]
-    made_with: dict[str, Any]
-    metrics: dict[str, Any]
+    weights: JsonObject
+    rows: list[JsonObject]
+    made_with: JsonObject
+    metrics: JsonObject
     repeatable: bool | None
     schema_version: int
 

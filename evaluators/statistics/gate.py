@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core.config import Document, guess, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
@@ -226,7 +227,7 @@ class GateVerdict:
         """Give the process exit code."""
         return self.outcome.exit_code
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the verdict for JSON."""
         checks = [asdict(check) for check in self.checks]
         return {
@@ -311,7 +312,7 @@ def _sides(table: RolloutTable) -> Sides:
     }
 
 
-def failures_of(table: RolloutTable) -> dict[str, Any]:
+def failures_of(table: RolloutTable) -> JsonObject:
     """Count rollouts that did not run to their end, as summary.json does."""
     by_class = table.failures()
     n_failed = sum(by_class.values())
@@ -523,7 +524,7 @@ def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -
     found = "no valid value" if mean is None else short(mean, metric.unit)
     text = f"{variant.renderer}: {metric.name} {found}, limit {limits}"
     worst = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
-    entry: dict[str, Any] = {"mean": mean, **bounds, "n_rollouts": len(known)}
+    entry: JsonObject = {"mean": mean, **bounds, "n_rollouts": len(known)}
     entry["worst"] = [
         {"scene": side.cells[i][1], "seed": side.cells[i][2], "was": None, "now": values[i]}
         for i in worst[:LISTED]

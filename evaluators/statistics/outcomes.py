@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import (
     CONTACT_SIDES,
@@ -65,9 +66,7 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
     return rows, times
 
 
-def outcome_table(
-    rollouts: Sequence[Rollout], times: Times | None = None
-) -> dict[str, dict[str, Any]]:
+def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, JsonObject]:
     """Count outcomes by arm.
 
     Args:
@@ -87,11 +86,11 @@ def outcome_table(
     return {name: _of_arm(own, times or {}) for name, own in arms.items()}
 
 
-def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
+def _of_arm(rollouts: Sequence[Rollout], times: Times) -> JsonObject:
     ended = [r for r in rollouts if has_ended(r)]
     known = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
     endings = Counter(map(ending_of, rollouts))
-    cells: dict[str, list[dict[str, Any]]] = {}
+    cells: dict[str, list[JsonObject]] = {}
     for rollout in ended:
         began = times.get(rollout.cell, {})
         for outcome in told(outcomes_of(rollout)):

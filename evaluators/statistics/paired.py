@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.sides import (
     Cell,
@@ -55,7 +56,7 @@ from evaluators.statistics.verdicts import (
     verdict,
 )
 
-Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
+Table = dict[str, dict[str, JsonObject]]  # RENDERER -> METRIC -> numbers
 
 LISTED = 50  # missing cells named per metric; the count is always whole
 NO_PAIR = "no scene-seed cell has this metric on both sides"
@@ -198,7 +199,7 @@ def compare(
     baseline: str,
     margin: float | None = None,
     listed: int = LISTED,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Compare one metric of two renderers on their shared cells.
 
     Args:
@@ -224,7 +225,7 @@ def compare(
     """
     margin = metric.accepted if margin is None else margin
     pairs = Pairs(side, base, metric.name)
-    entry: dict[str, Any] = {
+    entry: JsonObject = {
         "baseline": baseline,
         "diff": None,
         "ci95": None,
@@ -317,7 +318,7 @@ def compare(
     return entry
 
 
-def _beyond(pairs: Pairs, left: Pairs, metric: MetricInfo, reach: float) -> dict[str, Any]:
+def _beyond(pairs: Pairs, left: Pairs, metric: MetricInfo, reach: float) -> JsonObject:
     """Return the companion of a distance: how much more often something happens that it does not
     count, by the metric's event where a preset has it, else by differences beyond ``reach``.
 
@@ -439,7 +440,7 @@ class Pairs:
         self.only_base = np.flatnonzero(base.place_in(side) < 0)
         self.n_missing = int(np.sum(~self.both)) + len(self.only_base)
 
-    def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
+    def missing(self, metric: str, listed: int) -> list[JsonObject]:
         """Name the first cells without a pair, with side and cause."""
         (side, _), (base, _) = self._sides.values()
         # Both sides are sorted already.
@@ -447,7 +448,7 @@ class Pairs:
         cells += [base.cells[i] for i in self.only_base[:listed].tolist()]
         return [self.cause(cell, metric) for cell in sorted(cells)[:listed]]
 
-    def cause(self, cell: Cell, metric: str) -> dict[str, Any]:
+    def cause(self, cell: Cell, metric: str) -> JsonObject:
         """Name a cell without a pair, with side and cause."""
         policy, scene, seed = cell
         causes = {

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, I64, Aggregation, Direction, MetricInfo, MetricSeries
 from evaluators.metrics import METRICS
 from evaluators.metrics.presets import DEFAULT, Preset
@@ -51,7 +51,7 @@ class RolloutValue:
     unit: str
     direction: Direction
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the fields for a manifest; an infinite value, for which JSON has no number, is the
         text "inf" or "-inf".
         """
@@ -72,7 +72,7 @@ class Ledger:
     steps_scored: int
     dropped: str  # why the whole rollout does not count, or ""
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the counts by name, for a manifest."""
         return dict(self.__dict__)
 
@@ -84,17 +84,17 @@ class Reduction:
     values: dict[str, RolloutValue]
     ledger: Ledger
     events: tuple[
-        dict[str, Any], ...
+        JsonObject, ...
     ]  # {"metric", "t_us"}: first time of each kind of event among the scored steps
 
-    def as_row(self) -> dict[str, Any]:
+    def as_row(self) -> JsonObject:
         """Return flat columns: METRIC and METRIC_valid, as in rollouts.parquet."""
-        row: dict[str, Any] = {}
+        row: JsonObject = {}
         for name, value in self.values.items():
             row[name], row[f"{name}_valid"] = value.value, value.valid
         return row
 
-    def as_dict(self) -> dict[str, dict[str, Any]]:
+    def as_dict(self) -> dict[str, JsonObject]:
         """Return METRIC -> value, valid, reason, unit, direction, for a manifest."""
         return {name: value.as_dict() for name, value in self.values.items()}
 

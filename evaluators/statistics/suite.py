@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.statistics.intervals import TAIL, cluster_means, exact_rate
@@ -107,13 +108,13 @@ class Change:
         """Count the events that the baseline had alone."""
         return int(np.sum(self.harms[0] < 0.0))
 
-    def worst(self) -> list[dict[str, Any]]:
+    def worst(self) -> list[JsonObject]:
         """Name the cells that are worse, the worst first."""
         harm = np.max(self.harms, axis=0)
         order = np.argsort(-harm, kind="stable")[: int(np.sum(harm > 0.0))]
         return [self._named(i) for i in order[:LISTED].tolist()]
 
-    def _named(self, i: int) -> dict[str, Any]:
+    def _named(self, i: int) -> JsonObject:
         _, scene, seed = self.side.cells[i]
         return {"scene": scene, "seed": seed, "was": self.was[i], "now": self.now[i]}
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
@@ -70,12 +71,12 @@ def aggregate_sides(
     return {renderer: {name: entries[name][renderer] for name in metrics} for renderer in sides}
 
 
-def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
+def _entry(side: Side, metric: MetricInfo) -> JsonObject:
     by_cell = side.values(metric.name)
     known = np.isfinite(by_cell)
     values, scenes = by_cell[known], side.scene[known]
     n, n_ran = len(values), int(side.ok.sum())
-    entry: dict[str, Any] = {
+    entry: JsonObject = {
         "mean": None,
         "ci95": None,
         "ci95_clustered": None,
@@ -127,7 +128,7 @@ CUT_RULES = (
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
-def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, dict[str, Any]]:
+def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, JsonObject]:
     """Count what did not enter the table, per renderer and cause.
 
     Args:
@@ -152,13 +153,13 @@ def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, di
     return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
 
 
-def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> dict[str, Any]:
+def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> JsonObject:
     done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()
     for row in done:
         events.update(row.get("frame_events") or {})
-    out: dict[str, Any] = {
+    out: JsonObject = {
         "rollouts": len(side.rows),
         "failed": dict(
             Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)
@@ -244,7 +245,7 @@ def numbers(
     baseline: str | None = None,
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of
     ``summary.json`` (docs/statistics.md).
 
@@ -271,9 +272,7 @@ def numbers(
     }
 
 
-def by_policy(
-    parts: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]
-) -> dict[str, Any]:
+def by_policy(parts: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> JsonObject:
     """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY:
     policies are never averaged.
 
@@ -281,7 +280,7 @@ def by_policy(
         parts: POLICY -> what the table is made of.
         table: Gives RENDERER -> entry.
     """
-    out: dict[str, Any] = {}
+    out: JsonObject = {}
     for policy, some in parts.items():
         part = table(some)
         out |= (

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import inside, read_bytes, real
 from alpasim_plugin.core.types import F64, U8, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
@@ -360,7 +361,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
     return path
 
 
-def _document(run: Run, cause: Cause) -> dict[str, Any]:
+def _document(run: Run, cause: Cause) -> JsonObject:
     """Return what the script of the page draws; without a log, no query."""
     rollout, log = cause.rollout, cause.log
     if log is None:
@@ -384,7 +385,7 @@ def _document(run: Run, cause: Cause) -> dict[str, Any]:
     }
 
 
-def _query(query: Query, place: Place, scale: float) -> dict[str, Any]:
+def _query(query: Query, place: Place, scale: float) -> JsonObject:
     """Return a query for the page: times in milliseconds, lines in world centimetres, boxes in
     pixels of the page's image.
     """
@@ -463,7 +464,7 @@ def commands(
     return [("f", f"drive on from there behind {other}", fork), ("v", "watch the rollout", view)]
 
 
-def _parting(one: Parting, start_us: int) -> dict[str, Any]:
+def _parting(one: Parting, start_us: int) -> JsonObject:
     """Return a parting for the template, with the other's image and the own one."""
     images = [jpeg(smaller(image, WIDTH_PX)) for image in one.images]
     at_s = (one.t_us - start_us) * 1e-6

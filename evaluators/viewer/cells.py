@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
@@ -276,7 +277,7 @@ def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
     return read_asl(path)
 
 
-def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) -> dict[str, Any]:
+def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) -> JsonObject:
     """Return everything that a page shows of a cell.
 
     Args:
@@ -292,7 +293,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
     firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
     place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
     tracks = Tracks()
-    drives: list[dict[str, Any]] = []
+    drives: list[JsonObject] = []
     for rollout in cell.rollouts:
         name = {"renderer": cell.side(rollout)}
         log = logs.get(rollout.path)
@@ -324,7 +325,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
 
 def _camera_data(
     run: Run, rollout: Rollout, log: RolloutLog, facts: Rows, fine: Fineness, place: Place
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return a rollout's camera frames for a page, with lenses and trust maps where known, or why
     there are none.
     """
@@ -340,7 +341,7 @@ def _camera_data(
     return {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
 
 
-def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
+def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
     """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy,
     and the mounting, 3 rows of 4.
     """
@@ -362,7 +363,7 @@ def index_data(
     here: Sequence[WatchedCell],
     notes: Sequence[str],
     report: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return what a page must know before it shows a cell.
 
     Args:

@@ -16,6 +16,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
@@ -109,7 +110,7 @@ def scene_of(run: Run, scene: str) -> tuple[Mapping[str, Any], F64]:
     return content, log
 
 
-def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
+def map_data(content: Mapping[str, Any], log: F64, place: Place) -> JsonObject:
     """Return the map in whole centimetres.
 
     Args:
@@ -142,10 +143,10 @@ class Tracks:
     """The ways of all road users of a cell; one that several rollouts share is kept once."""
 
     def __init__(self) -> None:
-        self.all: list[dict[str, Any]] = []
+        self.all: list[JsonObject] = []
         self._known: dict[str, int] = {}
 
-    def add(self, track: dict[str, Any]) -> int:
+    def add(self, track: JsonObject) -> int:
         """Return a track's place in the list."""
         key = repr(track)
         if key not in self._known:
@@ -156,7 +157,7 @@ class Tracks:
 
 def drive_data(
     run: Run, rollout: Rollout, log: RolloutLog, place: Place, tracks: Tracks, frames: Rows
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return what a page draws of a rollout, without its camera frames.
 
     Args:
@@ -179,7 +180,7 @@ def drive_data(
     }
 
 
-def user_data(actor: Actor, place: Place) -> dict[str, Any]:
+def user_data(actor: Actor, place: Place) -> JsonObject:
     """Return a road user: its label, its size in centimetres, its way."""
     way, box = place.track(actor.track), actor.box
     poses = set(zip(way["x"], way["y"], way["a"], strict=True))
@@ -189,7 +190,7 @@ def user_data(actor: Actor, place: Place) -> dict[str, Any]:
     return {"id": actor.actor_id, "label": actor.label or "other", "size": size, **way}
 
 
-def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
+def _plan(plan: LoggedPlan, place: Place) -> JsonObject:
     """Return a plan and its samples, every half second: points from now on."""
     lines = [
         place.cm(half_seconds(line.t_us, line.xyz) if len(line) else np.empty((0, 2)))
@@ -204,7 +205,7 @@ def half_seconds(times_us: I64, xy: F64) -> F64:
     return np.stack([np.interp(steps_us, times_us, xy[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
+def curves(steps: pa.Table, place: Place) -> JsonObject:
     """Return every metric over time: t (ms), v (null where invalid), and why it is invalid where it
     is.
 
@@ -217,7 +218,7 @@ def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
         if row["metric"] not in POSE_SERIES:
             value = row["value"] if row["valid"] else None
             rows.setdefault(row["metric"], []).append((row["t_us"], value, row["reason"]))
-    metrics: dict[str, Any] = {}
+    metrics: JsonObject = {}
     for metric, of_metric in rows.items():
         times_us, values, reasons = zip(*of_metric, strict=True)
         metrics[metric] = {"t": place.ms(times_us), "v": rounded(np.array(values, dtype=float))}
@@ -229,12 +230,12 @@ def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
 
 def moments(
     rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """List what happened when: counted collisions and departures from the road, and frames that a
     guard replaced or named.
     """
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
-    found: list[dict[str, Any]] = []
+    found: list[JsonObject] = []
     for event in events_of(rollout, series_by_cell(known)):
         text, t_ms = event.what, None
         if event.t_us is not None and event.t_s is not None:
@@ -253,11 +254,11 @@ def _with_whom(t_s: float, manifest: Mapping[str, Any]) -> str:
     return ""
 
 
-def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
+def _frame_events(frames: Rows, place: Place) -> list[JsonObject]:
     """Return when an event of the frames began, such as a fixer's frame that was replaced; one that
     goes on is told once.
     """
-    found: list[dict[str, Any]] = []
+    found: list[JsonObject] = []
     before: set[str] = set()
     for row in frames:
         now = set(str(row.get("events") or "").split())
@@ -271,7 +272,7 @@ def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
 
 def plans_part(
     flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in
     `WatchedCell`.
     """

@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.reader import reporting
 from evaluators.numbers import plural
@@ -174,7 +175,7 @@ def make_page(
     room = max_bytes - shell - NOTES_BYTES
     factors = range(1, max(1, MOST_STRIDE // fine.stride) + 1)
     used = dict.fromkeys(factors, 0)  # bytes of the documents, by how much they are thinned
-    documents: list[dict[str, Any]] = []
+    documents: list[JsonObject] = []
     for cell in shown:
         document = cell_data(run, cell, read_logs(run, cell), fine)
         sizes = {factor: len(as_json(thinned(document, factor))) for factor in factors}
@@ -193,7 +194,7 @@ def make_page(
     return Page(render(index, texts), kept, tuple(notes))
 
 
-def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
+def thinned(document: Mapping[str, Any], factor: int) -> JsonObject:
     """Return a cell's document with every factor-th camera frame alone."""
     drives = []
     for drive in document["drives"]:

@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import (
     ARCHIVE_BYTES,
     DEPTH,
@@ -202,13 +203,13 @@ def read_json(path: Path | str, do_this: str = FETCH_AGAIN) -> Any:
     return parse_json(read_bytes(path, JSON_BYTES, do_this), path, do_this)
 
 
-def read_json_object(path: Path | str, do_this: str = FETCH_AGAIN) -> dict[str, Any]:
+def read_json_object(path: Path | str, do_this: str = FETCH_AGAIN) -> JsonObject:
     """Return a JSON file's object; see `read_json`.
 
     Raises:
         InputError: As there, or the document is no object.
     """
-    return as_shape(dict[str, Any], read_json(path, do_this), path, do_this)
+    return as_shape(JsonObject, read_json(path, do_this), path, do_this)
 
 
 def read_json_as(shape: type[T], path: Path | str, do_this: str = FETCH_AGAIN) -> T:
@@ -216,7 +217,7 @@ def read_json_as(shape: type[T], path: Path | str, do_this: str = FETCH_AGAIN) -
     return as_shape(shape, read_json(path, do_this), path, do_this)
 
 
-def read_json_lines(path: Path | str, do_this: str = FETCH_AGAIN) -> list[dict[str, Any]]:
+def read_json_lines(path: Path | str, do_this: str = FETCH_AGAIN) -> list[JsonObject]:
     """Return the objects of a file with one JSON object a line; empty lines are skipped.
 
     Raises:
@@ -226,7 +227,7 @@ def read_json_lines(path: Path | str, do_this: str = FETCH_AGAIN) -> list[dict[s
     for n, line in enumerate(read_bytes(path, JSON_BYTES, do_this).splitlines(), 1):
         if line.strip():
             where = f"{path}:{n}"
-            rows.append(as_shape(dict[str, Any], parse_json(line, where, do_this), where, do_this))
+            rows.append(as_shape(JsonObject, parse_json(line, where, do_this), where, do_this))
     return rows
 
 

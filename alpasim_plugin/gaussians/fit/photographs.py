@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes, read_json_object
 from alpasim_plugin.core.reading.files import as_shape
@@ -115,7 +116,7 @@ class Picture:
         )
 
 
-def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any], list[Picture]]:
+def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, list[Picture]]:
     """Read what a ``transforms.json`` says, without opening its pictures.
 
     Args:
@@ -211,12 +212,12 @@ def resized(view: PosedView, width: int) -> PosedView:
     )
 
 
-def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _frames(path: Path) -> tuple[JsonObject, list[JsonObject]]:
     """Return the document, and its frames with what it says for all of them."""
     document = read_json_object(
         path, do_this=f"give a folder with images and their {FILE} (docs/renderers.md)"
     )
-    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'")
+    frames = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
     return document, [{**document, **frame} for frame in frames]
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal, cast
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_json_as, real
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
@@ -69,7 +70,7 @@ class RolloutState:
         damage: Damaged files.
     """
 
-    manifest: dict[str, Any] | None
+    manifest: JsonObject | None
     damage: tuple[Damage, ...] = ()
 
     @property
@@ -92,14 +93,14 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     write_json(folder / MANIFEST, sealed({**manifest, "files": files}))
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> JsonObject:
     """Read the manifest of a rollout.
 
     Raises:
         InputError: It is missing, damaged, or names a file that no rollout has.
     """
     path = folder / MANIFEST
-    manifest = cast("dict[str, Any]", read_json_as(ManifestFile, path, do_this=AGAIN))
+    manifest = cast("JsonObject", read_json_as(ManifestFile, path, do_this=AGAIN))
     check_seal(manifest, path, AGAIN)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
@@ -147,14 +148,14 @@ def write_run_json(root: Path, info: Mapping[str, Any]) -> None:
     write_json(root / RUN_INFO, info)
 
 
-def read_run_json(root: Path) -> dict[str, Any]:
+def read_run_json(root: Path) -> JsonObject:
     """Read ``run.json``.
 
     Raises:
         InputError: It is missing or damaged, or a member is missing or has another type.
     """
     path = root / RUN_INFO
-    info = cast("dict[str, Any]", read_json_as(RunInfo, path, do_this=AGAIN))
+    info = cast("JsonObject", read_json_as(RunInfo, path, do_this=AGAIN))
     missing = [name for name in REQUIRED_OF_RUN if name not in info]
     if missing:
         raise InputError(f"{path} lacks the member {missing[0]!r}.", AGAIN)

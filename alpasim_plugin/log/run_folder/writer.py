@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
@@ -107,7 +108,7 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
     return removed
 
 
-def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def rollout_rows(manifests: Sequence[JsonObject]) -> list[JsonObject]:
     """Return one flat row per rollout: its key, its status, and every metric with its validity.
 
     An infinite value, for which JSON has no number, is the text "inf" or "-inf" in a manifest, and
@@ -116,7 +117,7 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for manifest in manifests:
         error = manifest.get("error") or {}
-        row: dict[str, Any] = {
+        row: JsonObject = {
             **{key: manifest[key] for key in (*KEYS, "status", "path", "wall_s")},
             **{key: manifest.get(key) for key in ("rollout", "copied_from", "frames", "steps")},
             "failure_class": error.get("failure_class"),
@@ -129,7 +130,7 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
+def rollout_table(manifests: Sequence[JsonObject]) -> pa.Table:
     """Return the content of ``rollouts.parquet``, a row per manifest."""
     metrics = dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {}))
     schema = ROLLOUTS_TABLE.arrow(metrics, any("rollout" in manifest for manifest in manifests))
@@ -142,7 +143,7 @@ def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
 
 
 def write_tables(
-    root: Path, manifests: Sequence[dict[str, Any]], tables: Path | None = None
+    root: Path, manifests: Sequence[JsonObject], tables: Path | None = None
 ) -> pa.Table:
     """Write ``rollouts.parquet`` and ``steps.parquet`` of a run folder and return the first.
 
@@ -231,7 +232,7 @@ def write_scene(root: Path, scenario: Scenario | LoggedScene) -> None:
     write_json(root / SCENES / f"{slug(scenario.scene.scene_id)}.json", scene_as_json(scenario))
 
 
-def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
+def scene_as_json(scenario: Scenario | LoggedScene) -> JsonObject:
     """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a
     centimetre.
     """
@@ -271,7 +272,7 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
     }
 
 
-def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
+def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> JsonObject:
     """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US`
     while the scene runs.
     """

@@ -24,6 +24,7 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
@@ -48,7 +49,7 @@ MISSING = "not there"
 class DrivenRollout:
     """A rollout that a node has driven: its manifest, and its files by name."""
 
-    manifest: dict[str, Any]
+    manifest: JsonObject
     files: Mapping[str, bytes]
 
 
@@ -101,7 +102,7 @@ def run_on_ray(
     executor: Executor,
     workers: int,
     limit_s: float | None,
-) -> Iterator[tuple[Cell, dict[str, Any] | Lost]]:
+) -> Iterator[tuple[Cell, JsonObject | Lost]]:
     """Yield every rollout with its manifest, as they finish; only this process writes ``root``.
 
     Args:
@@ -158,7 +159,7 @@ def run_on_ray(
                 ray.cancel(task, force=True)
 
 
-def _result(ray: Any, task: Any, root: Path) -> dict[str, Any] | Lost:
+def _result(ray: Any, task: Any, root: Path) -> JsonObject | Lost:
     """Write a finished rollout into the run folder and return its manifest.
 
     Raises:
@@ -263,7 +264,7 @@ def read_rollout(folder: Path, node: str) -> DrivenRollout:
     return DrivenRollout({"node": node, **manifest}, files)
 
 
-def write_rollout(rollout: DrivenRollout, root: Path) -> dict[str, Any]:
+def write_rollout(rollout: DrivenRollout, root: Path) -> JsonObject:
     """Write a rollout below a run folder, its manifest last, and return the manifest.
 
     Raises:
