@@ -34,7 +34,7 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
-from alpasim_plugin.fixers.bundle import parts_of, read_bundle, weights_to_give
+from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.settings import FixerSettings
 
@@ -284,13 +284,3 @@ class Parts:
             f"{self.settings.name}, weights.{part}: {found}",
             weights_to_give(part, self.settings.trained_by),
         )
-
-
-def load_tiny_vae(path: str | Path) -> TinyVAE:
-    """Return the tiny autoencoder in a file: a bundle's, or one that `TinyVAE.save` wrote.
-
-    Raises:
-        InputError: Neither, or a bundle with another kind of autoencoder.
-    """
-    tensors = load_weights(path)
-    return TinyVAE.from_state_dict(parts_of(tensors).get("vae", tensors), source=str(path))

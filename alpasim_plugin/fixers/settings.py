@@ -28,22 +28,12 @@ class Part(BaseModel):
 
 @dataclass(frozen=True)
 class Unit:
-    """What a fixer makes at a time, in the middle of a rollout.
-
-    Example:
-        >>> Unit(frames=8, network_calls=2, latents=2, lookahead_frames=7).calls_per_frame
-        0.25
-    """
+    """What a fixer makes at a time, in the middle of a rollout."""
 
     frames: int  # new ones that leave at a time
     network_calls: int  # forwards of the network, that of a cache write included
     latents: int  # of one forward
     lookahead_frames: int  # later frames that must be known before the first frame can leave
-
-    @property
-    def calls_per_frame(self) -> float:
-        """Network calls for a frame."""
-        return self.network_calls / self.frames
 
 
 class FixerSettings(Part):

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.runs.executors import local
-from alpasim_plugin.runs.executors.local import Lost, map_jobs, run_jobs
+from alpasim_plugin.runs.executors.local import Lost, run_jobs
 
 
 def work(item):

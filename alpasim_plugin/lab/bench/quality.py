@@ -26,6 +26,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.lab.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import CONTENT, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
@@ -37,7 +38,6 @@ from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.runs.executors.local import map_jobs
 from alpasim_plugin.runs.provenance import hardware, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
@@ -342,7 +342,7 @@ def measure_quality(
 def unit_of(spec: PartSpec | None) -> dict[str, Any] | None:
     """Return what a fixer makes at a time and what that costs; None where it does not say."""
     unit = getattr(spec and spec.settings, "unit", None)
-    return unit and {**asdict(unit), "calls_per_frame": unit.calls_per_frame}
+    return unit and {**asdict(unit), "calls_per_frame": unit.network_calls / unit.frames}
 
 
 def write_sheets(works: Sequence[Work], rows: Sequence[Mapping[str, Any]], out: Path) -> None:

@@ -15,9 +15,9 @@ from rich.console import Console
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, scene_files
+from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.lab.training.video_pairs import VideoRecipe, make_video_pairs
-from alpasim_plugin.runs.executors.local import map_jobs
 from scenarios.load import load_scenario
 
 EPILOG = """

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
@@ -41,6 +40,7 @@ from alpasim_plugin.lab.training.recipes.recipe import (
     Weights,
 )
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
+from alpasim_plugin.lab.training.vae import load_tiny_vae
 
 BUNDLE_FILE = "fixer.safetensors"
 BUNDLED = ("dit", "vae", "prompt")

@@ -18,11 +18,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.codec_weights import LatentStats
-from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
+from alpasim_plugin.fixers.bundle import parts_of
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.clips import (
     Clip,
     CropSize,
@@ -245,3 +246,13 @@ def channel_amplitudes(vae: TinyVAE, sigma: float = 0.3) -> Tensor:
         rms.append((vae.decode(moved, clamp=False) - still).square().mean().sqrt())
     out = torch.stack(rms)
     return out / out.mean()
+
+
+def load_tiny_vae(path: str | Path) -> TinyVAE:
+    """Return the tiny autoencoder in a file: a bundle's, or one that `TinyVAE.save` wrote.
+
+    Raises:
+        InputError: Neither, or a bundle with another kind of autoencoder.
+    """
+    tensors = load_weights(path)
+    return TinyVAE.from_state_dict(parts_of(tensors).get("vae", tensors), source=str(path))

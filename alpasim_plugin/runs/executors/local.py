@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from multiprocessing.context import BaseContext
 from typing import Any, TypeVar
 
-from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, safe_path
 
@@ -108,19 +107,6 @@ def run_jobs(
                 job,
                 (_lost(limit_s if is_late else None) if _is_lost(future) else future.result()),
             )
-
-
-def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterator[tuple[J, R]]:
-    """Yield every job with its result, as they finish; see `run_jobs`.
-
-    Raises:
-        InfrastructureError: The worker of a job died twice.
-        The first exception of ``work``.
-    """
-    for job, got in run_jobs(work, jobs, workers):
-        if isinstance(got, Lost):
-            raise InfrastructureError(f"{job}: {got.reason}", got.hint)
-        yield job, got
 
 
 def _in_pools(

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
-from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, Rollouts
 from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.trainer import Schedule
+from alpasim_plugin.lab.training.vae import load_tiny_vae
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, brightness, clips_of, data, run_of  # noqa: F401 - data is a fixture
