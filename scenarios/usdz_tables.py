@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
 from scenarios.recorded import MAX_REACH_M
@@ -279,9 +279,7 @@ def table_ids(names: Sequence[str]) -> dict[str, str]:
     }  # two names that differ only in these two characters
 
 
-def _row(
-    map_id: str | None, label: str, own: Mapping[str, Any], kind: str | None = None
-) -> JsonObject:
+def _row(map_id: str | None, label: str, own: JsonView, kind: str | None = None) -> JsonObject:
     return {
         "key": {"label_class_id": label, "map_id": map_id, "map_id_version": "0", "kind": kind},
         label: dict(own),

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
@@ -123,7 +124,7 @@ def compare(
 
 
 def _table(
-    rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], known: MetricTable
+    rows: Sequence[PairRow], entries: Mapping[str, JsonView], known: MetricTable
 ) -> list[str]:
     """Return one line per metric; lines are not wrapped."""
     lines = [("metric", "difference", "p", "these scenes", "95 %", "margin", "pairs", "others")]
@@ -145,7 +146,7 @@ def _table(
     return texts
 
 
-def _missing(entries: Mapping[str, Mapping[str, Any]], most: int) -> list[str]:
+def _missing(entries: Mapping[str, JsonView], most: int) -> list[str]:
     """List missing pairs: metrics without any, cells without any, and metrics that lack some cells;
     ``most`` names a line.
     """

@@ -15,7 +15,7 @@ from rich import progress
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 from alpasim_plugin.core.escape import terminal
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
 from alpasim_plugin.core.stage import stages_in
@@ -33,7 +33,7 @@ MAX_LINES = 1000  # of finished rollouts on a pipe
 LINE_EVERY_S = 10.0  # on a pipe, within one stage
 
 
-def show(as_json: bool, facts: Mapping[str, Any], *lines: Any) -> None:
+def show(as_json: bool, facts: JsonView, *lines: Any) -> None:
     """Print a result: its facts as one JSON document, or lines of text and tables of rich."""
     if as_json:
         say(json.dumps(facts))

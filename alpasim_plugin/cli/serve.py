@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.runs.score_logs import scenario_finder
@@ -178,9 +179,7 @@ def _serve_policy(
     _print_counts(counts, as_json)
 
 
-def _host(
-    host: Host, facts: Mapping[str, Any], text: str, host_policy: HostPolicy, as_json: bool
-) -> None:
+def _host(host: Host, facts: JsonView, text: str, host_policy: HostPolicy, as_json: bool) -> None:
     """Serve until a signal stops the process."""
     try:
         host.start()
@@ -190,7 +189,7 @@ def _host(
         host.stop(host_policy.drain_s)
 
 
-def _print_counts(counts: Mapping[str, Any], as_json: bool) -> None:
+def _print_counts(counts: JsonView, as_json: bool) -> None:
     show(as_json, counts, ", ".join(f"{key} {value}" for key, value in counts.items()))
 
 

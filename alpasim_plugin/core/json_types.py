@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 JsonObject = dict[str, Any]  # an object of a document, by its keys
+JsonView = Mapping[str, Any]  # one that is only read

@@ -234,7 +234,17 @@ def write_folder(
     )
     comparisons, coverage = measure(model, views, exposures, tell)
     quality = write_page(work, drive, placed, standing, len(views["fitted"]), comparisons, coverage)
-    write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
+    length_us = int(log.ego_log.t_us[-1])
+    timing = ""
+    if length_us < SHORT_US:
+        timing = "timing: {start_us: 0, warmup_us: 0}  # a short recording: driven from its first pose on\n"
+    write_text(
+        work / SCENARIO_FILE,
+        (
+            f"# A recorded drive, imported from {drive.scene_id}; quality.md says how good it is.\n"
+            f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
+        ),
+    )
     return quality
 
 
@@ -426,17 +436,6 @@ def scene_id_of(drive: SourceDrive) -> str:
     """Return a name that a scenario may have."""
     letters = "".join(c if c.isalnum() or c in "_.-" else "-" for c in drive.scene_id).strip("-_.")
     return letters[:80] or "drive"
-
-
-def _scenario_text(scene_id: str, log: RecordedLog, name: str) -> str:
-    length_us = int(log.ego_log.t_us[-1])
-    timing = ""
-    if length_us < SHORT_US:
-        timing = "timing: {start_us: 0, warmup_us: 0}  # a short recording: driven from its first pose on\n"
-    return (
-        f"# A recorded drive, imported from {name}; quality.md says how good it is.\n"
-        f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
-    )
 
 
 def fitted(

@@ -84,7 +84,15 @@ class AslReader:
         with open_regular(self.path, LOG_BYTES) as stream:
             index = 0
             while (body := self._next(stream, index)) is not None:
-                yield self._parse(body, index, stream.tell() - len(body))
+                offset = stream.tell() - len(body)
+                entry = logging_pb2.LogEntry()
+                try:
+                    entry.ParseFromString(body)
+                except DecodeError as error:
+                    raise self._damaged(
+                        index, offset, f"{len(body)} bytes that are no log entry"
+                    ) from error
+                yield entry
                 index += 1
         if index == 0 and self.truncated is None:
             raise InputError(f"{self.path}: an empty file", "run the rollout again")
@@ -110,16 +118,6 @@ class AslReader:
             )
         self.truncated = TruncatedTail(self.path, index, offset, announced, len(body))
         return None
-
-    def _parse(self, body: bytes, index: int, offset: int) -> logging_pb2.LogEntry:
-        entry = logging_pb2.LogEntry()
-        try:
-            entry.ParseFromString(body)
-        except DecodeError as error:
-            raise self._damaged(
-                index, offset, f"{len(body)} bytes that are no log entry"
-            ) from error
-        return entry
 
     def _damaged(self, index: int, offset: int, found: str) -> InputError:
         return InputError(

@@ -180,6 +180,8 @@ class VideoReader:
         height, width = self._upright(first).shape[:2]
         turned = (width, height) != (first.width, first.height)
         aspect = Fraction(self._stream.sample_aspect_ratio or 1)
+        others = [one for one in self._container.streams.video if one.index != self._stream.index]
+        tracks = [f"video track {one.index} ({one.width}x{one.height})" for one in others]
         self.format = VideoFormat(
             width=width,
             height=height,
@@ -188,13 +190,8 @@ class VideoReader:
             frames=self._stream.frames or None,
             pixel_aspect=1 / aspect if turned else aspect,
             colour=(int(first.colorspace), int(first.color_primaries), int(first.color_trc)),
-            left_out=self._left_out(),
+            left_out=(*tracks, "sound") if self._container.streams.audio else tuple(tracks),
         )
-
-    def _left_out(self) -> tuple[str, ...]:
-        others = [one for one in self._container.streams.video if one.index != self._stream.index]
-        tracks = [f"video track {one.index} ({one.width}x{one.height})" for one in others]
-        return (*tracks, "sound") if self._container.streams.audio else tuple(tracks)
 
     def _check_end(self, count: int, reached: int) -> None:
         """Refuse a file that was cut short: fewer frames than it claims, and an end well before the

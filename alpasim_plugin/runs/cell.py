@@ -11,7 +11,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 
@@ -19,7 +18,7 @@ from alpasim_plugin.control import Controller
 from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import FaultOfPart, SimrunError
 from alpasim_plugin.core.interfaces import Policy, Renderer
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
@@ -151,7 +150,7 @@ def run_cell(
     return manifest
 
 
-def is_copied(manifest: Mapping[str, Any]) -> bool:
+def is_copied(manifest: JsonView) -> bool:
     """Tell whether the same rollout behind other renderers is a copy of this one, which their
     images could not have changed.
     """
@@ -219,7 +218,7 @@ def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator
     write_manifest(folder, manifest)
 
 
-def _wants_film(video: str, manifest: Mapping[str, Any]) -> bool:
+def _wants_film(video: str, manifest: JsonView) -> bool:
     return video == "all" or (video == "failures" and bool(manifest["events"]))
 
 

@@ -27,6 +27,7 @@ import yaml
 from alpasim_plugin.core.atomic import atomic_file, atomic_folder, write_json, write_text
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.parts import require_installed
 from alpasim_plugin.core.reading.files import open_regular
@@ -110,7 +111,7 @@ def eval_config() -> dict[str, Any]:
     }
 
 
-def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]]:
+def scenes_of(info: JsonView) -> dict[str, tuple[ScenarioRef, Scenario]]:
     """Load the scenarios of a run by scene id.
 
     Args:
@@ -281,7 +282,7 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
 def _export_rollout(
     root: Path,
     folder: Path,
-    manifest: Mapping[str, Any],
+    manifest: JsonView,
     scenario: Scenario,
     run: ExportedRun,
 ) -> None:
@@ -321,8 +322,8 @@ def _finish(
     folder: Path,
     out: Path,
     run: ExportedRun,
-    info: Mapping[str, Any],
-    manifests: Sequence[Mapping[str, Any]],
+    info: JsonView,
+    manifests: Sequence[JsonView],
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{run.renderer} {run.policy}"

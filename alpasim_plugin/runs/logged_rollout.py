@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
@@ -26,7 +26,7 @@ class LoggedRollout:
     cell: Cell
     options: RunOptions
     scenario: Scenario
-    manifest: Mapping[str, Any]
+    manifest: JsonView
 
     @property
     def folder(self) -> Path:
@@ -82,7 +82,7 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
             f"{name}: it is the continuation of another rollout",
             f"name that rollout: {manifest['fork']['of']}",
         )
-    stated: Mapping[str, Any] = (info["scenes"].get(row.scene) or {}).get("ref") or {}
+    stated: JsonView = (info["scenes"].get(row.scene) or {}).get("ref") or {}
     if stated.get("path") is None:
         raise InputError(
             f"{root / RUN_INFO}: no path of the scenario {row.scene!r}",

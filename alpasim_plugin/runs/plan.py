@@ -5,7 +5,7 @@ keys.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
@@ -49,7 +50,7 @@ class RunOptions:
     ] = ()
 
 
-def options_of(info: Mapping[str, Any]) -> RunOptions:
+def options_of(info: JsonView) -> RunOptions:
     """Return the options of an earlier run, as its ``run.json`` states them."""
     stated = {
         f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]
@@ -59,7 +60,7 @@ def options_of(info: Mapping[str, Any]) -> RunOptions:
     )
 
 
-def ref_of(stated: Mapping[str, Any]) -> ScenarioRef:
+def ref_of(stated: JsonView) -> ScenarioRef:
     """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's
     ``ref``.
     """

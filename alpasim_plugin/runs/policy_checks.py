@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.spec import BUILTIN
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
@@ -53,7 +52,7 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
 
 
 def check_policies(
-    plan: RunPlan, known: Mapping[str, Any], how: HowToRun, noticed: Callable[[str], None]
+    plan: RunPlan, known: JsonView, how: HowToRun, noticed: Callable[[str], None]
 ) -> JsonObject:
     """Return what `policies.conformance.check_policy` finds in each policy of the user's own: its
     digest, and by ``breaches`` and ``notes`` a name and a sentence each.

@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
@@ -211,9 +211,7 @@ class Recorder:
             self._log.route(observation.t_us, observation.route_rig)
             self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
 
-    def policy_plan(
-        self, plan: Trajectory, samples: Sequence[Trajectory], debug: Mapping[str, Any]
-    ) -> None:
+    def policy_plan(self, plan: Trajectory, samples: Sequence[Trajectory], debug: JsonView) -> None:
         """Log the policy's plan and its samples, in world coordinates, and what it says of them."""
         with self.stage("log"):
             self._log.driver_return(plan, samples)

@@ -19,7 +19,7 @@ import numpy as np
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.reading import read_json, real
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
@@ -194,7 +194,7 @@ def _facts(run: Run, cell: WatchedCell) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items() if value not in (None, "")}
 
 
-def _map_item(content: Mapping[str, Any], recorded: F64, t_us: int) -> Item:
+def _map_item(content: JsonView, recorded: F64, t_us: int) -> Item:
     """Return the map that a run keeps, which is flat, laid at the height of the nearest point of
     the recorded drive ``(R, 3)``.
     """

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.atomic import scratch_folder
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
@@ -22,7 +21,7 @@ def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
 
 
 def repeat_rollout(
-    plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
+    plan: RunPlan, root: Path, manifests: Sequence[JsonView], threads: int
 ) -> JsonObject:
     """Drive the shortest finished rollout of each policy again and compare the two logs.
 
@@ -81,7 +80,7 @@ def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonOb
     }
 
 
-def repeat_line(repeat: Mapping[str, Any]) -> str:
+def repeat_line(repeat: JsonView) -> str:
     """Return the result of a repeated rollout as one line of text.
 
     Example:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import SimrunError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.images import smaller
@@ -72,7 +71,7 @@ def write_causes(run: Run) -> None:
         write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
 
 
-def divergences_of(run: Run, rollout: Rollout) -> list[Mapping[str, Any]]:
+def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:
     """Return the entries of ``flips.json`` about a rollout; none where the file is absent."""
     return [entry for entry in flip_entries(run) if key_of_entry(entry)[:4] == rollout.cell]
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import Scenario
@@ -171,7 +171,7 @@ def execute_run(
 
 
 def finish_run(
-    root: Path, manifests: Sequence[JsonObject], more: Mapping[str, Any], report: bool = True
+    root: Path, manifests: Sequence[JsonObject], more: JsonView, report: bool = True
 ) -> JsonObject:
     """Write the tables and the reports of a run whose rollouts are done; return the summary.
 
@@ -206,7 +206,7 @@ def finish_run(
 
 def summary_of_run(
     root: Path,
-    info: Mapping[str, Any],
+    info: JsonView,
     manifests: Sequence[JsonObject],
     tables: Path | None = None,
 ) -> JsonObject:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.types import (
     F64,
@@ -51,7 +51,7 @@ def tabulate(
     rollout: RolloutLog,
     series: Sequence[MetricSeries],
     preset: str | Preset,
-    frames: Sequence[Mapping[str, Any]] = (),
+    frames: Sequence[JsonView] = (),
 ) -> tuple[list[JsonObject], JsonObject]:
     """Flatten a scored rollout for the tables.
 

@@ -8,13 +8,12 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
@@ -44,7 +43,7 @@ def write_summary(
     manifests: Sequence[JsonObject],
     preset: str,
     baseline: str | None,
-    more: Mapping[str, Any],
+    more: JsonView,
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
     tables: Path | None = None,
@@ -164,8 +163,8 @@ def pool_of(
     manifests: Sequence[JsonObject],
     threads: Threads,
     wall_s: float,
-    before: Mapping[str, Any] | None,
-) -> Mapping[str, Any]:
+    before: JsonView | None,
+) -> JsonView:
     """Return the throughput of all workers together, start-up included; a run that only reused
     rollouts keeps its earlier figures.
     """
@@ -233,7 +232,7 @@ def joined_metrics(runs: Sequence[Path]) -> MetricTable:
     return _joined({run: read_run_json(run) for run in runs}, ())
 
 
-def _joined(infos: Mapping[Path, Mapping[str, Any]], metrics: Sequence[str]) -> MetricTable:
+def _joined(infos: Mapping[Path, JsonView], metrics: Sequence[str]) -> MetricTable:
     first, *others = infos.items()
     known = MetricTable.of_run(first[1])
     for run, info in others:
@@ -254,7 +253,7 @@ def _info_of(run: Path) -> JsonObject:
     return info
 
 
-def _check_alike(infos: Mapping[Path, Mapping[str, Any]]) -> None:
+def _check_alike(infos: Mapping[Path, JsonView]) -> None:
     """Refuse runs whose rollouts are not of one kind.
 
     Raises:

@@ -13,11 +13,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
@@ -194,7 +193,7 @@ class BoundarySearch:
         scenarios = {name: known[name] for name in wanted}
         return replace(self.plan, cells=tuple(cells), scenarios=scenarios, whole=self.plan)
 
-    def add(self, cells: Sequence[Cell], manifests: Sequence[Mapping[str, Any]]) -> None:
+    def add(self, cells: Sequence[Cell], manifests: Sequence[JsonView]) -> None:
         """Take in the outcomes of a round."""
         points = {plan.cells[0].scene: point for point, plan in self.scenes.items()}
         for cell, manifest in zip(cells, manifests, strict=True):
@@ -260,7 +259,7 @@ class BoundarySearch:
         return facts | {"fails": side} | vars(boundary_of(brackets)), brackets
 
 
-def _has_failed(manifest: Mapping[str, Any]) -> bool | None:
+def _has_failed(manifest: JsonView) -> bool | None:
     """Tell whether a rollout had an outcome that counts as a failure; None where that is not
     known.
     """

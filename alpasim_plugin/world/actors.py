@@ -111,7 +111,17 @@ class Actors:
                 [actor.box for actor in replayed],
                 velocity,
             )
-            others = concatenate([self._ego_body(ego), bodies])
+            yaw = yaw_of(ego.T_world_rig)
+            direction = np.array([np.cos(yaw), np.sin(yaw)])
+            centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
+            others = concatenate(
+                [
+                    bodies_from(
+                        centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
+                    ),
+                    bodies,
+                ]
+            )
             self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
         for driver in self.drivers:
             pose = driver.pose(t_us, self.closed_us, driver.motion)
@@ -128,12 +138,6 @@ class Actors:
             (d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present
         ]
         return ActorForecast(tuple(self.replayed), tuple(reactive), self.t_us, self.closed_us)
-
-    def _ego_body(self, ego: EgoState) -> Bodies:
-        yaw = yaw_of(ego.T_world_rig)
-        direction = np.array([np.cos(yaw), np.sin(yaw)])
-        centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
-        return bodies_from(centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction)
 
     def _advance(self, lines: Lines, from_us: int, to_us: int, others: Bodies) -> None:
         """Move all reactive drivers, who see each other and the others' bodies."""

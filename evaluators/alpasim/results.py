@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, MetricInfo, MetricSeries
 from evaluators.alpasim.settings import SceneScoreSettings
 from evaluators.metrics.presets import Preset
@@ -310,7 +310,7 @@ def metrics_results_table(
 def results_summary(
     rollouts: Sequence[ReducedRollout],
     scores: Mapping[int, SceneScore],
-    failed: Sequence[Mapping[str, Any]],
+    failed: Sequence[JsonView],
     sweeps: Mapping[str, float | int | None],
     settings: SceneScoreSettings,
 ) -> JsonObject:

@@ -8,14 +8,15 @@ the end of the path.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, speeds
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
@@ -98,7 +99,7 @@ def in_words(had: Iterable[str]) -> str:
     return " and ".join(outcome.words for outcome in told(had)) or NO_OUTCOME
 
 
-def first_failure(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def first_failure(manifest: JsonView) -> JsonView | None:
     """Return the event of a manifest with which its drive failed first, a contact at any side among
     them; None where it did not.
 

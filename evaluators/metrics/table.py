@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.image_metrics import BLACK_MAX
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
 from evaluators.scores.table import BENCHMARKS
@@ -159,7 +159,7 @@ class MetricTable(Mapping[str, MetricInfo]):
         return out
 
     @classmethod
-    def of_run(cls, info: Mapping[str, Any]) -> MetricTable:
+    def of_run(cls, info: JsonView) -> MetricTable:
         """Return the table that a run's ``run.json`` carries; ours for what it lacks, so that a run
         can be read without its plug-ins.
         """

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.rows import Rollout, Series
 from evaluators.numbers import fixed
@@ -152,7 +153,7 @@ def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
 
 def scene_view(
     scene: str,
-    content: Mapping[str, Any],
+    content: JsonView,
     rollouts: Sequence[Rollout],
     series: Series,
     variant_of: Variants,
@@ -239,7 +240,7 @@ def scene_view(
     )
 
 
-def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
+def drawn_map(content: JsonView) -> dict[str, list[F64]]:
     """Return what every view from above draws of a map: ``lanes``, ``paint`` (edges of lanes that
     carry markings), ``edges`` and ``crosswalks``.
 
@@ -290,7 +291,7 @@ def _areas(rings: Sequence[F64], frame: _Frame) -> str:
 def _mark(
     event: Event,
     frame: _Frame,
-    vehicle: Mapping[str, Any],
+    vehicle: JsonView,
     variant_of: Variants,
     label: str,
     zero_us: int,
@@ -316,7 +317,7 @@ def _mark(
 
 
 def road_users(
-    content: Mapping[str, Any], at_us: int, log: F64, draw: Callable[[F64, bool], str]
+    content: JsonView, at_us: int, log: F64, draw: Callable[[F64, bool], str]
 ) -> list[dict[str, str]]:
     """Lay out the road users of a scene; empty for scene files of earlier versions, which have no
     tracks.

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonView
 from evaluators.numbers import decimals, fixed
 from evaluators.report.charts import MUTED, VARIANT, Axes, Chart
 
 
-def sentence_of(record: Mapping[str, Any]) -> str:
+def sentence_of(record: JsonView) -> str:
     """Say in one line where each variant starts to fail, and how far the boundaries differ.
 
     Args:
@@ -38,7 +38,7 @@ def sentence_of(record: Mapping[str, Any]) -> str:
     return f"{text}; {record['rollouts']} rollouts, {share:.0f} % of a grid's{stopped}"
 
 
-def number(facts: Mapping[str, Any], unit: str, sign: bool = False) -> str:
+def number(facts: JsonView, unit: str, sign: bool = False) -> str:
     """Write an estimate with its interval, such as ``6.4 m (6.1 to 6.8)``."""
     values = [facts["value"], facts["low"], facts["high"]]
     places = decimals(*values)
@@ -46,7 +46,7 @@ def number(facts: Mapping[str, Any], unit: str, sign: bool = False) -> str:
     return f"{value} {unit} ({low} to {high})".replace("  ", " ")
 
 
-def names_of(record: Mapping[str, Any]) -> dict[str, str]:
+def names_of(record: JsonView) -> dict[str, str]:
     """Name variants by what they do not share: the renderer, the policy, or both."""
     parts = [name.split("/") for name in record["variants"]]
     for column in (0, 1):
@@ -55,12 +55,12 @@ def names_of(record: Mapping[str, Any]) -> dict[str, str]:
     return {name: name for name in record["variants"]}
 
 
-def boundary_section(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def boundary_section(record: JsonView | None) -> dict[str, Any] | None:
     """Return the section of a run that searched for boundaries, None of any other."""
     return None if record is None else {"title": record["sentence"], "charts": [chart(record)]}
 
 
-def chart(record: Mapping[str, Any]) -> Chart:
+def chart(record: JsonView) -> Chart:
     """Draw every driven point, a row for each variant and seed, with boundaries and intervals."""
     axes, names = Axes(), names_of(record)
     unit = f", {record['unit']}" if record["unit"] else ""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from evaluators.numbers import Cell, duration, finite, fixed, missing, plural, short
 from evaluators.opening import Run
 
@@ -30,7 +29,7 @@ COLUMNS = (  # head, what it means
 TIMES = ("ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms")
 
 
-def fixer_rows(summary: Mapping[str, Any]) -> list[JsonObject]:
+def fixer_rows(summary: JsonView) -> list[JsonObject]:
     """Lay out the fixers of a run: ``renderer``, ``trained``, and ``cells`` in the order of
     `COLUMNS`.
     """
@@ -65,7 +64,7 @@ def _kinds(events: Mapping[str, int]) -> str:
     return ", ".join(f"{kind.removeprefix(GUARD)} {n}" for kind, n in sorted(events.items()))
 
 
-def fixer_cautions(summary: Mapping[str, Any]) -> list[str]:
+def fixer_cautions(summary: JsonView) -> list[str]:
     """Say what a reader must know of the fixers before using the numbers."""
     cautions = []
     for name, entry in (summary.get("fixers") or {}).items():
@@ -81,7 +80,7 @@ def fixer_cautions(summary: Mapping[str, Any]) -> list[str]:
     return cautions
 
 
-def refused(summary: Mapping[str, Any], renderer: str) -> dict[str, int]:
+def refused(summary: JsonView, renderer: str) -> dict[str, int]:
     """Return how many frames of a renderer the fixer's guard replaced, by kind of event."""
     events = ((summary.get("censoring") or {}).get(renderer) or {}).get("frame_events") or {}
     return {kind: int(count) for kind, count in events.items() if kind.startswith(GUARD)}
@@ -105,7 +104,7 @@ class Speed:
 
 def speed(run: Run) -> Speed:
     """Lay out milliseconds per frame, whole and by stage."""
-    entries: Mapping[str, Mapping[str, Any]] = run.summary.get("speed") or {}
+    entries: Mapping[str, JsonView] = run.summary.get("speed") or {}
     names = list(dict.fromkeys(stage for e in entries.values() for stage in e.get("stages") or {}))
     absent = "no finished rollout has a frame after its first"
     rows = []
@@ -131,7 +130,7 @@ def speed(run: Run) -> Speed:
     return Speed(tuple(rows), tuple(names), ", ".join(texts))
 
 
-def _stage(entry: Mapping[str, Any]) -> Cell:
+def _stage(entry: JsonView) -> Cell:
     p50, p95, share = (finite(entry.get(key)) for key in ("p50_ms", "p95_ms", "share"))
     if p50 is None:
         return missing("this renderer has no such stage")

@@ -5,12 +5,12 @@ report: baseline, every check, the worst scenes first.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
@@ -38,7 +38,7 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
     return path
 
 
-def worst_of(checks: Sequence[Mapping[str, Any]]) -> list[JsonObject]:
+def worst_of(checks: Sequence[JsonView]) -> list[JsonObject]:
     """Return the pairs that did worst in every check that did not pass, once each, those of a shown
     regression first; ``checks`` are those of `GateVerdict.as_dict`.
     """

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
@@ -276,7 +277,7 @@ def variant_name(run: Run, name: str) -> str:
     return name.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else name
 
 
-def tone_of(entry: Mapping[str, Any]) -> Tone:
+def tone_of(entry: JsonView) -> Tone:
     """Give the tone of one metric of ``summary.json``'s ``paired``.
 
     Neutral means non-inferior: no worse than its margin, and not shown to be better.
@@ -365,7 +366,7 @@ def decided(rows: Sequence[VariantRow]) -> str:
 
 
 def _row(
-    run: Run, variant: str, entry: Mapping[str, Any], differences: Mapping[str, Difference]
+    run: Run, variant: str, entry: JsonView, differences: Mapping[str, Difference]
 ) -> VariantRow:
     metrics = run.summary.get("metrics") or {}
     renderer = variant.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else variant
@@ -394,7 +395,7 @@ def _row(
     )
 
 
-def _places(entry: Mapping[str, Any]) -> dict[str, list[str]]:
+def _places(entry: JsonView) -> dict[str, list[str]]:
     """Return ending -> scene and time of the failures of a variant, the gravest first."""
     places: dict[str, list[str]] = {}
     for name, facts in entry["outcomes"].items():

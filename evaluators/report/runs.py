@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
@@ -21,6 +21,7 @@ from rich.text import Text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.escape import terminal as escape
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.lock import is_locked
 from alpasim_plugin.core.reading.files import read_json_as
 from alpasim_plugin.log.run_folder.manifests import read_run_json
@@ -59,7 +60,7 @@ class RunEntry:
     folder: Path
     state: State
     problem: str
-    info: Mapping[str, Any]
+    info: JsonView
 
     @property
     def started_at(self) -> datetime | None:
@@ -79,11 +80,11 @@ class RunEntry:
         return f"{commit}+" if commit and project.get("dirty") else commit
 
     @property
-    def outcome(self) -> Mapping[str, Any]:
+    def outcome(self) -> JsonView:
         """Give ``n_rollouts`` and ``n_failed``, from ``run.json``."""
         if self.state != "finished":
             return {}
-        stated: Mapping[str, Any] = self.info.get("outcome") or {}
+        stated: JsonView = self.info.get("outcome") or {}
         return stated
 
     @property
@@ -99,7 +100,7 @@ class RunEntry:
         return math.prod(len(self.info.get(axis) or ()) for axis in axes)
 
     @cached_property
-    def summary(self) -> Mapping[str, Any]:
+    def summary(self) -> JsonView:
         """Give ``summary.json``, read on first use; empty where the run is not finished.
 
         Raises:
@@ -107,10 +108,10 @@ class RunEntry:
         """
         if self.state != "finished":
             return {}
-        summary: Mapping[str, Any] = read_json_as(Summary, self.folder / SUMMARY, do_this=CHECK)
+        summary: JsonView = read_json_as(Summary, self.folder / SUMMARY, do_this=CHECK)
         return summary
 
-    def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
+    def metric(self, metric: str, renderer: str, policy: str) -> JsonView:
         """Return the entry of a metric in ``summary.json``; empty where it has none."""
         table = self.summary.get("metrics") or {}
         alone = renderer if len(self.info.get("policies") or ()) == 1 else ""
@@ -151,7 +152,7 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
             makes it five times slower.
     """
     finished = os.path.isfile(folder / SUMMARY)  # False too in a folder that cannot be read
-    info: Mapping[str, Any] = {}
+    info: JsonView = {}
     problem = ""
     try:
         info = read_run_json(folder)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.numbers import (
@@ -66,7 +66,7 @@ class PairRow:
 
 
 def metric_rows(
-    summary: Mapping[str, Any],
+    summary: JsonView,
     reasons: Mapping[tuple[str, str], str] | None = None,
     known: MetricTable = METRICS,
 ) -> list[MetricRow]:
@@ -109,9 +109,7 @@ def metric_rows(
     return rows
 
 
-def metric_cell(
-    metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = ""
-) -> Cell:
+def metric_cell(metric: MetricInfo, entry: JsonView, places: int, reason: str = "") -> Cell:
     """Print a mean with its interval, scenes as clusters, and for rates the count."""
     mean = finite(entry.get("mean"))
     if mean is None:
@@ -141,7 +139,7 @@ def metric_cell(
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, mean)
 
 
-def pair_rows(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[PairRow]:
+def pair_rows(summary: JsonView, known: MetricTable = METRICS) -> list[PairRow]:
     """Lay out the paired differences, headline metrics first within each variant; those with a
     fixer's own base come last.
     """
@@ -153,7 +151,7 @@ def pair_rows(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[
     return rows
 
 
-def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> PairRow:
+def _pair_row(variant: str, metric: MetricInfo, entry: JsonView) -> PairRow:
     difference, p = finite(entry.get("diff")), finite(entry.get("p_value"))
     bounds = interval(entry.get("ci95"), difference) or ()
     scale, unit = scale_and_unit(metric, str(entry.get("unit", "")))
@@ -191,7 +189,7 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any]) -> Pai
     )
 
 
-def _pair_note(entry: Mapping[str, Any]) -> str:
+def _pair_note(entry: JsonView) -> str:
     counts = [(entry.get("n_cells"), "pair"), (entry.get("n_scenes"), "scene")]
     texts = [plural(int(count), noun) for count, noun in counts if count is not None]
     if entry.get("n_missing"):

@@ -7,13 +7,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from textwrap import wrap
-from typing import Any
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from alpasim_plugin.core.escape import terminal as escape
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
@@ -32,9 +32,7 @@ LEAST_PLOT = 20  # letters
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 
 
-def render_presets(
-    summaries: Mapping[str, Mapping[str, Any]], known: MetricTable = METRICS
-) -> Table:
+def render_presets(summaries: Mapping[str, JsonView], known: MetricTable = METRICS) -> Table:
     """Lay out the scores of several presets on the same logs: a benchmark's own scores, of the
     other presets their headline metrics.
 
@@ -63,7 +61,7 @@ def render_presets(
     return table
 
 
-def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent: bool) -> Text:
+def _score_cell(summary: JsonView, variant: str, name: str, in_percent: bool) -> Text:
     metrics = (summary.get("metrics") or {}).get(variant) or {}
     invalid = ((summary.get("censoring") or {}).get(variant) or {}).get("invalid") or {}
     reasons = "; ".join((invalid.get(name) or {}).get("reasons") or ())
@@ -78,7 +76,7 @@ def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent:
     return Text(f"{number} ").append(escape(note), style="dim")
 
 
-def metric_lines(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[str]:
+def metric_lines(summary: JsonView, known: MetricTable = METRICS) -> list[str]:
     """Print the mean and 95 % interval of each metric, a line a variant.
 
     Args:

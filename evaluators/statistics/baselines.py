@@ -8,14 +8,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
@@ -104,10 +103,10 @@ class Baseline:
 
     preset: str
     scenes: Mapping[str, str]  # scene id -> content hash
-    weights: Mapping[str, Any]  # as in run.json
+    weights: JsonView  # as in run.json
     rows: Sequence[Row]
-    made_with: Mapping[str, Any]  # command, versions, hardware, start: for people, not compared
-    metrics: Mapping[str, Any]  # what each is, as in run.json
+    made_with: JsonView  # command, versions, hardware, start: for people, not compared
+    metrics: JsonView  # what each is, as in run.json
     repeatable: bool | None  # what ``run --repeat`` found; None: not tried
     schema_version: int = SCHEMA_VERSION
 

@@ -12,14 +12,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core.config import Document, guess, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
@@ -208,7 +208,7 @@ class Check:
     kind: Kind
     cause: Cause
     text: str  # one sentence with the numbers
-    entry: Mapping[str, Any]  # the paired comparison, or mean and bounds
+    entry: JsonView  # the paired comparison, or mean and bounds
     binding: bool = True  # a check that does not bind leaves the gate open
 
 
@@ -218,7 +218,7 @@ class GateVerdict:
 
     outcome: Outcome
     checks: tuple[Check, ...]
-    failures: Mapping[str, Any]
+    failures: JsonView
     baseline: str  # what was compared with, in words
     about: str  # what it is about, in words
 
@@ -384,7 +384,7 @@ class _Pair:
     against: str
 
     def check(
-        self, metric: MetricInfo, cause: Cause, text: str, entry: Mapping[str, Any], binding: bool
+        self, metric: MetricInfo, cause: Cause, text: str, entry: JsonView, binding: bool
     ) -> Check:
         """Make the check of a metric."""
         renderer, policy = self.variant.renderer, self.variant.policy

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import (
     CONTACT_SIDES,
@@ -28,7 +27,7 @@ LISTED = 20  # cells named per outcome in summary.json
 DISTANCE = "lateral_distance_m"
 
 
-def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], Times]:
+def rollouts_of(manifests: Iterable[JsonView]) -> tuple[list[Rollout], Times]:
     """Return manifests as rows, and when their outcomes began."""
     rows: list[Rollout] = []
     times: dict[tuple[str, str, str, int], dict[str, float]] = {}

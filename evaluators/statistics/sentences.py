@@ -4,9 +4,9 @@ report and the terminal.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
 from evaluators.numbers import (
     decimals,
@@ -24,7 +24,7 @@ MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 NAMED = 3  # scenes and cells in a sentence
 
 
-def difference_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
+def difference_text(entry: JsonView, metric: MetricInfo) -> str:
     """Say a paired difference, its interval, and what would decide it.
 
     Args:
@@ -61,7 +61,7 @@ def more_scenes_text(more: Any) -> str:
     return f"at least {plural(more, 'more scene')} would decide"
 
 
-def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
+def change_text(entry: JsonView, metric: MetricInfo) -> str:
     """Say what changed on a suite, and where.
 
     Args:
@@ -96,7 +96,7 @@ def change_text(entry: Mapping[str, Any], metric: MetricInfo) -> str:
     return "; ".join(parts)
 
 
-def _place(pair: Mapping[str, Any]) -> str:
+def _place(pair: JsonView) -> str:
     return f"{pair['scene']} seed {pair['seed']}"
 
 

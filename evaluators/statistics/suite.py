@@ -12,13 +12,12 @@ that six new events and none gone are just enough.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.statistics.intervals import TAIL, cluster_means, exact_rate
@@ -59,7 +58,7 @@ class Change:
     is_cut: Bool
     n_neither: int
     n_short: int
-    missing: Sequence[Mapping[str, Any]]
+    missing: Sequence[JsonView]
 
     @property
     def harms(self) -> list[F64]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
@@ -272,7 +272,7 @@ def numbers(
     }
 
 
-def by_policy(parts: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> JsonObject:
+def by_policy(parts: JsonView, table: Callable[[Any], JsonView]) -> JsonObject:
     """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY:
     policies are never averaged.
 

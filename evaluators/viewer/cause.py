@@ -18,7 +18,7 @@ from markupsafe import Markup
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import inside, read_bytes, real
 from alpasim_plugin.core.types import F64, U8, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
@@ -84,7 +84,7 @@ class Query:
     route: F64
     lines: Sequence[F64]
     images: Mapping[str, tuple[int, bytes]]
-    debug: Mapping[str, Any]
+    debug: JsonView
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def worst_failure(run: Run) -> Rollout:
     return worst
 
 
-def cause_of(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -> Cause:
+def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     """Return what the files of a run say of how a rollout ended.
 
     Args:
@@ -255,7 +255,7 @@ def _met(run: Run, rollout: Rollout) -> str:
     return str(contacts[0]["actor_id"]) if contacts else ""
 
 
-def failed_at(manifest: Mapping[str, Any]) -> int | None:
+def failed_at(manifest: JsonView) -> int | None:
     """Return when a rollout failed first, microseconds; None where it did not."""
     first = first_failure(manifest)
     return None if first is None else int(first["t_us"])
@@ -422,7 +422,7 @@ def _query(query: Query, place: Place, scale: float) -> JsonObject:
     }
 
 
-def _parting_of(run: Run, rollout: Rollout, entry: Mapping[str, Any]) -> Parting:
+def _parting_of(run: Run, rollout: Rollout, entry: JsonView) -> Parting:
     """Return where plans part by an entry of ``flips.json``; a policy sees the same images."""
     t_us, gap_m = int(entry["t_us"]), float(entry["gap_m"])
     if entry["baseline"] == rollout.renderer:

@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
@@ -350,7 +350,7 @@ def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
     return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
 
 
-def missing_log(manifest: Mapping[str, Any]) -> str:
+def missing_log(manifest: JsonView) -> str:
     """Say that a rollout has no log, and where it should be."""
     if not manifest.get("log"):
         return f"{LOG_NAME} is missing"
@@ -374,7 +374,7 @@ def index_data(
         report: Address of the run's report, or "".
     """
     ids = {cell.id for cell in here}
-    stated: dict[str, Mapping[str, Any]] = {}
+    stated: dict[str, JsonView] = {}
     for table in (run.summary.get("metrics") or {}).values():
         stated |= table
     metrics = {}
@@ -415,6 +415,6 @@ def index_data(
     }
 
 
-def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:
+def _flip_entries(run: Run, cell: WatchedCell) -> list[JsonView]:
     keys = {flip.key for flip in cell.flips}
     return [entry for entry in flip_entries(run) if key_of_entry(entry) in keys] if keys else []

@@ -4,9 +4,8 @@ what moves and happens in a rollout.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
@@ -92,7 +91,7 @@ def rounded(values: F64) -> list[float | None]:
     return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
 
 
-def scene_of(run: Run, scene: str) -> tuple[Mapping[str, Any], F64]:
+def scene_of(run: Run, scene: str) -> tuple[JsonView, F64]:
     """Return ``scenes/SCENE.json`` of a run, and the recorded drive in it, ``(N, 2)`` metres, world.
 
     Raises:
@@ -110,7 +109,7 @@ def scene_of(run: Run, scene: str) -> tuple[Mapping[str, Any], F64]:
     return content, log
 
 
-def map_data(content: Mapping[str, Any], log: F64, place: Place) -> JsonObject:
+def map_data(content: JsonView, log: F64, place: Place) -> JsonObject:
     """Return the map in whole centimetres.
 
     Args:
@@ -229,7 +228,7 @@ def curves(steps: pa.Table, place: Place) -> JsonObject:
 
 
 def moments(
-    rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows
+    rollout: Rollout, steps: pa.Table, manifest: JsonView, place: Place, frames: Rows
 ) -> list[JsonObject]:
     """List what happened when: counted collisions and departures from the road, and frames that a
     guard replaced or named.
@@ -247,7 +246,7 @@ def moments(
     return found + _frame_events(frames, place)
 
 
-def _with_whom(t_s: float, manifest: Mapping[str, Any]) -> str:
+def _with_whom(t_s: float, manifest: JsonView) -> str:
     for contact in manifest.get("contacts") or ():
         if abs(float(contact["t_s"]) - t_s) <= CONTACT_TOLERANCE_S:
             return f" with {contact['actor_id']}"
@@ -270,9 +269,7 @@ def _frame_events(frames: Rows, place: Place) -> list[JsonObject]:
     return found[:MAX_FRAME_EVENTS]
 
 
-def plans_part(
-    flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool
-) -> list[JsonObject]:
+def plans_part(flips: Sequence[JsonView], place: Place, by_policy: bool) -> list[JsonObject]:
     """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in
     `WatchedCell`.
     """

@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.reader import reporting
 from evaluators.numbers import plural
@@ -194,7 +194,7 @@ def make_page(
     return Page(render(index, texts), kept, tuple(notes))
 
 
-def thinned(document: Mapping[str, Any], factor: int) -> JsonObject:
+def thinned(document: JsonView, factor: int) -> JsonObject:
     """Return a cell's document with every factor-th camera frame alone."""
     drives = []
     for drive in document["drives"]:

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BufferedReader
@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.limits import (
     ARCHIVE_BYTES,
     DEPTH,
@@ -282,7 +282,7 @@ WANTED = {  # type of a problem that pydantic finds -> what it wants instead
 }
 
 
-def wanted_of(problem: Mapping[str, Any]) -> str:
+def wanted_of(problem: JsonView) -> str:
     """Say what a value should be instead, of a problem as pydantic lists it."""
     words = WANTED.get(problem["type"])
     if words is None:

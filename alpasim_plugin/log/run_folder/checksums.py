@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.reading import file_sha256, read_json_as
 from alpasim_plugin.log.run_folder.schema import AGAIN, FILES
 
@@ -44,12 +45,12 @@ def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
     return facts
 
 
-def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+def sealed(content: JsonView) -> dict[str, Any]:
     """Return the content of a JSON file with its SHA-256 in it."""
     return {**content, DIGEST: _digest_of(content)}
 
 
-def check_seal(content: Mapping[str, Any], path: Path, do_this: str) -> None:
+def check_seal(content: JsonView, path: Path, do_this: str) -> None:
     """Compare the content of a JSON file with the digest in it, where it holds one.
 
     Raises:
@@ -59,7 +60,7 @@ def check_seal(content: Mapping[str, Any], path: Path, do_this: str) -> None:
         raise InputError(f"{path}: not the content that was written", do_this)
 
 
-def _digest_of(content: Mapping[str, Any]) -> str:
+def _digest_of(content: JsonView) -> str:
     others = {key: value for key, value in content.items() if key != DIGEST}
     return hashlib.sha256(json.dumps(others).encode()).hexdigest()
 

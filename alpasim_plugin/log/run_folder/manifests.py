@@ -8,14 +8,13 @@ command.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import read_json_as, real
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
@@ -81,7 +80,7 @@ class RolloutState:
         return "score" if self.damage else "none"
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+def write_manifest(folder: Path, manifest: JsonView) -> None:
     """Write the manifest of a rollout with the digests of its files; a failed rollout has none.
 
     Raises:
@@ -143,7 +142,7 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
     return RolloutState(manifest, tuple(damage))
 
 
-def write_run_json(root: Path, info: Mapping[str, Any]) -> None:
+def write_run_json(root: Path, info: JsonView) -> None:
     """Write ``run.json``."""
     write_json(root / RUN_INFO, info)
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import (
     inside,
@@ -73,8 +74,8 @@ class Run:
     """
 
     folder: Path
-    info: Mapping[str, Any]
-    summary: Mapping[str, Any]
+    info: JsonView
+    summary: JsonView
     rollouts: Sequence[Rollout]
     metric_names: tuple[str, ...]
 
@@ -132,12 +133,12 @@ class Run:
         """
         return self._scene_files.get(scene)
 
-    def scene_data(self, scene: str) -> Mapping[str, Any] | None:
+    def scene_data(self, scene: str) -> JsonView | None:
         """Read a scene's map and logged drive; None where the run has no such file."""
         path = self.scene_path(scene)
         return None if path is None else read_json_as(SceneFile, path, do_this=AGAIN)
 
-    def manifest(self, rollout: Rollout) -> Mapping[str, Any]:
+    def manifest(self, rollout: Rollout) -> JsonView:
         """Read a rollout's manifest; empty where the rollout did not get so far."""
         path = self.file_of(rollout, MANIFEST)
         return {} if path is None else read_json(path)
@@ -286,8 +287,8 @@ def read_run(run_dir: Path | str) -> Run:
             `ROLLOUTS_TABLE` says.
     """
     folder = Path(run_dir)
-    info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
-    summary: Mapping[str, Any] = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
+    info: JsonView = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
+    summary: JsonView = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
     path = table_path(folder, ROLLOUTS)
     return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
 

@@ -7,12 +7,12 @@ used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import Field
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.log.run_folder.checksums import FileFacts
 
@@ -125,7 +125,7 @@ class SceneFile(TypedDict, total=False):
     actors: list[Facts]
 
 
-def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+def pair_tables(summary: JsonView) -> list[tuple[str, JsonView]]:
     """List the tables of paired differences with the variant of each: renderers, fixers against
     their base, then policies.
     """

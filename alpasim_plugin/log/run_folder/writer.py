@@ -7,11 +7,10 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +19,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
@@ -165,7 +164,7 @@ def write_tables(
     return rollouts
 
 
-def write_steps(folder: Path, rows: Sequence[Mapping[str, Any]], of_logs: bool = False) -> None:
+def write_steps(folder: Path, rows: Sequence[JsonView], of_logs: bool = False) -> None:
     """Write ``steps.parquet`` of a rollout's folder; ``of_logs`` as for `TableSchema.arrow`."""
     write_table(folder / STEPS_NAME, rows, STEPS_TABLE.arrow(of_logs=of_logs))
 
@@ -180,7 +179,7 @@ def copy_steps(source: Path, folder: Path, renderer: str) -> None:
     write_parquet(folder / STEPS_NAME, table.set_column(index, "renderer", names))
 
 
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+def write_table(path: Path, rows: Sequence[JsonView], schema: pa.Schema) -> None:
     """Write rows as parquet atomically, in the order given."""
     write_parquet(path, pa.Table.from_pylist(rows, schema))
 
