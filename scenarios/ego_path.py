@@ -186,7 +186,7 @@ def _follow(road: Road, lane_id: str) -> list[str]:
     lanes = road.lane_map.lanes
     if lane_id not in lanes:
         raise InputError(
-            f"lane {lane_id!r}: the road's lanes are {', '.join(lanes)}",
+            f"lane {lane_id!r}: the road's lanes are {', '.join(sorted(lanes))}",
             "choose one of them",
         )
     out = [lane_id]

@@ -15,7 +15,7 @@ from alpasim_plugin.cli.options import (
     run_or_newest,
 )
 from alpasim_plugin.cli.output import Progress, show, warn
-from alpasim_plugin.cli.view import wanted_of
+from alpasim_plugin.cli.view import cells_wanted
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
@@ -138,10 +138,10 @@ def export_recording(
     refuse_existing(path, "--mcap", overwrite)
     require_mcap()  # before anything is read
     root, cell = run_and_cell(Path(items[0]))
-    wanted = wanted_of(root, cell, asked)
     if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
     run = read_so_far(root).run
+    wanted = cells_wanted(run.rollouts, cell, asked)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
     if len(cells) != 1:

@@ -86,7 +86,7 @@ def view(
         warn(f"note: the run is not finished: {done} of {so_far.planned} rollouts")
     if not so_far.run.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
-    wanted = wanted_of(so_far.run.rollouts, cell, asked)
+    wanted = cells_wanted(so_far.run.rollouts, cell, asked)
     page = out or root / PAGE
     made = write_page(so_far.run, page, wanted)
     facts = {
@@ -124,7 +124,7 @@ def _view_scenario(
     show(as_json, facts, *made["facts"], f"preview  {path}")
 
 
-def wanted_of(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wanted:
+def cells_wanted(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wanted:
     """Return which rollouts to show: of a run what was asked for, of a rollout those of its scene,
     policy and seed behind the renderers that were.
 

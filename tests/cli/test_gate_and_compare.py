@@ -235,6 +235,16 @@ def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert turned["diff"] == pytest.approx(-said["diff"])
 
 
+@pytest.mark.parametrize("verb", ["compare", "report"])
+def test_every_metric_is_printed_where_all_are_asked_for(runs, capsys, verb):
+    printed = []
+    for more in ([], ["--all"]):
+        assert run_command([verb, str(runs["good"]), *more]) == 0
+        printed.append(capsys.readouterr().out)
+    assert "plan_deviation" not in printed[0]
+    assert "plan_deviation" in printed[1]
+
+
 def _compare(capsys, *arguments: str):
     assert run_command(["compare", *arguments, "--json"]) == 0
     return json.loads(capsys.readouterr().out)["paired"]

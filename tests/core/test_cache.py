@@ -11,7 +11,7 @@ import textwrap
 import pytest
 
 from alpasim_plugin.core.cache import cached
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InputError
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +77,7 @@ def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_c
 def test_folder_that_cannot_be_written_names_the_variable(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(InfrastructureError, match="SIMRUN_CACHE"):
+    with pytest.raises(InputError, match="SIMRUN_CACHE"):
         cached("texts", "k", lambda folder: None, read, "a text")
 
 

@@ -75,6 +75,7 @@ def test_a_renderer_without_depth_cannot_be_put_into_fog():
     class Flat:
         lookahead = 0
         block = None
+        has_history = False
 
         def render(self, request):
             return Frame(request.t_us, request.camera.name, np.zeros((16, 32, 3), np.uint8))

@@ -105,7 +105,7 @@ def swap(old, new):
         (
             swap("road:", "log: {commonroad: a.xml}\nroad:"),
             ":1:1",
-            "exactly one of 'road' and 'log'",
+            "exactly one of 'road', 'log' and 'map'",
             "add road",
         ),
         (GOOD + "log: {}\n", ":8:1", "0 sources", "give one of argoverse"),
@@ -137,7 +137,7 @@ def swap(old, new):
         (GOOD + "scene_id: 'a b/c'\n", ":8:1", "scene_id = 'a b/c'", "match"),
         (GOOD + "seed: -1\n", ":8:1", "seed = -1", "greater than or equal to 0"),
         (GOOD + "seed: 1.5\n", ":8:1", "seed = 1.5", "integer"),
-        ("", ":1:1", "None", "object"),
+        ("", ":1:1", "empty", "object"),
         ("version: 1\nscenarios: [a.yaml]\n", ":2:1", "a suite, not a scenario", "load_suite"),
         ("just words\n", ":1:1", "'just words'", "object"),
     ],
@@ -154,7 +154,7 @@ def test_wrong_content_is_placed_and_explained(tmp_path, text, at, found, do):
     [
         (swap("s_m: 60", "s_m: 600"), ":6:5", "s_m = 600.0 is not on the road"),
         (swap("s_m: 60", "s_m: 60, lane: 3"), ":6:5", "1 forward and 1 oncoming lanes"),
-        (swap("s_m: 60", "s_m: 60, lane: nowhere"), ":6:5", "the road's lanes are s0_f0, s0_b0"),
+        (swap("s_m: 60", "s_m: 60, lane: nowhere"), ":6:5", "the road's lanes are s0_b0, s0_f0"),
         (swap("length_m: 200", "length_m: 85"), ":3:3", "the road is 85 m long"),
         (swap("road:\n", "ego: {lane: 1}\nroad:\n"), ":2:1", "no such forward lane"),
         (

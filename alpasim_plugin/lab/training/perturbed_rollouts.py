@@ -113,7 +113,7 @@ def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
             path = _joined(
                 *(lanes[name].centre for name in scenario.route.lane_ids[: i + 1]), after
             )
-            out.append((path, float(path.project(after[:1])[0][0])))
+            out.append((path, float(path.project(after[:1, :2])[0][0])))
     return out
 
 
