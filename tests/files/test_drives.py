@@ -178,6 +178,14 @@ def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path):
     assert any("wobble" in note for note in drive.notes)
 
 
+def test_masks_of_frames_are_noted_since_they_are_not_used(tmp_path):
+    folder = transforms(tmp_path, [f"{i}.png" for i in range(6)])
+    document = json.loads((folder / "transforms.json").read_text())
+    document["frames"][2]["mask_path"] = "masks/2.png"
+    (folder / "transforms.json").write_text(json.dumps(document))
+    assert any("mask_path" in note for note in read_source(folder, photographs=False).notes)
+
+
 def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"], ply_file_path="gone.ply")
     assert read_source(folder, photographs=False).points is None

@@ -62,9 +62,9 @@ COEFFICIENTS = {  # of each lens model, in the order of OpenCV
 # Keys of a file and of its frames that change nothing of what is read, or are read below.
 _KEYS = """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y cx cy
     camera_angle_x camera_angle_y x_fov y_fov k1 k2 k3 k4 k5 k6 p1 p2 file_path transform_matrix
-    t_us camera use exposure sky_path mask_path aabb_scale scale offset render_aabb up sharpness
+    t_us camera use exposure aabb_scale scale offset render_aabb up sharpness
     colmap_im_id applied_transform applied_scale orientation_override auto_scale_poses_override
-    train_filenames val_filenames test_filenames depth_file_path depth_unit_scale_factor
+    train_filenames val_filenames test_filenames depth_unit_scale_factor
     integer_depth_scale enable_depth_loading n_extra_learnable_dims white_transparent
     black_transparent"""
 KNOWN_KEYS = frozenset(_KEYS.split())
