@@ -36,6 +36,8 @@ def test_no_complaint_and_no_outside_request(browser, request, name, width, dark
     assert (
         browser.evaluate("document.documentElement.scrollWidth") <= width
     )  # tables scroll, the page does not
+    shown = "[...document.querySelectorAll('#table-overview td')].every(d => d.offsetWidth > 0)"
+    assert browser.evaluate(shown)
 
 
 def test_changed_outcomes_lead_to_their_frames(browser, usual_run):
