@@ -152,15 +152,19 @@ class Overview:
 
     @property
     def badge(self) -> tuple[str, Tone]:
-        """Give how many variants fail, and its colour."""
+        """Give how many variants fail and how many rollouts end early, and its colour."""
         if not self.rows:
             return "no rollouts", "unclear"
+        n_short = sum(row.endings.get(SHORT_OF_END, 0) for row in self.rows)
+        n_rollouts = sum(row.n_rollouts for row in self.rows)
         n, total = len(self.failing), plural(len(self.rows), "variant")
         if len(self.rows) == 1:
-            n, total = self.rows[0].n_failed, plural(self.rows[0].n_rollouts, "rollout")
-        if n == 0:
-            return f"no failure in {total}", "better"
-        return f"{n} of {total} fail{'s' if n == 1 else ''}", "worse"
+            n, total = self.rows[0].n_failed, plural(n_rollouts, "rollout")
+        tone: Tone = "worse" if n else "unclear" if n_short else "better"
+        text = f"{n} of {total} fail{'s' if n == 1 else ''}" if n else f"no failure in {total}"
+        if n_short:
+            text += f"; end not reached in {n_short} of {plural(n_rollouts, 'rollout')}"
+        return text, tone
 
     @property
     def title(self) -> str:

@@ -179,6 +179,16 @@ def test_tone_of_a_difference(entry, tone):
     assert tone_of(entry) == tone
 
 
+@pytest.mark.parametrize(("failed", "tone"), [({}, "unclear"), ({"off-road": 1}, "worse")])
+def test_the_headline_counts_rollouts_that_do_not_reach_the_end(three, failed, tone):
+    run = read_run(three)
+    entry = {"n_rollouts": 2, "outcomes": {}, "endings": {"end not reached": 2}}
+    table = {"clean/a": entry, "clean/b": entry | {"endings": entry["endings"] | failed}}
+    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"outcomes": table}))
+    assert shown.badge[1] == tone
+    assert f" 4 of {4 + len(failed)}\u00a0rollouts" in shown.badge[0]
+
+
 def test_identical_variants_are_called_better_or_worse_in_no_more_runs_than_one_question_allows(
     three,
 ):
