@@ -14,7 +14,7 @@ from alpasim_plugin.core.reading import parsing, real
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
-from alpasim_plugin.log.run_folder.schema import FILES, REPORTS, TABLES
+from alpasim_plugin.log.run_folder.schema import FILES, GATE_FILES, REPORTS, TABLES
 
 
 def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
@@ -38,7 +38,7 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     damage = [*inspect_files(root), *run.damage]
     tables = [one for one in damage if not one.cell and one.file in TABLES]
     for one in damage:
-        is_made_again = one in tables or one.file in (FILES, *REPORTS)
+        is_made_again = one in tables or one.file in (FILES, *REPORTS, *GATE_FILES)
         if not is_made_again and os.path.exists(root / one.path):
             raise InputError(f"{root}: {one}", again(info))
     if not tables:

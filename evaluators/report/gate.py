@@ -11,30 +11,37 @@ from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.log.run_folder.checksums import checksums_of
+from alpasim_plugin.log.run_folder.checksums import (
+    DIGEST,
+    check_seal,
+    checksums_of,
+    sealed,
+    state_files,
+)
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
+from alpasim_plugin.log.run_folder.schema import GATE_FILES, ROLLOUTS, WHY_NAME
 from evaluators.numbers import DASH, short
 from evaluators.opening import Run
 from evaluators.statistics.gate import GateVerdict
 from evaluators.statistics.verdicts import WORDS
 
-GATE_NAME = "gate.json"
 WORST = 5  # scenes of a check that are named
 TONES = {"pass": "better", "regression": "worse", "undecided": "unclear"}
 CAUSES_FIRST = ("regression", "undecided")
 
 
 def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
-    """Keep a verdict in the run folder, for its report, and return the file.
+    """Keep a verdict in the run folder, for its report, with digests of the gate's files, and
+    return the file.
 
     Args:
         run: The run that was judged.
         verdict: What `evaluators.statistics.gate.judge` gave.
         gate: Name or file of the gate.
     """
-    path = run.folder / GATE_NAME
-    write_json(path, {"of": _content(run), "gate": gate} | verdict.as_dict())
+    path = run.folder / GATE_FILES[0]
+    write_json(path, sealed({"of": _content(run), "gate": gate} | verdict.as_dict()))
+    state_files(run.folder, GATE_FILES)
     return path
 
 
@@ -62,14 +69,15 @@ def gate_section(run: Run) -> JsonObject | None:
     """Return what the report shows of the last gate that judged these rollouts; None without one.
 
     Raises:
-        InputError: gate.json is damaged.
+        InputError: gate.json is damaged, or not what a gate wrote.
     """
-    path = run.folder / GATE_NAME
+    path = run.folder / GATE_FILES[0]
     if not os.path.isfile(path):
         return None
     stored = read_json(path)
     if stored["of"] != _content(run):
         return None
+    check_seal({DIGEST: None} | stored, path, "Give simrun gate again.")
     pages = {
         rollout.cell: run.href(rollout, WHY_NAME) or run.href(rollout) for rollout in run.rollouts
     }

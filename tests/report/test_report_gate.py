@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import pyarrow.parquet as pq
+import pytest
 
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.run_folder.checksums import sealed, stated_files
 from evaluators.opening import read_run
 from evaluators.report import html
 from evaluators.report.ci import overview_md, write_gate_files
@@ -35,6 +39,14 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usu
     text = (root / "gate.md").read_text()
     assert section["worst"][0]["scene"] in text
     assert text.endswith(overview_md(overview_of(run), "###"))
+    assert {file.name for file in files} <= stated_files(root).keys()
+    stored = json.loads(files[2].read_text())
+    passed = stored["outcome"] | {"cause": "pass", "exit_code": 0}
+    del stored["sha256"]
+    for edited in (stored | {"outcome": passed}, sealed(stored) | {"outcome": passed}):
+        files[2].write_text(json.dumps(edited))
+        with pytest.raises(InputError):
+            gate_section(run)
     table = pq.read_table(root / "rollouts.parquet")
     pq.write_table(table.slice(0, table.num_rows - 1), root / "rollouts.parquet")
     assert gate_section(read_run(root)) is None
