@@ -318,7 +318,7 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     """Build one suite of checks in front of the run's own suite of rollouts.
 
     A check that is worse or over its limit is a failure of type ``regression``, one that is not
-    decided a failure of type ``undecided``, or skipped where it does not bind. How the drives ended
+    decided a failure of type ``undecided``; one that does not bind is skipped. How the drives ended
     is said of them and fails nothing here: the gate's checks are the verdict.
     """
     root = junit(run, outcomes_fail=False)
@@ -330,9 +330,11 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
             "name": clean(f"{check.metric} {check.kind}"),
         }
         case = ET.SubElement(suite, "testcase", names)
-        facts = {key: str(check.entry[key]) for key in CHECK_FACTS if key in check.entry}
+        facts = {
+            key: str(check.entry[key]) for key in CHECK_FACTS if check.entry.get(key) is not None
+        }
         _properties(case, facts)
-        if check.cause == "undecided" and not check.binding:
+        if check.cause != "pass" and not check.binding:
             ET.SubElement(case, "skipped", {"message": clean(check.text)})
             counts["skipped"] += 1
         elif check.cause != "pass":
