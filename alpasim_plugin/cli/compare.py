@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import Json, run_or_newest
-from alpasim_plugin.cli.output import first_screen, show, warn
+from alpasim_plugin.cli.output import first_screen, show, terminal_width, warn
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.reading import some_of
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.numbers import plural
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.report.terminal import metric_lines
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
+from evaluators.statistics.outcomes import LISTED, outcome_table
+from evaluators.statistics.summary import CUT_RULES
 
 EPILOG = """
 Examples:
@@ -36,6 +42,7 @@ Examples:
 - `simrun compare runs/night-1 runs/night-2 runs/night-3`: the shards of one run, as of one
 """
 EVERY_MISSING = 10**9
+INDENT = " " * 6  # of what does not fit on a line
 SHOWN = 10  # lines about missing pairs
 
 
@@ -81,7 +88,8 @@ def compare(
         info["scenes"] = {
             name: facts for run in opened for name, facts in run.info["scenes"].items()
         }
-        shown = replace(opened[0], summary=joined, rollouts=whole, info=info)
+        summary = joined | _endings(opened, whole, joined["metrics"])
+        shown = replace(opened[0], summary=summary, rollouts=whole, info=info)
     else:
         result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
         means = dict(opened[0].summary)
@@ -104,29 +112,55 @@ def compare(
             causes = ", ".join(f"{name} {count}" for name, count in failures["by_class"].items())
             number = f"{failures['n_failed']} of {failures['n_rollouts']}"
             lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
-    lines += [f"note: {note}" for note in result.notes]
+    said = [f"note: {note}" for note in result.notes]
     for tables in (result.paired, result.with_base, result.policies):
         for variant, entries in tables.items():
             baseline = next((entry["baseline"] for entry in entries.values()), "nothing")
-            lines += ["", f"{variant} minus {baseline}"]
+            said += ["", f"{variant} minus {baseline}"]
             rows = [
                 row
                 for row in pair_rows({"paired": {variant: entries}}, result.metrics)
                 if entries[row.metric]["n_cells"]
                 and (every or row.metric in result.metrics.headline)
             ]
-            lines += _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
+            said += _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
             missing = _missing(entries, len(entries) if every else SHOWN)
-            lines += missing if every else missing[:SHOWN]
+            said += missing if every else missing[:SHOWN]
             if len(missing) > SHOWN and not every:
-                lines.append(f"  {len(missing) - SHOWN} more lines: --all")
+                said.append(f"  {len(missing) - SHOWN} more lines: --all")
+    width = terminal_width()
+    for line in said:
+        lines += wrap(line, width, subsequent_indent=INDENT, break_on_hyphens=False) or [""]
     show(as_json, facts, *lines)
+
+
+def _endings(
+    runs: Sequence[Run], rollouts: Sequence[Rollout], keys: Collection[str]
+) -> dict[str, Any]:
+    """Return how the rollouts of some runs ended, with the times of their events, and how many of
+    their steps were cut; ``keys`` are those of the joined summary.
+    """
+    tables = [run.summary.get("outcomes") or outcome_table(run.rollouts) for run in runs]
+    outcomes = outcome_table(rollouts)
+    for variant, entry in outcomes.items():
+        for name, facts in entry["outcomes"].items():
+            parts = [table[variant]["outcomes"] for table in tables if variant in table]
+            cells = [cell for part in parts if name in part for cell in part[name]["cells"]]
+            facts["cells"] = cells[:LISTED]
+    cut: dict[str, Counter[str]] = {}
+    for run in runs:
+        for renderer, entry in (run.summary.get("censoring") or {}).items():
+            key = renderer if renderer in keys else cell_name(renderer, run.policies[0])
+            cut.setdefault(key, Counter()).update(
+                {rule: entry.get(rule) or 0 for rule in CUT_RULES}
+            )
+    return {"outcomes": outcomes, "censoring": cut}
 
 
 def _table(
     rows: Sequence[PairRow], entries: Mapping[str, JsonView], known: MetricTable
 ) -> list[str]:
-    """Return one line per metric; lines are not wrapped."""
+    """Return one line per metric."""
     lines = [("metric", "difference", "p", "these scenes", "95 %", "margin", "pairs", "others")]
     for row in rows:
         entry = entries[row.metric]
@@ -141,7 +175,8 @@ def _table(
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     texts = []
     for line in lines:
-        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
+        whole = [cell.replace(" ", "\u00a0") for cell in line]
+        cells = [cell.ljust(width) for cell, width in zip(whole, widths, strict=True)]
         texts.append("  " + "  ".join(cells).rstrip())
     return texts
 

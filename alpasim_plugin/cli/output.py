@@ -68,7 +68,12 @@ def first_screen(run: Run) -> list[Any]:
     from evaluators.report.overview import overview_of
     from evaluators.report.terminal import overview_lines
 
-    return list(overview_lines(overview_of(run), Console().width))
+    return list(overview_lines(overview_of(run), terminal_width()))
+
+
+def terminal_width() -> int:
+    """Return how many letters fit on a line of standard output, 80 where it is no terminal."""
+    return Console().width
 
 
 class Progress(progress.Progress):
