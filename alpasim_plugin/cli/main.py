@@ -309,10 +309,11 @@ def _run(args: list[str]) -> int:
         return leaving.exit_code if args else InputError.exit_code
     except typer.TyperException as error:
         message = error.format_message()
-        if hasattr(error.__cause__, "errors"):  # of pydantic, which Typer asks
+        errors = getattr(error.__cause__, "errors", None)  # of pydantic, which Typer asks
+        if errors is not None:
             from alpasim_plugin.core.reading.files import wanted_of
 
-            problem = error.__cause__.errors()[0]
+            problem = errors()[0]
             found = f"{problem['input']!r}, wanted {wanted_of(problem)}"
             if problem["type"] == "value_error":  # a choice, whose error says all of it
                 found = str(problem["ctx"]["error"])
