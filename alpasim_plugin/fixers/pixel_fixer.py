@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -234,9 +235,11 @@ class PixelFixer(Fixer):
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
         visible = slice(None), slice(height), slice(width)
         output = after.output[visible]
-        images = _grey_levels(output).cpu().numpy()
-        measured = guard.measures(video[visible]).cpu().numpy()
-        sums = trust_sums(output, after.render[visible], after.recorded[visible]).cpu().numpy()
+        images, measured, sums = download(
+            _grey_levels(output),
+            guard.measures(video[visible]),
+            trust_sums(output, after.render[visible], after.recorded[visible]),
+        )
         fixed = []
         for b, past in enumerate(pasts):
             before = None if past is None else (past.fixed, past.raw)
@@ -261,6 +264,16 @@ def _grey_levels(images: Tensor) -> Tensor:
     """Convert images in [-1, 1] to bytes, rounded to nearest; what is no number becomes black."""
     levels = (images * HALF).add_(HALF).round_().clamp_(0, 255)
     return levels.nan_to_num_(0.0).to(torch.uint8)
+
+
+def download(*parts: Tensor) -> list[Any]:
+    """Return tensors as arrays, brought to the host in one copy: each copy waits for the device."""
+    data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
+    pieces = torch.split(data.cpu(), [part.nbytes for part in parts])
+    return [
+        piece.clone().view(part.dtype).view(part.shape).numpy()
+        for piece, part in zip(pieces, parts, strict=True)
+    ]
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:
