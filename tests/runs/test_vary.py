@@ -29,6 +29,7 @@ def searched(tmp_path_factory):
     return root, drive(root, *GAP)
 
 
+@pytest.mark.slow
 def test_the_boundary_of_a_gap_is_found_with_few_rollouts(searched):
     root, found = searched
     facts = found["variants"]["clean/pure-pursuit"]
@@ -40,6 +41,7 @@ def test_the_boundary_of_a_gap_is_found_with_few_rollouts(searched):
         assert "fails below" in (root / name).read_text()
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_continues_to_the_same_boundary(searched, tmp_path, capsys):
     root = shutil.copytree(searched[0], tmp_path / "again")
     (root / SUMMARY).unlink()
