@@ -98,8 +98,8 @@ class Signal:
         found = []
         for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
             share = float(beyond[k] / (beyond[k] - beyond[k + 1]))
-            aside = (line[k, :2] + share * (line[k + 1, :2] - line[k, :2]) - start[:2]) @ along
-            if 0.0 <= aside <= along @ along and abs(line[k, 2] - start[2]) <= LEVEL_M:
+            projection = (line[k, :2] + share * (line[k + 1, :2] - line[k, :2]) - start[:2]) @ along
+            if 0.0 <= projection <= along @ along and abs(line[k, 2] - start[2]) <= LEVEL_M:
                 found.append((k, share))
         return found
 

@@ -80,7 +80,7 @@ def read_kitti(folder: Path) -> SourceDrive:
         if os.path.isdir(folder / name)
     }
     if right not in files:
-        notes.append(f"no {right}: no second camera to judge the fit by")
+        notes.append(f"no {right}: no second camera to measure the fit with")
     times = _times(folder, len(poses))
     for name, rows in _rows_of_poses(folder, files, len(poses)).items():
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")

@@ -8,6 +8,7 @@ a mode, which the package that holds it registers in the entry-point group ``sim
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -160,9 +161,9 @@ class FixedRenderer(Renderer):
         """Render one frame; see ``render_batch``."""
         return self.render_batch([request])[0]
 
+    @abstractmethod
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Return the frames of the requests, in their order."""
-        raise NotImplementedError
 
 
 class PerFrameRenderer(FixedRenderer):

@@ -32,11 +32,11 @@ LONGEST_S = 30.0  # a longer log gets the points and steps of so many seconds
 REFUSED_S = 120.0  # of a longer log next to nothing would be left
 FEWEST_VIEWS, MOST_VIEWS = 12, 180  # the latter by camera
 ACTOR_POINTS = 400  # by camera
-# A camera that looks along the road sees a surface for seconds, one that looks aside for less than
+# A camera that looks ahead sees a surface for seconds, one that looks to the side for less than
 # one: with several, start points come from every second instant, and each view is learned from twice
 # as often.
-INSTANTS_ALONG, INSTANTS_ASIDE = 6, 2
-STEPS_ASIDE = 2.0
+INSTANTS_ONE_CAMERA, INSTANTS_RIG = 6, 2
+STEPS_RIG = 2.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ReconstructionRecipe:
     splat: SplatRecipe
     lateral_offset_m: float
     fit_actors: bool
-    depth_every: int = INSTANTS_ALONG
+    depth_every: int = INSTANTS_ONE_CAMERA
     range_error: float = 0.1
     size: float = 0.6
     opacity: float = 0.2
@@ -83,10 +83,10 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
             "say reconstruction or cycle",
         )
     cameras = max(1, len(scenario.cameras))
-    aside = cameras > 1
+    is_rig = cameras > 1
     log_s = (scenario.ego_log.t_us[-1] - scenario.ego_log.t_us[0]) * 1e-6
     watched_s = cameras * min(LONGEST_S, log_s)
-    steps = amount.share * FULL_STEPS_PER_S * watched_s * (STEPS_ASIDE if aside else 1.0)
+    steps = amount.share * FULL_STEPS_PER_S * watched_s * (STEPS_RIG if is_rig else 1.0)
     views = min(MOST_VIEWS * cameras, round(amount.views_per_s * log_s * cameras))
     points = max(POINTS_PER_S, round(POINTS_PER_S * watched_s))
     splat = SplatRecipe(
@@ -111,7 +111,7 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
         splat,
         lateral_offset_m,
         on_path,
-        depth_every=INSTANTS_ASIDE if aside else INSTANTS_ALONG,
+        depth_every=INSTANTS_RIG if is_rig else INSTANTS_ONE_CAMERA,
         range_error=amount.depth_error,
         pose_error_m=amount.pose_error_m,
     )

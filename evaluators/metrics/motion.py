@@ -66,7 +66,7 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     """
     to = tracks.xy - ego.centre
     along = to[..., 0] * ego.heading[:, 0] + to[..., 1] * ego.heading[:, 1]
-    aside = np.abs(to[..., 1] * ego.heading[:, 0] - to[..., 0] * ego.heading[:, 1])
+    lateral = np.abs(to[..., 1] * ego.heading[:, 0] - to[..., 0] * ego.heading[:, 1])
     c, s = np.abs(np.cos(tracks.yaw - ego.yaw)), np.abs(np.sin(tracks.yaw - ego.yaw))
     length, width = (tracks.size[:, [d]] / 2 for d in (0, 1))
     gap_m = along - ego.size[0] / 2 - (length * c + width * s)
@@ -76,7 +76,7 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     margin_m = gap_m - safe_distance_m(
         np.broadcast_to(np.maximum(ego.velocity[:, 0], 0.0), gap_m.shape), ahead_mps
     )
-    counts = tracks.there & (along > 0) & (aside < ego.size[1] / 2 + length * s + width * c)
+    counts = tracks.there & (along > 0) & (lateral < ego.size[1] / 2 + length * s + width * c)
     return np.asarray(np.where(counts, margin_m, np.inf).min(axis=0, initial=np.inf))
 
 
