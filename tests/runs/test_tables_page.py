@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
 from tests.report.make_run import Plan, make_run
 
@@ -72,15 +71,3 @@ def test_paired_differences_are_those_of_the_summary(repo, run):
     assert [row["worse_by_m"] for row in found.values()] == sorted(
         (row["worse_by_m"] for row in found.values()), reverse=True
     )
-
-
-def test_the_farthest_instant_is_that_of_the_series(repo, run):
-    series = series_by_cell(run.steps(["lateral_bias_m"]))
-    found = rows(repo, 2)
-    assert len(found) == min(10, len(series))
-    for row in found:
-        t_us, value = series[row["renderer"], "lane-camera", row["scene"], row["seed"]][
-            "lateral_bias_m"
-        ]
-        at = abs(value).argmax()
-        assert (row["most_m"], row["at_s"]) == pytest.approx((abs(value[at]), 1e-6 * t_us[at]))
