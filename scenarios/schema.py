@@ -38,10 +38,8 @@ DEGRADATION_KEYS = {
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
 
-    at_m: float = within(
-        b.DISTANCE_M, "Start of the change, metres along the ego's path from where it starts."
-    )
-    to_lane: int = within(b.LANE_INDEX, "Target forward lane; 0 is next to the centre line.")
+    at_m: float = within(b.DISTANCE_M, "Start of the change, along the ego's path.")
+    to_lane: int = within(b.LANE_INDEX, "Target lane.")
     length_m: float = within(b.SEGMENT_M, "Length of the change along the road.", 60.0)
 
 
@@ -50,10 +48,10 @@ class EgoSpec(Part):
     slows down for bends.
     """
 
-    lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line.", 0)
+    lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0: at the centre line.", 0)
     start_m: float = within(
         b.DISTANCE_M,
-        "Distance of the rear axle from the road's beginning at the log's start.",
+        "Rear axle from the road's beginning.",
         20.0,
     )
     speed_mps: float = within(b.SPEED_MPS, "Speed at the log's start.", 10.0)
@@ -142,14 +140,14 @@ class CameraModel(Part):
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
     shutter_us: int = within(
         b.SHUTTER_US,
-        "Rolling shutter: from the first row's exposure to the last one's; 0: all at once.",
+        "From the first row's exposure to the last one's.",
         0,
     )
     interval_us: int = Field(
         default=0,
         ge=0,
         le=int(b.PERIOD_US.high),
-        description="Time between frames, a multiple of rates.control_us; 0: rates.camera_us.",
+        description="Between frames, a multiple of rates.control_us; 0: rates.camera_us.",
     )
 
     @model_validator(mode="after")
@@ -216,29 +214,25 @@ class RatesSpec(Part):
 class TimingSpec(Part):
     """Which part of the log is driven."""
 
-    start_us: int = within(
-        b.TIME_US, "First frame, after the log's first pose; the log before it is context.", 500_000
-    )
+    start_us: int = within(b.TIME_US, "First frame, after the log's first pose.", 500_000)
     duration_us: int | None = Field(
         default=None,
         gt=0,
         le=b.TIME_US.high,
-        description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log or of a map's route.",
+        description="From the first frame; none: 8 s on a built road, else to the end of the log or route.",
     )
-    warmup_us: int = within(
-        b.TIME_US, "The log is forced for so long after the first frame.", 500_000
-    )
+    warmup_us: int = within(b.TIME_US, "How long the log is forced from then.", 500_000)
     stop_at_path_end: bool = Field(
         default=True,
-        description="A rollout ends where the recorded path ends, unless the recorded car stands there.",
+        description="End where the recorded path ends, unless the recorded car stands there.",
     )
     timeline: Literal["scenario", "alpasim"] = Field(
         default="scenario",
-        description="alpasim: start at the recording's first camera frame, where it has any, and force 1.7 s, whatever the keys above say.",
+        description="alpasim: start at the recording's first camera frame and force 1.7 s.",
     )
     start_time_offset_us: int = within(
         b.TIME_US,
-        "With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55).",
+        "With timeline alpasim: skipped at the start.",
         0,
     )
 
@@ -252,7 +246,7 @@ class LatencySpec(Part):
     fixed_us: int = within(b.TIME_US, "Delay where kind is fixed.", 0)
     fixer: bool = Field(
         default=False,
-        description="Where kind is measured: the policy also waits for the fixer of its frames.",
+        description="With kind measured: the policy also waits for the fixer.",
     )
 
     @model_validator(mode="after")
@@ -269,37 +263,37 @@ class DegradationSpec(Part):
 
     kind: Literal["reconstruction", "cycle", "none"] = Field(
         default="reconstruction",
-        description="A model fitted to the logged drive and stopped early; one fitted to views beside it; none.",
+        description="A model stopped early; one fitted to views to the left of the path; none.",
     )
     share: float = Field(
         default=0.15,
         gt=0,
         le=1,
-        description="Reconstruction and cycle: share of the fit's whole schedule.",
+        description="Share of the fit's whole schedule.",
     )
     shift_m: float = Field(
         default=1.0,
         ge=-10,
         le=10,
-        description="Cycle: how far to the left the views lie that the model is fitted to.",
+        description="Cycle: how far to the left the views lie.",
     )
     views_per_s: float = Field(
         default=6.0,
         gt=0,
         le=30,
-        description="Reconstruction and cycle: views per second of log that are fitted.",
+        description="Views per second of log that are fitted.",
     )
     depth_error: float = Field(
         default=0.1,
         ge=0,
         le=0.5,
-        description="Reconstruction and cycle: spread of the first points' depth, share.",
+        description="Spread of the first points' depth, share.",
     )
     pose_error_m: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Reconstruction and cycle: spread of the poses of these views.",
+        description="Spread of the poses of these views.",
     )
 
     @model_validator(mode="after")
@@ -326,7 +320,7 @@ class BackgroundSpec(Part):
     )
     keep_road: bool = Field(
         default=False,
-        description="Draw the built road with the file; otherwise the file replaces road and houses.",
+        description="Draw the built road too.",
     )
 
 
@@ -336,9 +330,7 @@ class VehicleSpec(Part):
     length_m: float = within(b.VEHICLE_M, "Body length.", 4.855)
     width_m: float = within(b.VEHICLE_M, "Body width.", 1.88)
     height_m: float = within(b.VEHICLE_M, "Body height.", 1.6)
-    rear_axle_to_centre_m: float = within(
-        b.AXLE_M, "From the rear axle forwards to the body's middle.", 1.4
-    )
+    rear_axle_to_centre_m: float = within(b.AXLE_M, "From the rear axle to the body's middle.", 1.4)
     wheelbase_m: float = within(b.VEHICLE_M, "Distance between the axles.", 2.85)
     max_steer_rad: float = Field(
         default=0.6,
@@ -413,7 +405,7 @@ class ScenarioSpec(Part):
         default=0,
         ge=0,
         le=int(b.SEED.high),
-        description="Scene seed; 0: the numbers are used as written, others jitter them.",
+        description="Scene seed; 0: as written, others jitter the numbers.",
     )
     road: RoadSpec | None = Field(
         default=None, description="A road to build; give this, log or map."
@@ -452,7 +444,7 @@ class ScenarioSpec(Part):
         default=None, description="The ego vehicle; none: the log's own, or the default one."
     )
     jitter: JitterSpec = Field(
-        default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file."
+        default=JitterSpec(), description="How other scene seeds than 0 differ."
     )
     variations: dict[str, RangeSpec | ChoiceSpec] = Field(
         default={},
@@ -460,7 +452,7 @@ class ScenarioSpec(Part):
     )
     samples: tuple[dict[str, Any], ...] = Field(
         default=(),
-        description="Explicit samples, each dotted key to value; the scene seed picks one, cyclically.",
+        description="Each dotted key to value; the scene seed picks one, cyclically.",
     )
 
     @property

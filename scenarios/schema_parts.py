@@ -92,7 +92,7 @@ class IntersectionSegment(Part):
         default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry."
     )
     cross_lanes: int = Field(
-        default=1, ge=1, le=4, description="Lanes per direction on the arms beside the road."
+        default=1, ge=1, le=4, description="Lanes per direction on the other arms."
     )
     arm_length_m: float = Field(
         default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms."
@@ -110,9 +110,7 @@ class NarrowGapSegment(Part):
     """A straight on which parked cars on both sides leave a narrow gap for the ego."""
 
     kind: Literal["narrow_gap"]
-    length_m: float = within(
-        b.SEGMENT_M, "Length of the straight; the cars stand in its middle half.", 40.0
-    )
+    length_m: float = within(b.SEGMENT_M, "Length; the cars stand in its middle half.", 40.0)
     gap_m: float = Field(
         default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars."
     )
@@ -120,7 +118,7 @@ class NarrowGapSegment(Part):
         default=0.0,
         ge=-3,
         le=3,
-        description="The gap's middle, metres left of the ego lane's middle.",
+        description="The gap's middle, left of the ego lane's.",
     )
     cars_left: int = Field(default=2, ge=0, le=8, description="Parked cars on the left.")
     cars_right: int = Field(default=2, ge=0, le=8, description="Parked cars on the right.")
@@ -164,14 +162,12 @@ class RoadSpec(Part):
         le=30,
         description="Raised median between the directions; 0: markings only.",
     )
-    shoulder_m: float = Field(
-        default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes."
-    )
+    shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the lanes.")
     parking_m: float = Field(
         default=0.0,
         ge=0,
         le=6,
-        description="Parking strip outside the outer lanes, instead of the shoulder.",
+        description="Parking strip, instead of the shoulder.",
     )
     speed_limit_mps: float | None = within(b.LIMIT_MPS, "Speed limit of all lanes.", None)
     centre_paint: CentrePaint = Field(
@@ -208,7 +204,7 @@ class LogSpec(Part):
     )
     ego: int | str | None = Field(
         default=None,
-        description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.",
+        description="CommonRoad: the vehicle that becomes the ego.",
     )
     actors: Literal["replay", "idm", "none"] = Field(
         default="replay", description="Replay the recorded traffic, let it react, or drop it."
@@ -274,10 +270,10 @@ class _Actor(Part):
 class _InLane(_Actor):
     lane: int | str = Field(
         default=0,
-        description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id.",
+        description="Forward lane (0: at the centre line), oncoming lane (-1), or a lane id.",
     )
     s_m: float = within(
-        b.STATION_M, "Centre, along the road from the ego's start (lane id: that lane's beginning)."
+        b.STATION_M, "Centre, along the road from the ego's start (lane id: of that lane)."
     )
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
@@ -286,10 +282,10 @@ class ParkedActor(_Actor):
     """A standing vehicle, or a row of them, beside the outer lane."""
 
     kind: Literal["parked"]
-    s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start.")
+    s_m: float = within(b.STATION_M, "Centre, along the road from the ego's start.")
     side: Literal["left", "right"] = Field(default="right", description="Side of the road.")
     clearance_m: float = within(
-        b.OFFSET_M, "From the outer lane's edge to the body; negative: it stands in the lane.", 0.3
+        b.OFFSET_M, "From the outer lane's edge; negative: it stands in the lane.", 0.3
     )
     count: int = Field(default=1, ge=1, le=40, description="Vehicles in the row.")
     spacing_m: float = within(b.SPACING_M, "Distance between their centres.", 7.0)
@@ -305,7 +301,7 @@ class LoggedActor(_Actor):
     points: tuple[tuple[Moment, Coordinate, Coordinate, Angle], ...] = Field(
         min_length=1,
         max_length=int(b.POINTS.high),
-        description="Rows of time in seconds after the log's start, x, y in metres (world), yaw in radians.",
+        description="Rows of time in seconds, x, y (world), yaw in radians.",
     )
 
     @model_validator(mode="after")
@@ -341,7 +337,7 @@ class DriveActor(_InLane):
     speeds: tuple[tuple[Annotated[float, Field(ge=0, le=b.MOMENT_S.high)], Speed], ...] = Field(
         min_length=1,
         max_length=int(b.POINTS.high),
-        description="Rows of time in seconds after the log's start and speed in m/s; linear in between.",
+        description="Rows of time in seconds and speed; linear in between.",
     )
 
     @model_validator(mode="after")
@@ -358,10 +354,8 @@ class OncomingActor(_Actor):
     """A vehicle that comes the other way at a constant speed."""
 
     kind: Literal["oncoming"]
-    lane: int = within(b.LANE_INDEX, "Oncoming lane; 0 is next to the centre line.", 0)
-    s_m: float = within(
-        b.STATION_M, "Centre at the start, metres along the ego's path from the ego's start."
-    )
+    lane: int = within(b.LANE_INDEX, "Oncoming lane; 0: at the centre line.", 0)
+    s_m: float = within(b.STATION_M, "Centre at the start, along the ego's path.")
     speed_mps: float = within(b.SPEED_MPS, "Speed.")
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
@@ -371,7 +365,7 @@ class HardBrakeActor(_InLane):
 
     kind: Literal["hard_brake"]
     speed_mps: float = within(b.CRUISE_MPS, "Speed before braking.")
-    brake_at_us: int = within(b.TIME_US, "Start of braking after the log's start.")
+    brake_at_us: int = within(b.TIME_US, "Start of braking.")
     decel_mps2: float = Field(default=6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
     end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
 
@@ -388,15 +382,11 @@ class CutInActor(_Actor):
     """A vehicle that changes into another lane with a quintic lateral motion."""
 
     kind: Literal["cut_in"]
-    from_lane: int = within(
-        b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line."
-    )
+    from_lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0: at the centre line.")
     to_lane: int = within(b.LANE_INDEX, "Forward lane afterwards.")
-    s_m: float = within(
-        b.STATION_M, "Centre at the start, metres along the road from the ego's start."
-    )
+    s_m: float = within(b.STATION_M, "Centre at the start.")
     speed_mps: float = within(b.CRUISE_MPS, "Speed.")
-    at_us: int = within(b.TIME_US, "Start of the lateral motion after the log's start.")
+    at_us: int = within(b.TIME_US, "Start of the lateral motion.")
     change_us: int = Field(
         default=2_500_000,
         ge=b.PERIOD_US.low,
@@ -404,9 +394,7 @@ class CutInActor(_Actor):
         description="Duration of the lateral motion.",
     )
     end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
-    decel_mps2: float = within(
-        b.ACCEL_MPS2, "How fast the speed changes after the lateral motion has begun.", 2.0
-    )
+    decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes then.", 2.0)
 
     @model_validator(mode="after")
     def _two_lanes(self) -> CutInActor:
@@ -422,9 +410,7 @@ class CrossingActor(_Actor):
 
     kind: Literal["crossing_pedestrian"]
     label: Label = Field(default="pedestrian", description="Class of road user.")
-    s_m: float = within(
-        b.STATION_M, "Place of crossing, metres along the road from the ego's start."
-    )
+    s_m: float = within(b.STATION_M, "Place of crossing.")
     side: Literal["left", "right"] = Field(
         default="right", description="Side that the crossing starts from."
     )
@@ -433,10 +419,10 @@ class CrossingActor(_Actor):
         default=1.0,
         ge=-b.TIME_US.high * 1e-6,
         le=b.TIME_US.high * 1e-6,
-        description="How long before the ego would be there, undisturbed, the middle of the ego's lane is reached.",
+        description="Reaches the middle of the ego's lane so long before the ego would, undisturbed.",
     )
     margin_m: float = within(
-        b.GAP_M, "Distance behind the road edge at which the walk starts and ends.", 1.0
+        b.GAP_M, "How far behind the road's edges the walk starts and ends.", 1.0
     )
 
 

@@ -56,7 +56,8 @@ def verb_section(name: str, command: Any) -> str:
             if is_argument
             else [*option.opts, *option.secondary_opts]
         )
-        if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB):
+        is_newest = option.help == "A run folder; by default the newest."  # said once, above
+        if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB) or is_newest:
             continue
         shown = ", ".join(f"`{name}`" for name in names)
         again = " Repeatable."
@@ -121,11 +122,12 @@ def key_row(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
     """Return a key's name, type with bounds, default and meaning."""
     bounds = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS
               if getattr(item, sign, None) is not None}  # fmt: skip
-    kind = ", ".join(
-        [type_name(field.annotation), *(f"{SIGNS[sign]} {end}" for sign, end in bounds.items())]
-    )
+    limits = [f"{SIGNS[sign]} {end}" for sign, end in bounds.items()]
     if {"ge", "le"} <= bounds.keys():
-        kind = f"{type_name(field.annotation)}, {bounds['ge']}..{bounds['le']}"
+        limits = [f"{bounds['ge']}..{bounds['le']}"]
+    kind = type_name(field.annotation)
+    if limits:  # a range is one of numbers, where nothing else is said
+        kind = ", ".join([kind, *limits]).removeprefix("number, ")
     value = field.default
     default = f"`{str(value).lower() if isinstance(value, bool) else value}`"
     if value is PydanticUndefined or value is None or isinstance(value, Part) or value in ("", {}):
