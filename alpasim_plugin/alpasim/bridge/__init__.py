@@ -1,7 +1,4 @@
-"""Sources of ``alpasim-onefixer-bridge``: what AlpaSim's own environment needs of this project,
-without torch, numba or PyAV.
+"""Sources of ``alpasim-onefixer-bridge``: Hydra presets for AlpaSim's own environment.
 
-The distribution is put together by `build.py`, under the name ``alpasim_onefixer_bridge``: the wire
-messages, Hydra presets, a client, and ``onefixer-bridge``, which asks a renderer service what it
-is. Nothing here imports the rest of the project.
+The distribution is put together by `build.py`. Nothing here imports the rest of the project.
 """

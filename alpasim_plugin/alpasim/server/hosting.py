@@ -27,10 +27,9 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.reading import read_bytes, read_text
 from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.log.wire.services import OPTIONS, V1ALPHA, Reflection, handlers
+from alpasim_plugin.log.wire.services import OPTIONS, handlers
 
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
-LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
@@ -286,7 +285,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     Args:
         token: None: no token is asked for.
-        workers: Calls that are worked on; health and reflection do not count.
+        workers: Calls that are worked on; health does not count.
     """
 
     def __init__(self, token: str | None, workers: int) -> None:
@@ -302,7 +301,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         ):
             return self._refusal
         handler = continuation(details)
-        if handler is None or details.method.startswith(LIGHT_CALLS):
+        if handler is None or details.method.startswith(OPEN_CALLS):
             return handler
         return grpc.unary_unary_rpc_method_handler(
             partial(self._answer, handler.unary_unary),
@@ -368,9 +367,7 @@ class Host:
             interceptors=(Gate(read_token(policy.token_file), workers),),
         )
         made = [handlers(name, service) for name, service in services.items()]
-        self._server.add_generic_rpc_handlers(
-            (*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers())
-        )
+        self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health)))
         host, _, port = listen.rpartition(":")
         is_socket = listen.startswith("unix:")
         credentials = policy.credentials()

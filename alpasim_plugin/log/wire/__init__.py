@@ -16,7 +16,6 @@ from .protos import (
     health_pb2,
     logging_pb2,
     physics_pb2,
-    reflection_pb2,
     runtime_pb2,
     sensorsim_pb2,
     traffic_pb2,
@@ -31,7 +30,6 @@ MODULES = (
     health_pb2,
     logging_pb2,
     physics_pb2,
-    reflection_pb2,
     runtime_pb2,
     sensorsim_pb2,
     traffic_pb2,
@@ -49,7 +47,6 @@ SERVICE_PATHS = {
     "RuntimeService": "/RuntimeService/",
     "WorldModelService": "/omnidreams.video_model.WorldModelService/",
     "Health": "/grpc.health.v1.Health/",
-    "ServerReflection": "/grpc.reflection.v1.ServerReflection/",
 }
 
 #: Version of AlpaSim's wire interface that these messages speak: what `common.VersionId` reports.
@@ -77,7 +74,6 @@ __all__ = [
     "health_pb2",
     "logging_pb2",
     "physics_pb2",
-    "reflection_pb2",
     "runtime_pb2",
     "sensorsim_pb2",
     "traffic_pb2",
