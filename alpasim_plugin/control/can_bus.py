@@ -13,13 +13,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
-from urllib.parse import parse_qs
 
 import can
 import numpy as np
 
 from alpasim_plugin.control.can_codec import BadFrame, Codec, FrameId, Received
 from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.queries import options_of
 
 HOLD_US = 200_000  # how long the last command stands in for a missing one
 RAMP_MPS3, STOP_MPS2 = 2.0, -3.0  # then the brake grows at this rate up to this deceleration
@@ -34,9 +34,9 @@ class Address:
 
     interface: str
     channel: str
-    map: str = "example"
-    dbc: str | None = None
-    timeout_s: float = 0.1
+    map: str
+    dbc: str | None
+    timeout_s: float
 
     @classmethod
     def parse(cls, text: str) -> Address:
@@ -50,33 +50,18 @@ class Address:
             InputError: No channel, an unknown option, or a bad number.
         """
         place, _, query = text.partition("?")
+        options = options_of(query, ("map", "dbc", "timeout_ms"), f"can://{text}")
         interface, colon, channel = place.partition(":")
         if not colon or interface not in INTERFACES:
             interface, channel = "virtual", place
-        options = {
-            key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()
-        }
-        timeout = options.pop("timeout_ms", "100")
-        unknown = sorted(set(options) - {"map", "dbc"})
-        if not channel or unknown or not timeout.isdigit() or not 0 < int(timeout) <= 10_000:
-            found = (
-                f"option {unknown[0]!r}"
-                if unknown
-                else "no channel"
-                if not channel
-                else f"timeout_ms = {timeout!r}"
-            )
+        timeout = options.get("timeout_ms", "100")
+        if not channel or not timeout.isdigit() or not 0 < int(timeout) <= 10_000:
             raise InputError(
-                f"can://{text}: {found}",
-                f"write can://[{'|'.join(INTERFACES)}:]CHANNEL[?map=NAME&dbc=FILE&timeout_ms=1..10000]",
+                f"can://{text}: no channel, or a timeout_ms that is no number from 1 to 10000",
+                f"write can://[{'|'.join(INTERFACES)}:]CHANNEL[?map=NAME&dbc=FILE&timeout_ms=N]",
             )
-        return cls(
-            interface,
-            channel,
-            options.get("map", "example"),
-            options.get("dbc"),
-            int(timeout) / 1000,
-        )
+        name = options.get("map", "example")
+        return cls(interface, channel, name, options.get("dbc"), int(timeout) / 1000)
 
 
 def open_bus(address: Address, codec: Codec | None = None) -> can.BusABC:
@@ -217,25 +202,12 @@ class Exchange:
     def _renew(self, one: _Command, frame: can.Message, t_us: int) -> bool:
         """Take in a command; return whether the frame renews it."""
         try:
-            found = self.codec.decode(one.part, bytes(frame.data))
+            value, counter = self.codec.decode(one.part, bytes(frame.data))
         except BadFrame as error:
-            text = str(error)
-            self.counts[
-                "not_enabled"
-                if text.startswith("not enabled")
-                else "out_of_range"
-                if "outside" in text
-                else "malformed"
-            ] += 1
+            self.counts[error.fault] += 1
             return False
-        if found is None:
-            return False
-        value, counter = found
-        if counter is not None and one.counter is not None and one.part.counter is not None:
-            size = (
-                1
-                << self.codec.message(one.part.message).get_signal_by_name(one.part.counter).length
-            )
+        if one.part.counter is not None and counter is not None and one.counter is not None:
+            size = self.codec.counter_size(one.part.message, one.part.counter)
             ahead = (counter - one.counter) % size
             if ahead == 0:
                 self.counts["repeated"] += 1
@@ -244,26 +216,20 @@ class Exchange:
         one.counter, one.value, one.t_us = counter, value, t_us
         return True
 
-    def _commands(self, t_us: int, fresh: bool) -> Commands:
+    def _commands(self, t_us: int, is_fresh: bool) -> Commands:
         """Return the newest commands, or what replaces them."""
-        wheel = self._steer.value if self._steer.value is not None else 0.0
         self._began_us = t_us if self._began_us is None else self._began_us
-        never_us = (
-            self._began_us - HOLD_US
-        )  # without a first command there is nothing to hold: the ramp begins at once
-        age_us = t_us - min(
-            one.t_us if one.value is not None else never_us for one in (self._steer, self._accel)
-        )
-        held = self._accel.value if self._accel.value is not None else 0.0
-        mark: Mark = (
-            "fresh"
-            if fresh
-            else "held"
-            if age_us <= HOLD_US and None not in (self._steer.value, self._accel.value)
-            else "ramped"
-        )
+        wheel, accel = self._steer.value, self._accel.value
+        since_us = min(self._steer.t_us, self._accel.t_us)
+        mark: Mark = "fresh" if is_fresh else "held"
+        if wheel is None or accel is None:  # nothing to hold: the ramp begins at once
+            since_us = self._began_us - HOLD_US
+            mark = "ramped"
+        over_us = t_us - since_us - HOLD_US
+        if not is_fresh and over_us > 0:
+            mark = "ramped"
         self.counts[mark] += 1
-        if mark != "ramped":
-            return Commands(wheel, held, mark)
-        ramp = min(held, 0.0) - RAMP_MPS3 * max(age_us - HOLD_US, 0) * 1e-6
-        return Commands(wheel, max(ramp, STOP_MPS2), mark)
+        if mark == "ramped":
+            ramp = min(accel or 0.0, 0.0) - RAMP_MPS3 * max(over_us, 0) * 1e-6
+            accel = max(ramp, STOP_MPS2)
+        return Commands(wheel or 0.0, accel or 0.0, mark)

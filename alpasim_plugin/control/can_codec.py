@@ -1,17 +1,14 @@
-"""Between quantities and CAN frames: encoding with counters and checksums, decoding with every
-check that the database allows.
+"""Between quantities and CAN frames: encoding with counters, decoding with every check that the
+database allows.
 
 Which message and signal of a database carries which quantity stands in a map, one YAML file beside
-a DBC.
-
-A checksum is CRC-8 SAE J1850 over identifier and data. Nothing of a frame is trusted before all
-checks have passed.
+a DBC. Nothing of a frame is trusted before all checks have passed.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,10 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lazy import require_library
 
-POLYNOMIAL = 0x1D  # CRC-8 SAE J1850
-START = 0xFF
-FD_BYTES = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # that a frame of CAN FD carries
 FrameId = tuple[int, bool]  # identifier, and whether it is an extended one of 29 bits
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
@@ -47,6 +42,7 @@ Quantity = Literal[
     "path_curvature_rate_1pm2",
     "path_length_m",
 ]
+Fault = Literal["malformed", "not_enabled", "out_of_range"]
 
 
 class _Part(BaseModel):
@@ -60,7 +56,6 @@ class Sent(_Part):
     period_us: Annotated[int, Field(gt=0)]
     signals: dict[str, Quantity]
     counter: str | None = None
-    checksum: str | None = None  # the signal of one byte that holds it
 
 
 class Received(_Part):
@@ -73,7 +68,6 @@ class Received(_Part):
     scale: float = 1.0
     enabled: dict[str, int] = {}  # the command counts only while these signals have these values
     counter: str | None = None
-    checksum: str | None = None  # the signal of one byte that holds it
 
 
 class CanMap(_Part):
@@ -84,11 +78,6 @@ class CanMap(_Part):
     send: tuple[Sent, ...]
     steer: Received
     accel: Received
-
-    @property
-    def parts(self) -> tuple[Sent | Received, ...]:
-        """Return every message that the map sends or reads."""
-        return (*self.send, self.steer, self.accel)
 
 
 def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
@@ -117,7 +106,15 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
 
 
 class BadFrame(Exception):
-    """A frame that fails a check; the text says which."""
+    """A frame that fails a check.
+
+    Args:
+        fault: Which kind of check.
+    """
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault)
+        self.fault = fault
 
 
 @dataclass
@@ -135,99 +132,70 @@ class Codec:
     @property
     def uses_fd(self) -> bool:
         """Return whether any message of the map needs a CAN FD frame."""
-        return any(is_fd(self.message(part.message)) for part in self.map.parts)
+        parts = (*self.map.send, self.map.steer, self.map.accel)
+        return any(is_fd(self.message(part.message)) for part in parts)
 
     def address(self, name: str) -> FrameId:
         """Return what identifies the frames of a message."""
         message = self.message(name)
         return int(message.frame_id), bool(message.is_extended_frame)
 
-    def frame(self, name: str, data: bytes) -> can.Message:
-        """Return data as a frame of the kind that the database states."""
+    def encode(self, sent: Sent, quantities: Mapping[str, float]) -> can.Message:
+        """Return the frame of a message, with the next counter."""
+        signals = {name: quantities[quantity] for name, quantity in sent.signals.items()}
+        return self.pack(sent.message, signals, sent.counter)
+
+    def encode_command(self, received: Received, value: float) -> can.Message:
+        """Return the frame of a command, as a control unit sends it."""
+        signals = {received.signal: value * received.scale, **received.enabled}
+        return self.pack(received.message, signals, received.counter)
+
+    def pack(self, name: str, values: Mapping[str, float], counter: str | None) -> can.Message:
+        """Return the frame of given signal values, each the nearest that its signal can hold;
+        signals that are not named are at raw value 0.
+        """
         message = self.message(name)
+        full = {signal.name: signal.offset for signal in message.signals}
+        for signal_name, value in values.items():
+            full[signal_name] = _carried(message.get_signal_by_name(signal_name), value)
+        if counter is not None:
+            size = self.counter_size(name, counter)
+            full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % size
         return can.Message(
             arbitration_id=message.frame_id,
             is_extended_id=message.is_extended_frame,
             is_fd=is_fd(message),
-            data=data,
+            data=message.encode(full, strict=False),
         )
 
-    def encode(self, sent: Sent, quantities: Mapping[str, float]) -> can.Message:
-        """Return the frame of a message, with the next counter and its checksum."""
-        values = {
-            name: self._carried(sent.message, name, quantities[quantity])
-            for name, quantity in sent.signals.items()
-        }
-        return self.pack(sent.message, values, sent.counter, sent.checksum)
+    def counter_size(self, name: str, counter: str) -> int:
+        """Return how many values a message's counter has."""
+        return 1 << int(self.message(name).get_signal_by_name(counter).length)
 
-    def encode_command(self, received: Received, value: float) -> can.Message:
-        """Return the frame of a command, as a control unit sends it."""
-        values = {
-            received.signal: self._carried(
-                received.message, received.signal, value * received.scale
-            ),
-            **received.enabled,
-        }
-        return self.pack(received.message, values, received.counter, received.checksum)
-
-    def pack(
-        self, name: str, values: Mapping[str, float], counter: str | None, checksum: str | None
-    ) -> can.Message:
-        """Return the frame of given signal values; signals that are not named are at their lowest
-        raw value, 0 in most.
-        """
-        message = self.message(name)
-        full = {signal.name: signal.offset for signal in message.signals}
-        named = [one for one in (*values, counter, checksum) if one is not None]
-        full |= {**multiplexed(message, named, {}), **values}
-        if counter is not None:
-            length = message.get_signal_by_name(counter).length
-            full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (
-                1 << length
-            )
-        data = bytearray(message.encode(full, strict=False))
-        if checksum is not None:
-            position = _byte_of(message, checksum)
-            data[position] = checksum_of(message.frame_id, bytes(data), position)
-        return self.frame(name, bytes(data))
-
-    def decode(self, received: Received, data: bytes) -> tuple[float, int | None] | None:
-        """Return a command's value and counter; None where the frame carries other signals of a
-        multiplexed message.
+    def decode(self, received: Received, data: bytes) -> tuple[float, int | None]:
+        """Return a command's value and counter.
 
         Raises:
-            BadFrame: Wrong length, wrong checksum, a value that the database does not allow, or a
-                command that is not enabled.
+            BadFrame: Wrong length, a value that the database does not allow, or a command that is
+                not enabled.
         """
         message = self.message(received.message)
-        values = checked_values(message, data, received.checksum)
-        if not {received.signal, *received.enabled} <= set(values):
-            return None
-        off = [
-            f"{name} = {values[name]}"
-            for name, wanted in received.enabled.items()
-            if values[name] != wanted
-        ]
-        if off:
-            raise BadFrame(f"not enabled: {', '.join(off)}")
-        signal, value = message.get_signal_by_name(received.signal), float(values[received.signal])
-        if not _inside(signal, value):
-            low, high = _range(signal)
-            raise BadFrame(f"{received.signal} = {value} outside [{low:g}, {high:g}]")
-        return value / received.scale, None if received.counter is None else int(
-            values[received.counter]
-        )
-
-    def _carried(self, message: str, name: str, wanted: float) -> float:
-        """Return the value that a signal can hold nearest to the wanted one."""
-        signal = self.message(message).get_signal_by_name(name)
+        if len(data) != message.length:
+            raise BadFrame("malformed")
+        try:
+            values: dict[str, float] = message.decode(data, decode_choices=False)
+        except Exception as error:  # the decoder raises errors of many kinds
+            raise BadFrame("malformed") from error
+        if any(values[name] != wanted for name, wanted in received.enabled.items()):
+            raise BadFrame("not_enabled")
+        signal = message.get_signal_by_name(received.signal)
+        value = float(values[received.signal])
         low, high = _range(signal)
-        held = min(max(wanted, low), high)
-        if signal.is_float:
-            return float(held)
-        raw = round((held - signal.offset) / signal.scale)
-        first, last = _raw_range(signal)
-        return float(min(max(raw, first), last) * signal.scale + signal.offset)
+        half = abs(float(signal.scale)) / 2
+        if not low - half <= value <= high + half:  # NaN is outside
+            raise BadFrame("out_of_range")
+        counter = None if received.counter is None else int(values[received.counter])
+        return value / received.scale, counter
 
 
 def open_codec(can_map: CanMap, database: Path) -> Codec:
@@ -235,15 +203,9 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
 
     Raises:
         InputError: cantools is missing, the file is not a database that it accepts, or the map
-            names what the database lacks.
+            names what the database lacks or what cannot be sent.
     """
-    try:
-        import cantools
-    except ImportError as error:
-        raise InputError(
-            f"{database}: cantools is not installed",
-            "install the extra [can], or pip install cantools",
-        ) from error
+    cantools = require_library("cantools", str(database), "Install the extra [can], or cantools.")
     try:
         # Real databases have overlapping signals in messages that nobody uses here; the map's own
         # messages are checked below.
@@ -254,89 +216,29 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             "repair the database, or remove the message that it names",
         ) from error
     codec = Codec(can_map, loaded)
-    for part in can_map.parts:
+    for part in (*can_map.send, can_map.steer, can_map.accel):
         _check(codec, database, part)
     return codec
 
 
 def _check(codec: Codec, database: Path, part: Sent | Received) -> None:
-    """Refuse a message that a map names and that cannot be sent or read as it says."""
-    signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
-    whole = [name for name in (part.counter, part.checksum) if name is not None]
+    """Refuse a message that cannot be sent or read as a map says: it is made and read once."""
     where = f"{database}, message {part.message}"
+    trial = Codec(codec.map, codec.database)
     try:
-        message = codec.message(part.message)
-        found = {name: message.get_signal_by_name(name) for name in (*signals, *whole)}
-    except KeyError as error:
+        if isinstance(part, Sent):
+            frame = trial.encode(part, dict.fromkeys(part.signals.values(), 0.0))
+        else:
+            frame = trial.encode_command(part, 0.0)
+            trial.decode(part, bytes(frame.data))
+        codec.message(part.message).decode(bytes(frame.data))
+    except Exception as error:  # the library raises errors of many kinds
         raise InputError(
-            f"{where}: no {error}", "name a database of the vehicle that the map is for"
+            f"{where}: it cannot be sent as the map says: {type(error).__name__}: {error}",
+            "correct the map, or name a database of the vehicle that the map is for",
         ) from error
-    if is_fd(message) and message.length not in FD_BYTES:
-        raise InputError(
-            f"{where}: {message.length} bytes, which no CAN frame carries",
-            f"use a message of up to 8 bytes, or of {', '.join(map(str, FD_BYTES[1:]))} in CAN FD",
-        )
-    odd = next((name for name, one in found.items() if not one.scale), None)
-    if isinstance(part, Received) and not part.scale:
-        odd = part.signal
-    if part.counter is not None and odd is None:
-        one = found[part.counter]
-        if one.is_float or one.is_signed or (one.scale, one.offset) != (1, 0):
-            odd = part.counter
-    if part.checksum is not None and odd is None:
-        one = found[part.checksum]
-        first = one.start % 8 == (7 if one.byte_order == "big_endian" else 0)
-        odd = None if one.length == 8 and first else part.checksum
-    if odd is not None:
-        raise InputError(
-            f"{where}, signal {odd}: it cannot carry what the map wants of it",
-            "use a signal with a scale; unsigned counters of scale 1 and offset 0, checksums of one whole byte",
-        )
-    fixed = part.enabled if isinstance(part, Received) else {}
-    multiplexed(message, [*signals, *whole], fixed, where)
-    try:  # what else a database can have wrong shows as the message is made and read once
-        trial = Codec(codec.map, codec.database).pack(
-            part.message,
-            {name: found[name].offset for name in signals} | dict(fixed),
-            part.counter,
-            part.checksum,
-        )
-        checked_values(message, bytes(trial.data), part.checksum)
-    except Exception as error:  # the encoder raises errors of many kinds
-        raise InputError(
-            f"{where}: {type(error).__name__}: {error}", "correct the message in the database"
-        ) from error
-
-
-def multiplexed(
-    message: Any, names: Sequence[str], fixed: Mapping[str, int], where: str = ""
-) -> dict[str, int]:
-    """Return the values of multiplexers under which a message carries signals.
-
-    Args:
-        message: Of a database.
-        names: The signals.
-        fixed: Values that multiplexers must have.
-        where: The message's place, for the error.
-
-    Raises:
-        InputError: No frame carries all of them.
-    """
-    allowed: dict[str, set[int]] = {name: {value} for name, value in fixed.items()}
-    for name in names:
-        signal = message.get_signal_by_name(name)
-        while signal.multiplexer_signal is not None:
-            ids = set(signal.multiplexer_ids)
-            over = allowed[signal.multiplexer_signal] = (
-                allowed.get(signal.multiplexer_signal, ids) & ids
-            )
-            if not over:
-                raise InputError(
-                    f"{where}: no frame carries {', '.join(names)} together: they are of different values of {signal.multiplexer_signal}",
-                    "name signals of one multiplexer value; send the message once for each",
-                )
-            signal = message.get_signal_by_name(signal.multiplexer_signal)
-    return {name: min(ids) for name, ids in allowed.items() if name not in fixed}
+    if codec.message(part.message).is_multiplexed():
+        raise InputError(f"{where}: it is multiplexed", "name messages of one layout")
 
 
 def is_fd(message: Any) -> bool:
@@ -344,38 +246,15 @@ def is_fd(message: Any) -> bool:
     return bool(message.is_fd) or int(message.length) > 8
 
 
-def checked_values(message: Any, data: bytes, checksum: str | None) -> dict[str, float]:
-    """Return the signals of a frame.
-
-    Raises:
-        BadFrame: Wrong length or checksum, or bytes that do not decode.
-    """
-    if len(data) != message.length:
-        raise BadFrame(f"{len(data)} bytes, not {message.length}")
-    if checksum is not None:
-        position = _byte_of(message, checksum)
-        wanted = checksum_of(message.frame_id, data, position)
-        if data[position] != wanted:
-            raise BadFrame(f"checksum {data[position]:#04x}, not {wanted:#04x}")
-    try:
-        values: dict[str, float] = message.decode(data, decode_choices=False)
-    except Exception as error:  # the decoder raises errors of many kinds
-        raise BadFrame(f"{type(error).__name__}: {error}") from error
-    return values
-
-
-def checksum_of(frame_id: int, data: bytes, position: int) -> int:
-    """Return the checksum of a frame whose byte ``position`` holds it."""
-    crc = START
-    for byte in frame_id.to_bytes(4, "little")[:2] + data[:position] + data[position + 1 :]:
-        crc ^= byte
-        for _ in range(8):
-            crc = ((crc << 1) ^ POLYNOMIAL if crc & 0x80 else crc << 1) & 0xFF
-    return crc ^ 0xFF
-
-
-def _byte_of(message: Any, signal: str) -> int:
-    return int(message.get_signal_by_name(signal).start) // 8
+def _carried(signal: Any, wanted: float) -> float:
+    """Return the value that a signal can hold nearest to the wanted one."""
+    low, high = _range(signal)
+    held = min(max(wanted, low), high)
+    if signal.is_float:
+        return float(held)
+    first, last = _raw_range(signal)
+    raw = min(max(round((held - signal.offset) / signal.scale), first), last)
+    return float(raw * signal.scale + signal.offset)
 
 
 def _raw_range(signal: Any) -> tuple[int, int]:
@@ -391,22 +270,13 @@ def _range(signal: Any) -> tuple[float, float]:
     then the bits decide.
     """
     if signal.is_float:
-        most = float(np.finfo(f"f{int(signal.length) // 8}").max)
-        stated = signal.minimum, signal.maximum
-        if None in stated or stated[0] == stated[1]:  # DBC writes [0|0] where it states none
-            return -most, most
-        return float(stated[0]), float(stated[1])
-    low, high = sorted(
-        raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal)
-    )
-    least = signal.minimum
-    most = signal.maximum
+        high = float(np.finfo(f"f{int(signal.length) // 8}").max)
+        low = -high
+    else:
+        scaled = [raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal)]
+        low, high = min(scaled), max(scaled)
+    least, most = signal.minimum, signal.maximum
     half = abs(float(signal.scale)) / 2
-    if least is None or most is None or not (low - half <= least < most <= high + half):
+    if least is None or most is None or not low - half <= least < most <= high + half:
         return low, high
     return max(low, float(least)), min(high, float(most))
-
-
-def _inside(signal: Any, value: float) -> bool:
-    (low, high), half = _range(signal), abs(float(signal.scale)) / 2
-    return low - half <= value <= high + half  # false for NaN

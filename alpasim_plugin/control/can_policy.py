@@ -97,10 +97,8 @@ class CanPolicy(Policy):
                 t_us,
                 quantities(state, self._steer_rate, self._accel, path, self._ratio, self._vehicle),
             )
-            before, state = (
-                state,
-                step(state, self._command(commands), self._step_us * 1e-6, self._vehicle),
-            )
+            before = state
+            state = step(state, self._command(commands), self._step_us * 1e-6, self._vehicle)
             self._steer_rate = (state.steer_rad - before.steer_rad) / (self._step_us * 1e-6)
             self._accel = (state.speed_mps - before.speed_mps) / (self._step_us * 1e-6)
             states.append(state)

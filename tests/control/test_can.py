@@ -21,10 +21,10 @@ can = pytest.importorskip("can")
 
 from alpasim_plugin.control.bicycle import BicycleState  # noqa: E402
 from alpasim_plugin.control.can_bus import HOLD_US, STOP_MPS2, Address, Exchange, open_bus  # noqa: E402
-from alpasim_plugin.control.can_codec import BadFrame, checksum_of, load_map, open_codec  # noqa: E402
-from alpasim_plugin.control.can_ecu import LaneKeeper, serve  # noqa: E402
+from alpasim_plugin.control.can_codec import load_map, open_codec  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
 from alpasim_plugin.core.types import Vehicle  # noqa: E402
+from tests.control.can_ecu import LaneKeeper, serve  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -66,12 +66,6 @@ NOTHING = quantities(BicycleState(0, 0, 0, 10.0, 0.0), 0.0, 0.0, np.zeros((0, 3)
 
 
 # --- frames
-
-
-def test_checksums_by_hand():
-    # CRC-8 SAE J1850 of the text 123456789 is 4B in the published catalogue; here identifier 0x3231
-    # is its first two bytes.
-    assert checksum_of(0x3231, b"3456789\0", 7) == 0x4B
 
 
 def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec):
@@ -152,40 +146,24 @@ def test_every_fault_is_counted_by_cause(codec, wires):
     for frame in frames[3]:  # two of each lost
         unit.send(frame)
     steer_id, data = frames[4][0].arbitration_id, bytes(frames[4][0].data)
-    send(unit, steer_id, bytes([data[0] ^ 1]) + data[1:])  # a flipped bit
     send(unit, steer_id, data[:5])  # cut short
-    off = other.pack("ACCEL_CMD", {"ACCEL": 1.0, "ENABLE": 0}, "COUNTER", other.map.accel.checksum)
-    unit.send(off)
-    unit.send(
-        other.pack("ACCEL_CMD", {"ACCEL": -30.0, "ENABLE": 1}, "COUNTER", other.map.accel.checksum)
+    unit.send(other.pack("ACCEL_CMD", {"ACCEL": 1.0, "ENABLE": 0}, "COUNTER"))
+    raw = other.message("ACCEL_CMD").encode(
+        {"ACCEL": -30.0, "ENABLE": 1, "COUNTER": 9}, strict=False
     )
+    send(unit, frames[4][1].arbitration_id, raw)
     send(unit, 0x7AB, b"\1\2")  # of nobody here
     got = one.step(0, NOTHING)
     wanted = {
         "repeated": 2,
         "lost": 4,
-        "malformed": 2,
+        "malformed": 1,
         "not_enabled": 1,
         "out_of_range": 1,
         "other": 1,
     }
     assert {name: one.counts[name] for name in wanted} == wanted
     assert (got.wheel_deg, got.accel_mps2) == (pytest.approx(1.0), pytest.approx(0.5))
-
-
-def test_a_frame_of_random_bytes_never_becomes_a_command(codec):
-    rng = np.random.Generator(np.random.Philox(7))
-    accepted = 0
-    for _ in range(2000):
-        data = rng.integers(0, 256, int(rng.integers(0, 9)), dtype=np.uint8).tobytes()
-        try:
-            codec.decode(codec.map.steer, data)
-            accepted += 1
-        except BadFrame:
-            pass
-    assert (
-        accepted < 2000 / 256
-    )  # as many as an 8-bit checksum lets pass, times half for the enabling bit and a ninth for the length
 
 
 # --- driving

@@ -42,7 +42,7 @@ BESIDE = {  # address in a command -> what answers there
 }
 CONTROL_UNIT = (
     "can://udp_multicast:239.74.163.2",
-    "alpasim_plugin.control.can_ecu",
+    "tests.control.can_ecu",
     "udp_multicast:239.74.163.2",
 )
 COMMANDS = [

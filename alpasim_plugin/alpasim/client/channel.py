@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
-from urllib.parse import parse_qs
+from typing import Any, cast, get_args
 
 import grpc
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub, is_lost_connection
@@ -41,17 +41,9 @@ class Address:
         """
         target, _, query = text.partition("?")
         host, _, port = target.rpartition(":")
-        options = {
-            key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()
-        }
-        unknown = sorted(set(options) - set(known))
-        if not host or not port.isdigit() or unknown:
-            found = f"no option {unknown[0]!r}" if unknown else "no HOST:PORT"
-            shown = f"[?{'&'.join(f'{name}=...' for name in known)}]" if known else ""
-            raise InputError(
-                f"{scheme}://{text}: {found}",
-                f"write {scheme}://HOST:PORT{shown}",
-            )
+        options = options_of(query, known, f"{scheme}://{text}")
+        if not host or not port.isdigit():
+            raise InputError(f"{scheme}://{text}: no HOST:PORT", f"write {scheme}://HOST:PORT")
         return cls(target, options)
 
 
@@ -61,13 +53,9 @@ def encoding_of(address: str, given: str) -> ImageEncoding:
     Raises:
         InputError: It is none that the wire has.
     """
-    known: dict[str, ImageEncoding] = {"jpeg": "jpeg", "png": "png"}
-    if given in known:
-        return known[given]
-    raise InputError(
-        f"{address}: encoding {given!r}",
-        "write encoding=jpeg or encoding=png",
-    )
+    if given not in get_args(ImageEncoding):
+        raise InputError(f"{address}: encoding {given!r}", "write encoding=jpeg or encoding=png")
+    return cast("ImageEncoding", given)
 
 
 class Service:
@@ -87,17 +75,17 @@ class Service:
         self._channel = grpc.insecure_channel(target, options=OPTIONS)
         self.stub = Stub(self._channel, name)
 
-    def wait_ready(self, timeout_s: float = READY_S) -> None:
+    def wait_ready(self) -> None:
         """Wait for the service.
 
         Raises:
             InfrastructureError: Nothing listens there.
         """
         try:
-            grpc.channel_ready_future(self._channel).result(timeout=timeout_s)
+            grpc.channel_ready_future(self._channel).result(timeout=READY_S)
         except grpc.FutureTimeoutError as error:
             raise InfrastructureError(
-                f"{self.target}: nothing answers at {self.target} within {timeout_s:g} s",
+                f"{self.target}: nothing answers within {READY_S:g} s",
                 "start the service, or correct the address",
             ) from error
 

@@ -19,12 +19,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import parse_qs
 
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.child import Child, exit_reason
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.core.subprocesses import say
 from alpasim_plugin.core.types import Scenario
 
@@ -155,15 +155,7 @@ class Command:
         """
         whole = f"exec:{text}"
         head, _, rest = text.partition(" ") if text.startswith("?") else ("", "", text)
-        options = {
-            key: values[-1] for key, values in parse_qs(head[1:], keep_blank_values=True).items()
-        }
-        known = (*OPTIONS, "ready_s")
-        unknown = sorted(set(options) - set(known))
-        if unknown:
-            raise InputError(
-                f"{whole}: no option {unknown[0]!r}", f"the options are {', '.join(known)}"
-            )
+        options = options_of(head[1:], (*OPTIONS, "ready_s"), whole)
         for key in ("ready_s", "timeout_s"):
             if not re.fullmatch(r"\d+(\.\d+)?", options.get(key, "1")):
                 raise InputError(f"{whole}: {key}={options[key]!r}", "write seconds as a number")

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl
 
 import grpc
 
@@ -28,6 +27,7 @@ from alpasim_plugin.alpasim.server.sources import (
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest
+from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.core.reading import file_sha256, read_bytes
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
@@ -96,19 +96,15 @@ class Upstream:
             InputError: Another option, or a file that cannot be read.
         """
         address, _, query = text.partition("?")
-        given = dict(parse_qsl(query, keep_blank_values=True))
-        known = {"ca", "token_file", "image"}
-        if (
-            not address
-            or not set(given) <= known
-            or given.get("image", "png") not in ("png", "as-asked")
-        ):
+        given = options_of(query, ("ca", "token_file", "image"), f"--upstream {text}")
+        image = given.get("image", "png")
+        if not address or image not in ("png", "as-asked"):
             raise InputError(
-                f"--upstream {text}: no address, or an option that is unknown",
+                f"--upstream {text}: no address, or an image that is neither png nor as-asked",
                 "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]",
             )
         ca, token = (Path(given[key]) if key in given else None for key in ("ca", "token_file"))
-        return cls(address, ca, read_token(token), given.get("image") != "as-asked")
+        return cls(address, ca, read_token(token), image == "png")
 
     def channel(self) -> Any:
         """Open a channel."""

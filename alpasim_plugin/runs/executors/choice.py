@@ -6,9 +6,9 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
-from urllib.parse import parse_qsl
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.queries import options_of
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,8 @@ def parse_executor(text: str) -> Executor:
         return LOCAL
     named, _, query = text.partition("?")
     kind, _, address = named.partition(":")
-    needs = dict(parse_qsl(query, keep_blank_values=True))
-    if (
-        kind == "ray"
-        and not address.startswith("//")
-        and needs.keys() <= {"cores", "gpus", "memory"}
-    ):
+    needs = options_of(query, ("cores", "gpus", "memory"), f"--executor {text}")
+    if kind == "ray" and not address.startswith("//"):
         with suppress(ValueError):
             cores = int(needs.get("cores", 1))
             gpus = float(needs.get("gpus", 0))
