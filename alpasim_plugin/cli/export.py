@@ -22,7 +22,7 @@ from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 from alpasim_plugin.runs.export import export_run, export_scenes
 from alpasim_plugin.runs.recordings import export_mcap, require_mcap
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.opening import read_so_far
+from evaluators.opening import Run
 from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 
 SHOWN_CELLS = 4  # in the message that there are several
@@ -140,7 +140,7 @@ def export_recording(
     root, cell = run_and_cell(Path(items[0]))
     if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
-    run = read_so_far(root).run
+    run = Run.read_so_far(root)
     wanted = cells_wanted(run.rollouts, cell, asked)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)

@@ -27,7 +27,8 @@ from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.opening import read_run, read_so_far
+from evaluators.opening import Run as OpenedRun
+from evaluators.opening import read_run
 from evaluators.report.terminal import metric_lines
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import MB, write_page
@@ -78,17 +79,17 @@ def view(
     root, cell = run_and_cell(path)
     if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
-    so_far = read_so_far(root)
-    for line in so_far.damage:
+    opened = OpenedRun.read_so_far(root)
+    for line in opened.damage:
         warn(f"warning: damaged: {line}")
-    if not so_far.finished:
-        done = len(so_far.run.rollouts)
-        warn(f"note: the run is not finished: {done} of {so_far.planned} rollouts")
-    if not so_far.run.rollouts:
+    if not opened.summary:
+        done = len(opened.rollouts)
+        warn(f"note: the run is not finished: {done} of {opened.planned} rollouts")
+    if not opened.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
-    wanted = cells_wanted(so_far.run.rollouts, cell, asked)
+    wanted = cells_wanted(opened.rollouts, cell, asked)
     page = out or root / PAGE
-    made = write_page(so_far.run, page, wanted)
+    made = write_page(opened, page, wanted)
     facts = {
         "page": str(page),
         "bytes": made.size,

@@ -12,7 +12,7 @@ from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
-from alpasim_plugin.log.run_folder.reader import read_run
+from alpasim_plugin.log.run_folder.reader import Run
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, cell_name
 from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of
@@ -64,7 +64,7 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
         InputError: No such rollout, it did not finish, its scenario or its parts have changed, or
             it was driven with a part that is neither installed nor named.
     """
-    row = named_rollout(read_run(root).rollouts, name)
+    row = named_rollout(Run.read(root).rollouts, name)
     if not row.ok:
         raise InputError(
             f"{name}: the rollout did not finish: {row.failure}", "Name a finished rollout."

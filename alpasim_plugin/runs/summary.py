@@ -18,7 +18,7 @@ from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, SUMMARY
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
@@ -249,7 +249,6 @@ def _info_of(run: Path) -> JsonObject:
     info = read_run_json(run)
     if not os.path.isfile(table_path(run, SUMMARY)):
         raise InputError(f"The run {run} is not finished.", AGAIN)
-    ROLLOUTS_TABLE.check(table_path(run, ROLLOUTS), AGAIN, MetricTable.of_run(info).rates)
     return info
 
 

@@ -22,8 +22,7 @@ from alpasim_plugin.log.run_folder.schema import (
     rollout_folder,
 )
 from alpasim_plugin.log.run_folder.sides import RolloutTable
-from alpasim_plugin.runs.summary import aggregate_runs
-from evaluators.opening import read_run, read_so_far
+from evaluators.opening import Run, read_run
 from tests.core.checksum_files import vouch_for
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -38,69 +37,36 @@ ROW = {
     "frames": 3,
 }
 ROWS = [ROW | {"offroad": 0.0, "offroad_valid": True, "seed": seed} for seed in range(3)]
-STEP = {
-    "renderer": "clean",
-    "policy": "p",
-    "scene": "s",
-    "seed": 0,
-    "t_us": 5,
-    "metric": "offroad",
-    "value": 0.0,
-    "valid": True,
-}
 
 
-def changed(column, value):
-    """Return the rows with another value of a column in the last one, or with another column where
-    ``value`` is a list.
-    """
+def changed(column, values):
+    """Return the rows with other values of a column."""
     table = pa.Table.from_pylist(ROWS)
-    values = value if isinstance(value, list) else [*table[column].to_pylist()[:-1], value]
     return table.set_column(table.column_names.index(column), column, pa.array(values))
 
 
 @pytest.mark.parametrize(
-    ("table", "where", "found"),
+    "table",
     [
-        (changed("offroad", ["a", "b", "c"]), "", "column 'offroad' of string, wanted number"),
-        (changed("offroad", [[0.0], [1.0], [2.0]]), "", "column 'offroad' of list"),
-        (changed("offroad_valid", [1, 1, 1]), "", "column 'offroad_valid' of int64, wanted flag"),
-        (changed("frames", ["3", "3", "3"]), "", "column 'frames' of string, wanted integer"),
-        (changed("path", [1, 2, 3]), "", "column 'path' of int64, wanted text"),
-        (pa.Table.from_pylist(ROWS).drop(["scene"]), "", "no column 'scene'"),
-        (pa.Table.from_pylist(ROWS).drop(["offroad"]), "", "no column 'offroad'"),
-        (changed("scene", None), ", row 2", "column 'scene': nothing, wanted text"),
-        (changed("seed", None), ", row 2", "column 'seed': nothing, wanted integer"),
-        (changed("frames", -1), ", row 2", "column 'frames': a value below 0"),
-        (changed("frames", -(2**63)), ", row 2", "column 'frames': a value below 0"),
-        (changed("wall_s", -0.5), ", row 2", "column 'wall_s': a value below 0"),
-        (changed("offroad", -1e308), ", row 2", "column 'offroad': a value below -1e+15"),
-        (pa.Table.from_pylist([*ROWS, ROWS[0], ROWS[0]]), "", "3 rows of renderer "),
+        changed("offroad", ["a", "b", "c"]),
+        changed("offroad_valid", [1, 1, 1]),
+        changed("frames", ["3", "3", "3"]),
+        changed("path", [1, 2, 3]),
+        pa.Table.from_pylist(ROWS).drop(["scene"]),
+        pa.Table.from_pylist(ROWS).drop(["offroad"]),
     ],
 )
-@pytest.mark.parametrize("with_statistics", [True, False])
-def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_row(
-    tmp_path, usual_run, table, where, found, with_statistics
+def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_and_column(
+    tmp_path, usual_run, table
 ):
     for name in ("run.json", "summary.json"):
         shutil.copy(usual_run / name, tmp_path)
     path = tmp_path / "rollouts.parquet"
-    pq.write_table(table, path, row_group_size=2, write_statistics=with_statistics)
+    pq.write_table(table, path, row_group_size=2)
     for read in (read_run, lambda folder: RolloutTable.of_files([folder / "rollouts.parquet"])):
         with pytest.raises(InputError) as caught:
             read(tmp_path)
-        assert caught.value.message.startswith(str(path) + where)
-
-
-@pytest.mark.parametrize("value", [-1e14, 1.5])
-def test_a_rate_outside_its_range_is_refused_by_row(tmp_path, usual_run, value):
-    run = shutil.copytree(usual_run, tmp_path / "run")
-    pq.write_table(changed("offroad", value), run / "rollouts.parquet")
-    vouch_for(run)
-    for read in (read_run, lambda folder: aggregate_runs([folder])):
-        with pytest.raises(InputError, match=r"offroad") as caught:
-            read(run)
-        assert caught.value.message.startswith(f"{run / 'rollouts.parquet'}, row 2")
+        assert caught.value.message.startswith(str(path))
 
 
 def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path, usual_run):
@@ -110,23 +76,13 @@ def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path
         held = json.loads(path.read_text())
         write_manifest(path.parent, {key: value for key, value in held.items() if key != "wall_s"})
     with pytest.raises(InputError):
-        read_so_far(run)
-
-
-def test_steps_without_their_time_are_refused_by_row(tmp_path, usual_run):
-    for name in ("run.json", "summary.json", "rollouts.parquet"):
-        shutil.copy(usual_run / name, tmp_path)
-    pq.write_table(pa.Table.from_pylist([STEP, STEP | {"t_us": None}]), tmp_path / "steps.parquet")
-    with pytest.raises(InputError):
-        read_run(tmp_path).steps(["offroad"])
+        Run.read_so_far(run)
 
 
 def test_what_the_schema_writes_it_also_reads(tmp_path):
     made = pa.Table.from_pylist(ROWS, schema=ROLLOUTS_TABLE.arrow(["offroad"], of_logs=True))
     pq.write_table(made, tmp_path / "rollouts.parquet")
     assert ROLLOUTS_TABLE.read(tmp_path / "rollouts.parquet").equals(made)
-    some = ROLLOUTS_TABLE.read(tmp_path / "rollouts.parquet", only=("seed", "offroad"))
-    assert some.to_pydict() == {"seed": [0, 1, 2], "offroad": [0.0, 0.0, 0.0]}
 
 
 @pytest.mark.parametrize("table", [ROLLOUTS_TABLE, STEPS_TABLE])

@@ -19,7 +19,6 @@ def read_parquet(
     path: Path | str,
     columns: Mapping[str, Kind],
     do_this: str = FETCH_AGAIN,
-    only: bool = False,
 ) -> Any:
     """Return a parquet file as an Arrow table.
 
@@ -27,7 +26,6 @@ def read_parquet(
         path: File.
         columns: Columns that must be there, by type; null values are allowed.
         do_this: Hint of the errors.
-        only: Read these columns alone.
 
     Raises:
         InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
@@ -35,7 +33,7 @@ def read_parquet(
     """
     file = _open(path, path, do_this)
     with parsing(path, do_this, NO_PARQUET):
-        table = file.read(columns=list(columns) if only else None)
+        table = file.read()
         table.validate(full=True)
     check_columns(table, columns, path, do_this)
     return table

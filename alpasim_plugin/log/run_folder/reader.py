@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Generic, TypeVar
+from typing import Any, Self
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -71,6 +71,8 @@ class Run:
         summary: ``summary.json``; empty where the run is not finished.
         rollouts: Rows of ``rollouts.parquet``.
         metric_names: Rollout metrics in the column order of ``rollouts.parquet``.
+        planned: Rollouts in all, of an unfinished run.
+        damage: What cannot be read of an unfinished run, one line each.
     """
 
     folder: Path
@@ -78,6 +80,47 @@ class Run:
     summary: JsonView
     rollouts: Sequence[Rollout]
     metric_names: tuple[str, ...]
+    planned: int = 0
+    damage: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read a run folder.
+
+        Raises:
+            InputError: ``run.json``, ``rollouts.parquet`` or ``summary.json`` is absent or
+                unreadable, or the table is not as `ROLLOUTS_TABLE` says.
+        """
+        info: JsonView = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
+        summary: JsonView = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
+        path = table_path(folder, ROLLOUTS)
+        rows = StoredRollouts(path)
+        return cls(folder, info, summary, rows, metrics_in(ROLLOUTS_TABLE.check(path)))
+
+    @classmethod
+    def read_so_far(cls, root: Path) -> Self:
+        """Read a run folder that may be unfinished: then with the finished rollouts alone, and
+        without a summary.
+
+        Raises:
+            InputError: It holds no run, or its description or its tables are damaged.
+        """
+        if os.path.exists(table_path(root, SUMMARY)):
+            return cls.read(root)
+        found = inspect_run(root)
+        damaged = {one.cell for one in found.damage}
+        with parsing(root, AGAIN, "manifests from which no table can be made"):
+            whole = [manifest for manifest in found.manifests if manifest["path"] not in damaged]
+            table = rollout_table(whole)
+        return cls(
+            root,
+            read_run_json(root),
+            {},
+            rollouts_of_table(table),
+            metrics_in(table.column_names),
+            len(found.cells),
+            tuple(map(str, found.damage)),
+        )
 
     @property
     def renderers(self) -> list[str]:
@@ -228,26 +271,6 @@ class Run:
         return found
 
 
-RunT = TypeVar("RunT", bound=Run)
-
-
-@dataclass(frozen=True)
-class RunSoFar(Generic[RunT]):
-    """A run as far as it has got.
-
-    Attributes:
-        run: With the finished rollouts alone; an unfinished one has no summary.
-        planned: Rollouts in all.
-        damage: What cannot be read, one line each.
-        finished: All of it is written, tables and reports too.
-    """
-
-    run: RunT
-    planned: int
-    damage: tuple[str, ...]
-    finished: bool
-
-
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object of a run folder.
 
@@ -273,41 +296,3 @@ def reporting(run: Run) -> AbstractContextManager[None]:
     not a traceback.
     """
     return parsing(run.folder, AGAIN, "a run from which no report can be made")
-
-
-def read_run(run_dir: Path | str) -> Run:
-    """Read a run folder.
-
-    Args:
-        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json``
-            (docs/architecture.md).
-
-    Raises:
-        InputError: A file is absent or unreadable, or ``rollouts.parquet`` is not as
-            `ROLLOUTS_TABLE` says.
-    """
-    folder = Path(run_dir)
-    info: JsonView = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
-    summary: JsonView = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
-    path = table_path(folder, ROLLOUTS)
-    return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
-
-
-def read_so_far(root: Path) -> RunSoFar[Run]:
-    """Read a run folder that may be unfinished: with the finished rollouts alone.
-
-    Raises:
-        InputError: It holds no run, or its description or its tables are damaged.
-    """
-    if os.path.exists(table_path(root, SUMMARY)):
-        run = read_run(root)
-        return RunSoFar(run, len(run.rollouts), (), True)
-    found = inspect_run(root)
-    damaged = {one.cell for one in found.damage}
-    with parsing(root, AGAIN, "manifests from which no table can be made"):
-        whole = [manifest for manifest in found.manifests if manifest["path"] not in damaged]
-        table = rollout_table(whole)
-    run = Run(
-        root, read_run_json(root), {}, rollouts_of_table(table), metrics_in(table.column_names)
-    )
-    return RunSoFar(run, len(found.cells), tuple(map(str, found.damage)), False)

@@ -4,29 +4,19 @@ column, and the names of its cells.
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
-from alpasim_plugin.core.reading import parsing
-from alpasim_plugin.core.reading.tables import Kind, check_columns, check_parquet, read_parquet
+from alpasim_plugin.core.reading.tables import Kind, check_parquet, read_parquet
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.compute as pc
 
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
-# of a metric's value: a double holds no thousandths of larger ones, and no image a thousand times
-# as much
-LARGEST = 1e15
-LATEST_US = 2.0**62  # of a time: the difference of two is one of 64 bits
 VALID = "_valid"  # ends the name of the column that tells where a metric is valid
 
 
@@ -68,39 +58,14 @@ class Column:
     Attributes:
         name: Its name.
         kind: Its type: text, integer (64 bits), number (double) or flag (boolean).
-        is_required: A table without it, and a row without a value in it, is refused.
-        least: The least value; None: any.
-        most: The greatest value; infinite: any.
+        is_required: A table without it is refused.
         of_logs: Only tables of scored logs have it.
     """
 
     name: str
     kind: Kind
     is_required: bool = False
-    least: float | None = None
-    most: float = math.inf
     of_logs: bool = False
-
-    def faults(self) -> list[tuple[pc.Expression, str]]:
-        """Return what must not be, with what a row that has it lacks; a number that is not finite
-        counts as missing.
-        """
-        import pyarrow.compute as pc
-
-        value = pc.field(self.name)
-        faults = []
-        if self.is_required:
-            faults.append((value.is_null(), f"nothing, wanted {self.kind}"))
-        # Arrow compares an integer with a float as floats, and refuses integers that a float does
-        # not hold.
-        bound = int if self.kind == "integer" else float
-        if self.least is not None:
-            is_less = pc.is_finite(value) & (value < bound(self.least))
-            faults.append((is_less, f"a value below {self.least:g}"))
-        if math.isfinite(self.most):
-            is_greater = pc.is_finite(value) & (value > bound(self.most))
-            faults.append((is_greater, f"a value above {self.most:g}"))
-        return faults
 
 
 @dataclass(frozen=True)
@@ -110,17 +75,10 @@ class TableSchema:
     Attributes:
         name: Its file.
         columns: In the order of the file; those of the metrics follow.
-        identity: Columns that name a row, as far as a file has them: no two rows agree in all.
     """
 
     name: str
     columns: tuple[Column, ...]
-    identity: tuple[str, ...] = ()
-
-    @property
-    def required(self) -> dict[str, Kind]:
-        """Give the columns that every such table has, with their kinds."""
-        return {column.name: column.kind for column in self.columns if column.is_required}
 
     def arrow(self, metrics: Iterable[str] = (), of_logs: bool = False) -> pa.Schema:
         """Return the schema by which the table is written.
@@ -142,74 +100,34 @@ class TableSchema:
             [(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))]
         )
 
-    def check(self, path: Path, do_this: str = AGAIN, rates: Container[str] = ()) -> list[str]:
-        """Compare a file with the schema before any of it is used, and return the names of its
-        columns.
+    def kinds(self, names: Sequence[str]) -> dict[str, Kind]:
+        """Give the kinds of the columns of a file with these names, as far as they are known."""
+        own = [column for column in self.columns if column.name in names]
+        return {column.name: column.kind for column in (*own, *columns_of(metrics_in(names)))}
 
-        Rows are read only where the statistics in the header do not tell. Metrics that are
-        ``rates`` lie in [0, 1].
+    def check(self, path: Path, do_this: str = AGAIN) -> list[str]:
+        """Compare the header of a file with the schema, and return the names of its columns.
 
         Raises:
-            InputError: It is no such table: the error names the file, the column, and the first row
-                that is wrong.
+            InputError: It is no such table.
         """
-        import pyarrow.compute as pc
-        import pyarrow.dataset as pads
-
-        names = check_parquet(path, self.required, do_this)
-        stated = [
-            *(c for c in self.columns if c.name in names),
-            *columns_of(metrics_in(names), rates),
-        ]
-        kinds = {column.name: column.kind for column in stated}
-        with parsing(path, do_this, "no readable parquet"):
-            data = pads.dataset(path, format="parquet")
-        check_columns(data.schema.empty_table(), kinds, path, do_this)
-        faults = {column.name: column.faults() for column in stated}
-        wrong = reduce(or_, (fault for found in faults.values() for fault, _ in found))
-        with parsing(path, do_this, "no readable parquet"):
-            n_wrong = data.count_rows(filter=wrong)
-        for name, found in faults.items() if n_wrong else ():
-            for fault, text in found:
-                row = pc.index(data.to_table(columns={"wrong": fault})["wrong"], True).as_py()
-                if row >= 0:
-                    raise InputError(f"{path}, row {row}: column {name!r}: {text}", do_this)
-        identity = {name: kinds[name] for name in self.identity if name in names}
-        if identity:
-            _check_identity(read_parquet(path, identity, do_this, only=True), path, do_this)
+        required = {column.name: column.kind for column in self.columns if column.is_required}
+        names = check_parquet(path, required, do_this)
+        check_parquet(path, self.kinds(names), do_this)
         return names
 
-    def read(
-        self,
-        path: Path,
-        do_this: str = AGAIN,
-        only: Sequence[str] | None = None,
-    ) -> pa.Table:
-        """Return a file, or ``only`` the named columns of it, after `check`."""
-        names = self.check(path, do_this)
-        wanted = names if only is None else only
-        kinds = {
-            column.name: column.kind
-            for column in (*self.columns, *columns_of(metrics_in([*names, *wanted])))
-        }
-        return read_parquet(
-            path,
-            {name: kinds[name] for name in wanted if name in kinds},
-            do_this,
-            only=only is not None,
-        )
+    def read(self, path: Path) -> pa.Table:
+        """Return a file after `check`."""
+        return read_parquet(path, self.kinds(self.check(path)), AGAIN)
 
 
-def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Column]:
+def columns_of(metrics: Iterable[str]) -> list[Column]:
     """Return the columns of metrics: a number, and a flag that tells whether it is valid; null
     where a rollout failed.
-
-    A number is one that reports can draw (`LARGEST`); one of the ``rates`` is in [0, 1].
     """
     out: list[Column] = []
     for name in metrics:
-        least, most = (0.0, 1.0) if name in rates else (-LARGEST, LARGEST)
-        out += [Column(name, "number", least=least, most=most), Column(name + VALID, "flag")]
+        out += [Column(name, "number"), Column(name + VALID, "flag")]
     return out
 
 
@@ -239,37 +157,23 @@ ROLLOUTS_TABLE = TableSchema(
         Column("failure", "text"),
         Column("path", "text"),
         Column("copied_from", "text"),
-        Column("wall_s", "number", least=0.0),
-        Column("frames", "integer", least=0),
-        Column("steps", "integer", least=0),
+        Column("wall_s", "number"),
+        Column("frames", "integer"),
+        Column("steps", "integer"),
     ),
-    identity=(*KEYS, LOG_COLUMN.name),
 )
 STEPS_TABLE = TableSchema(
     STEPS,
     (
         *CELL_COLUMNS,
-        Column("t_us", "integer", is_required=True, least=-LATEST_US, most=LATEST_US),
+        Column("t_us", "integer", is_required=True),
         Column("metric", "text", is_required=True),
-        Column("value", "number", least=-LARGEST, most=LARGEST),
+        Column("value", "number"),
         Column("valid", "flag", is_required=True),
         Column("reason", "text"),
         LOG_COLUMN,
     ),
 )
-
-
-def _check_identity(keys: pa.Table, path: Path, do_this: str) -> None:
-    """Refuse rows that are named alike: each would count as a rollout of its own."""
-    counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
-    if counted.num_rows == keys.num_rows:
-        return
-    often = counted.sort_by([("count_all", "descending")]).slice(0, 1).to_pylist()[0]
-    times = often.pop("count_all")
-    raise InputError(
-        f"{path}: {times} rows of {', '.join((f'{key} {value!r}' for key, value in often.items()))}, wanted one",
-        do_this,
-    )
 
 
 SLUG_LENGTH = 80
