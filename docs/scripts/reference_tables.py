@@ -87,7 +87,7 @@ def metric_table() -> str:
             continue
         row = (
             metric.formula or metric.help,
-            metric.reference.removesuffix(", plan view"),
+            metric.reference.removesuffix(", plan view").replace("box centre", ""),
             metric.unit,
             {"none": "neither"}.get(metric.direction, metric.direction),
             metric.aggregation,
