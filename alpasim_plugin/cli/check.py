@@ -107,7 +107,7 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
 def check_policy(
     policy: Annotated[str, Positional("A policy's name, package.module:Class, or file.py:Class.")],
     scenario: Annotated[
-        str | None, Flag("Scenario whose cameras it gets; by default one camera ahead.")
+        str | None, Flag("Scenario whose cameras it receives; default: one ahead.")
     ] = None,
     as_json: Json = False,
 ) -> None:

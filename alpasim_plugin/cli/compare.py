@@ -52,7 +52,7 @@ def compare(
         Positional("One run, its shards, or two: the second is compared with the first."),
     ] = (),
     baseline: Annotated[
-        str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")
+        str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.")
     ] = None,
     every: Annotated[
         bool, Flag("Print every metric, not only the headline ones.", "--all")

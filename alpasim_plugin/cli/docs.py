@@ -31,7 +31,7 @@ Examples:
 
 
 def docs(
-    page: Annotated[str | None, Positional("A page, such as `policies`; without it, all.")] = None,
+    page: Annotated[str | None, Positional("A page, such as `policies`; none: all.")] = None,
     as_json: Json = False,
 ) -> None:
     """Read a page of the documentation, or list all."""

@@ -46,7 +46,7 @@ def export(
     items: Annotated[
         tuple[str, ...],
         Positional(
-            "A run, a rollout, or scenarios (--alpasim); by default the newest run.",
+            "A run, a rollout, or scenarios (--alpasim).",
             metavar="RUN|ROLLOUT|SCENARIO...",
         ),
     ] = (),

@@ -32,19 +32,15 @@ def fork(
     cell: Annotated[
         Path, Positional("The rollout: RUN/RENDERER/POLICY/SCENE/SEED.", metavar="RUN/CELL")
     ],
-    at: Annotated[float, Flag("Seconds after the first frame at which the change takes effect.")],
+    at: Annotated[float, Flag("Seconds after the first frame, of the change.")],
     renderer: Annotated[str | None, Flag("Renderer after the change.")] = None,
-    policy: Annotated[
-        str | None, Flag("Policy after the change; it has seen the frames before it.")
-    ] = None,
+    policy: Annotated[str | None, Flag("Policy after the change.")] = None,
     seed: Annotated[int | None, Flag("Seed of the new parts.", min=0)] = None,
     own: Annotated[
         tuple[str, ...],
-        Flag("A part of your own that drove the rollout; it runs only if named here. Repeatable."),
+        Flag("A part of your own that drove the rollout, named again. Repeatable."),
     ] = (),
-    out: Annotated[
-        Path | None, Flag("Run folder to write; by default one below RUN/forks/.")
-    ] = None,
+    out: Annotated[Path | None, Flag("Run folder to write; default: below RUN/forks/.")] = None,
     as_json: Json = False,
 ) -> None:
     """Continue a logged rollout from an instant with another renderer, policy or seed.

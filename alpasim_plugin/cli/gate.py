@@ -52,17 +52,13 @@ def gate(
         str, Flag("A gate file, or the name of a shipped gate.", "--gate")
     ] = "default",
     baseline_file: Annotated[
-        Path | None, Flag("Compare with this stored baseline, or this earlier run.")
+        Path | None, Flag("A stored baseline, or an earlier run, to compare with.")
     ] = None,
     approve: Annotated[
         Path | None, Flag("Store the run as a baseline and stop.", "--write-baseline")
     ] = None,
-    self_test: Annotated[
-        bool, Flag("Drive broken renderers and fail unless the gate catches each.")
-    ] = False,
-    out: Annotated[
-        Path | None, Flag("Where gate.md and gate.junit.xml go; by default the run folder.")
-    ] = None,
+    self_test: Annotated[bool, Flag("Fail unless the gate catches each broken renderer.")] = False,
+    out: Annotated[Path | None, Flag("Where gate.md and gate.junit.xml go.")] = None,
     as_json: Json = False,
 ) -> None:
     """Check a run against a gate, or test the gate on broken renderers."""

@@ -34,12 +34,12 @@ def drive(
     out: Out,
     camera_height: Annotated[
         float | None,
-        Flag("Front camera above the ground, metres, where poses have no unit.", min=0.1, max=5.0),
+        Flag("Of the front camera, metres, where poses have no unit.", min=0.1, max=5.0),
     ] = None,
     road: Annotated[
         Path | None,
         Flag(
-            "OpenDRIVE map in the poses' coordinates; by default the road is the driven path.",
+            "OpenDRIVE map in the poses' coordinates; default: the driven path.",
             "--map",
         ),
     ] = None,
@@ -53,13 +53,13 @@ def splat(
     file: Annotated[
         Path,
         Positional(
-            "The model: .ply, compressed .ply, .splat, .spz, .sog, or a folder of SOG.",
+            "The model: .ply, .splat, .spz, .sog, or a folder of SOG.",
             metavar="FILE",
         ),
     ],
     poses: Annotated[
         Path,
-        Flag("Its drive, in its own frame: transforms.json, COLMAP model, KITTI folder."),
+        Flag("Its drive: transforms.json, COLMAP model, KITTI folder."),
     ],
     out: Out,
     as_json: Json = False,

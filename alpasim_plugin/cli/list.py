@@ -33,7 +33,7 @@ def list_names(
     kind: Annotated[Kind | None, Positional("What to list; without it, the kinds.")] = None,
     roots: Annotated[
         tuple[Path, ...],
-        Positional("Of runs: folders that are searched; by default runs.", metavar="[FOLDER]..."),
+        Positional("Folders of runs; default: runs.", metavar="[FOLDER]..."),
     ] = (),
     renderer: Annotated[
         tuple[str, ...], Flag("Runs with this renderer; * and ? match. Repeatable.")

@@ -37,7 +37,7 @@ Examples:
 
 def new(
     kind: Annotated[Kind, Positional("What to write.")],
-    name: Annotated[str, Positional("Its name, as a file: lower case, digits and underscores.")],
+    name: Annotated[str, Positional("Its name: lower case, digits and underscores.")],
     folder: Annotated[Path, Flag("Where it goes.")] = Path("."),
     as_json: Json = False,
 ) -> None:

@@ -24,7 +24,7 @@ from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 FIXER_PREFIX = "fixer."
 METAVARS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH", bool: " "}
 
-Run = Annotated[Path | None, Positional("A run folder; by default the newest.")]
+Run = Annotated[Path | None, Positional("A run folder; default: the newest.")]
 Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json", also="-j")]
 Debug = Annotated[bool, Flag("Show tracebacks.", "--debug")]
 Overrides = Annotated[

@@ -30,10 +30,8 @@ Examples:
 
 
 def refine(
-    source: Annotated[
-        Path, Positional("A video of any size, rate and length, or a folder of PNG.", metavar="IN")
-    ],
-    out: Annotated[Path, Flag("The refined video (MP4), or a folder of PNG.", also="-o")],
+    source: Annotated[Path, Positional("A video, or a folder of PNG.", metavar="IN")],
+    out: Annotated[Path, Flag("The refined video (MP4) or folder of PNG.", also="-o")],
     opacity: Annotated[
         Path | None, Flag("Grey, white where the input is reliable; in the input's form.")
     ] = None,

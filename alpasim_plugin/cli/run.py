@@ -80,7 +80,7 @@ def run(
     scenarios: Annotated[
         tuple[str, ...],
         Positional(
-            "Scenario or suite, a folder of them, a shipped name, or a recorded log.",
+            "Scenario, suite, folder of them, shipped name, or recorded log.",
             metavar="SCENARIO...",
             names="scenario",
         ),
@@ -114,7 +114,7 @@ def run(
     ] = None,
     workers: Annotated[
         int | None,
-        Flag("Worker processes; by default one per core.", min=1),
+        Flag("Worker processes; default: one per core.", min=1),
     ] = None,
     executor: Annotated[
         str,
@@ -122,13 +122,13 @@ def run(
     ] = "local",
     report: Annotated[
         bool,
-        Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report"),
+        Flag("Write report.html; `simrun report` writes it later.", "--report/--no-report"),
     ] = True,
     time_limit: Annotated[
         float | None,
         Flag("Seconds after which a rollout is ended and reported.", min=0.001),
     ] = None,
-    out: Annotated[Path | None, Flag("Run folder; by default one below runs/.")] = None,
+    out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None,
     shard: Annotated[
         str | None, Flag("Drive this part of the scenes alone.", metavar="I/N")
     ] = None,
@@ -138,14 +138,14 @@ def run(
     until_decided: Annotated[
         bool,
         Flag(
-            "Drive scenes in random order and stop as soon as the comparison is decided.",
+            "Sequential test: stop as soon as the comparison is decided.",
             "--until-decided",
         ),
     ] = False,
     metric: Annotated[
         tuple[str, ...],
         Flag(
-            "With --until-decided: this metric instead of the default gate's. Repeatable.",
+            "With --until-decided: NAME=MARGIN instead of the default gate's. Repeatable.",
             metavar="NAME[=MARGIN]",
         ),
     ] = (),
@@ -155,7 +155,7 @@ def run(
     ] = None,
     repeat: Annotated[
         bool,
-        Flag("Drive a rollout of each policy twice and compare the logs.", "--repeat"),
+        Flag("Drive a rollout of each policy twice and compare.", "--repeat"),
     ] = False,
     dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,

@@ -39,13 +39,11 @@ Examples:
 def score(
     logs: Annotated[
         tuple[str, ...],
-        Positional("Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes."),
+        Positional("Logs (.asl), folders of them, or patterns in quotes."),
     ],
     scene: Annotated[
         tuple[str, ...],
-        Flag(
-            "The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable."
-        ),
+        Flag("The logs' scene: a scenario, a recorded log, or a folder of them. Repeatable."),
     ],
     preset: Annotated[
         str, Flag("Evaluator presets, separated by commas.", names="preset")
@@ -58,9 +56,7 @@ def score(
         Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails"),
     ] = True,
     evaluators: Evaluators = (),
-    out: Annotated[
-        Path | None, Flag("Run folder; by default one below runs/, by logs and preset.")
-    ] = None,
+    out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None,
     as_json: Json = False,
 ) -> None:
     """Score rollout logs, AlpaSim's or ours, without rendering.

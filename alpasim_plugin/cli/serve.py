@@ -51,7 +51,7 @@ def serve(
     listen: Annotated[
         str | None,
         Flag(
-            "Address, or unix:PATH; port 0 takes a free one. Default: 127.0.0.1:50051, of a policy 50052.",
+            "Address, or unix:PATH; port 0: a free one. Default: 127.0.0.1:50051, of a policy 50052.",
             metavar="HOST:PORT",
         ),
     ] = None,
@@ -74,13 +74,13 @@ def serve(
     device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu",
     history_mb: Annotated[
         int,
-        Flag("Most memory for histories or images of callers, MiB.", min=16),
+        Flag("Most memory for callers' histories or images, MiB.", min=16),
     ] = 2048,
     mask: Annotated[
         tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")
     ] = (),
     render_width: Annotated[
-        int | None, Flag("Render wider images at this width and enlarge them, pixels.", min=16)
+        int | None, Flag("Render wider images at this width, pixels, and enlarge them.", min=16)
     ] = None,
     shutter: Annotated[
         Literal["asked", "rolling", "global"], Flag("Which shutters roll: as asked, all, or none.")

@@ -55,14 +55,14 @@ def view(
     what: Annotated[
         str | None,
         Positional(
-            "A run, a rollout or a scenario; by default the newest run.",
+            "A run, a rollout or a scenario.",
             metavar="RUN|ROLLOUT|SCENARIO",
         ),
     ] = None,
     overrides: Overrides = (),
     out: Annotated[
         Path | None,
-        Flag("The file; by default view.html in the run folder, or SCENE.png here.", also="-o"),
+        Flag("The file; default: view.html in the run folder, or SCENE.png.", also="-o"),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -30,7 +30,7 @@ def why(
     cell: Annotated[
         Path | None,
         Positional(
-            "A rollout, or a run, whose worst failure is shown.",
+            "A rollout, or a run: its worst failure.",
             metavar="RUN|RUN/CELL",
         ),
     ] = None,

@@ -42,7 +42,7 @@ class RunOptions:
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
     controller: Annotated[
         str | None,
-        Flag("Controller that tracks the plans; by default the policy's.", names="controller"),
+        Flag("Controller of the plans; default: the policy's.", names="controller"),
     ] = None
     evaluators: Annotated[
         tuple[str, ...],

@@ -56,7 +56,7 @@ def verb_section(name: str, command: Any) -> str:
             if is_argument
             else [*option.opts, *option.secondary_opts]
         )
-        is_newest = option.help == "A run folder; by default the newest."  # said once, above
+        is_newest = option.help == "A run folder; default: the newest."  # said once, above
         if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB) or is_newest:
             continue
         shown = ", ".join(f"`{name}`" for name in names)
