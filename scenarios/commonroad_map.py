@@ -137,7 +137,7 @@ def read_lanelets(
     if swapped:
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
     notes += light_notes
-    lanes = _mark_intersections(lanes)
+    lanes = mark_intersections(lanes)
     if (
         root.find("lanelet/leftBound/lineMarking") is None
         and root.find("lanelet/rightBound/lineMarking") is None
@@ -288,7 +288,7 @@ def _speed_limit(
     return min(limits) if limits else None
 
 
-def _mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
+def mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
     """Mark lanelets that overlap others they are neither linked to nor beside: those cross or fork
     inside an intersection.
     """

@@ -58,8 +58,8 @@ def load_scenario(
     """Load a scenario file, a recorded log, a map, or a shipped scenario by name.
 
     Args:
-        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, OpenDRIVE map,
-            or a name such as ``smoke/straight``.
+        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, OpenDRIVE or
+            Lanelet2 map, or a name such as ``smoke/straight``.
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene,
             with the seed in its id. Seed 0 is the file as written, but for its ``variations`` and
             ``samples``.
@@ -271,7 +271,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     if spec.map is None:
         del content["map"]
     else:
-        content["map"]["opendrive"] = "given by its content"
+        content["map"][spec.map.source[0]] = "given by its content"
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())

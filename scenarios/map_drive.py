@@ -6,7 +6,7 @@ Only the part of the map around the route enters the scene.
 from __future__ import annotations
 
 import difflib
-from collections import Counter
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,29 +14,22 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import project
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, Lane, Route, Signal, Vehicle
+from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
+from scenarios import lanelet2, opendrive
 from scenarios.expert import ExpertStyle, drive
-from scenarios.map_lines import ground_of
+from scenarios.map_lines import bordered, ground_of
 from scenarios.map_route import LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers, vehicles
-from scenarios.opendrive import bordered, read_lanes
-from scenarios.opendrive_road import (
-    OdrMap,
-    lanes_at,
-    parse_map,
-    placed,
-    sided,
-)
-from scenarios.opendrive_signals import CYCLE, GREEN_S, Head, traffic_lights, with_cycles
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
+from scenarios.street_map import CYCLE, GREEN_S, Head, StreetMap, with_cycles
 from scenarios.variation import Drawn
 
+READERS = {"opendrive": opendrive.read_street, "lanelet2": lanelet2.read_street}
 ROUTE_M = 200.0  # length of a route that is drawn
 SHORTEST_ROUTE_M = 20.0
 DRAWS = 100
@@ -60,26 +53,23 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     """
     spec = drawn.spec
     assert spec.map is not None
-    path = drawn.document.folder_of(("map", "opendrive")) / spec.map.opendrive
+    kind, text = spec.map.source
+    path = drawn.document.folder_of(("map", kind)) / text
     files = SourceFiles()
     with parsing(path, "repair this map, or use another one"):
-        odr = parse_map(files, path, files.read_xml(path))
-        odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
-        origin = _origin(odr)
-        T_local_map = np.eye(4)
-        T_local_map[:3, 3] = -origin
-        lanes, notes = read_lanes(files, path, odr, T_local_map)
-    graph = LaneGraph(lanes)
+        street = READERS[kind](files, path)
+    graph = LaneGraph(street.lanes)
     with drawn.at("map", "route"):
-        way = _way(drawn, spec.map, graph, odr, T_local_map)
-    if not any(way.lane_ids[0] in lane.successors for lane in lanes.values()):
+        way = _way(drawn, spec.map, graph, street)
+    if not any(way.lane_ids[0] in lane.successors for lane in street.lanes.values()):
         way = replace(way, start_m=max(way.start_m, REAR_M))
     goal_m = graph.line(way).length_m - way.beyond_m
     way = graph.carried_on(way, AHEAD_M)
     line = graph.line(way)
-    near = _near(lanes, line)
-    lane_map = bordered(odr, near, T_local_map)
-    heads, light_notes = traffic_lights(odr, near, T_local_map)
+    lane_map = _around(street, line)
+    heads = [
+        head for head in street.heads if any(key in lane_map.lanes for key in head.signal.lanes)
+    ]
     style = ExpertStyle(
         spec.ego.speed_mps,
         spec.ego.cruise_mps,
@@ -94,40 +84,29 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     if duration_us is not None:
         end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
     rng = stream(drawn.scene_id, spec.seed, "scenario/map/vehicles")
-    followers = place_followers(LaneGraph(near), way, line, spec.map.vehicles, rng)
+    followers = place_followers(LaneGraph(lane_map.lanes), way, line, spec.map.vehicles, rng)
     run = drive(driven, 0.0, vehicle, style, (), followers, end_us, lane_map.signals)
     return RecordedLog(
         drawn.scene_id,
-        "opendrive",
+        kind,
         lane_map,
         ground_of(lane_map, run.ego_log.xyz),
         run.ego_log,
         vehicle,
         vehicles(followers, run.followers),
         (),
-        (float(origin[0]), float(origin[1]), 0.0),
+        street.origin,
         files.content_hash,
-        (*_said(odr, way, goal_m, heads, len(followers)), *notes, *light_notes),
+        (*_said(way, goal_m, heads, len(followers)), *street.notes),
         route=Route(line.xyz[::4], way.lane_ids),
     )
 
 
-def _origin(odr: OdrMap) -> F64:
-    """Return the start ``(3,)`` of the first road, in whole metres: the subtraction loses
-    nothing.
-    """
-    starts = [road.records[0] for road in odr.roads if road.records]
-    if not starts:
-        return np.zeros(3)
-    return np.array([np.round(starts[0].x_m), np.round(starts[0].y_m), 0.0])
-
-
-def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, odr: OdrMap, T_local_map: F64) -> Way:
+def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:
     """Return the route: between two places, or with an end that is drawn."""
     named = spec.route if isinstance(spec.route, MapRoute) else MapRoute()
     starts, goals = (
-        None if text is None else _spots(text, graph, odr, T_local_map)
-        for text in (named.from_, named.to)
+        None if text is None else _spots(text, graph, street) for text in (named.from_, named.to)
     )
     rng = stream(drawn.scene_id, drawn.spec.seed, "scenario/map/route")
     best: Way | None = None
@@ -159,30 +138,25 @@ def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, odr: OdrMap, T_local_map
     return best
 
 
-def _spots(text: str, graph: LaneGraph, odr: OdrMap, T_local_map: F64) -> list[Spot]:
+def _spots(text: str, graph: LaneGraph, street: StreetMap) -> list[Spot]:
     """Return the places on lanes for vehicles at ``ROAD:S``.
 
     Raises:
         InputError: There is no such road, it is shorter, or has no lane for vehicles there.
     """
     name, _, number = text.rpartition(":")
-    s_m = float(number)
-    roads = {road.road_id: road for road in odr.roads}
-    road = roads.get(name)
-    if road is None:
-        near = difflib.get_close_matches(name, list(roads), n=3, cutoff=0.0)
+    length_m = street.roads.get(name)
+    if length_m is None:
+        near = difflib.get_close_matches(name, list(street.roads), n=3, cutoff=0.0)
         raise InputError(
-            f"{text}: the map has no road {name!r}", f"choose a road such as {', '.join(near)}"
+            f"{text}: the map has no road {name!r} with lanes",
+            f"choose a road such as {', '.join(near)}",
         )
-    if s_m > road.length_m or not road.records or not road.sections:
+    if float(number) > length_m:
         raise InputError(
-            f"{text}: road {name} has lanes from 0 to {road.length_m:.1f} m", "choose a place on it"
+            f"{text}: road {name} has lanes from 0 to {length_m:.1f} m", "choose a place on it"
         )
-    spots = []
-    for _, key, inner_t, outer_t in lanes_at(road, s_m):
-        if key in graph.lanes:
-            point = placed(road, np.array([[s_m, (inner_t + outer_t) / 2]]), T_local_map)[0]
-            spots.append(Spot(key, project(graph.lanes[key].centre, point)[0]))
+    spots = [spot for spot in street.spots(name, float(number)) if spot.lane_id in graph.lanes]
     if not spots:
         raise InputError(
             f"{text}: road {name} has no lane there on which a car fits", "choose another place"
@@ -190,13 +164,33 @@ def _spots(text: str, graph: LaneGraph, odr: OdrMap, T_local_map: F64) -> list[S
     return spots
 
 
-def _near(lanes: dict[str, Lane], line: Path) -> dict[str, Lane]:
-    """Return the lanes that come near to the route."""
+def _near(line: Path, shapes: Sequence[F64]) -> Bool:
+    """Return which polylines and points come near to the route, by their vertices."""
     route = shapely.linestrings(line.xyz[::8, :2])
     shapely.prepare(route)
-    centres = [shapely.linestrings(lane.centre[:, :2]) for lane in lanes.values()]
-    close = shapely.dwithin(route, centres, AROUND_M)
-    return {key: lane for (key, lane), keep in zip(lanes.items(), close, strict=True) if keep}
+    places = [shapely.multipoints(shape[:, :2]) for shape in shapes]
+    return np.asarray(shapely.dwithin(route, places, AROUND_M), dtype=np.bool_)
+
+
+def _around(street: StreetMap, line: Path) -> LaneMap:
+    """Return the part of a map around the route."""
+    beside = street.beside
+
+    def kept(shapes: Sequence[F64]) -> tuple[F64, ...]:
+        return tuple(itertools.compress(shapes, _near(line, shapes)))
+
+    lanes = list(street.lanes.items())
+    middles = [pose[None, :3, 3] for pose, _ in beside.signs]
+    return bordered(
+        dict(itertools.compress(lanes, _near(line, [lane.centre for _, lane in lanes]))),
+        replace(
+            beside,
+            crosswalks=kept(beside.crosswalks),
+            stop_lines=kept(beside.stop_lines),
+            poles=kept(beside.poles),
+            signs=tuple(itertools.compress(beside.signs, _near(line, middles))),
+        ),
+    )
 
 
 def _until(line: Path, length_m: float) -> Path:
@@ -222,22 +216,12 @@ def _timed(
     return with_cycles(heads, begins_us)
 
 
-def _said(
-    odr: OdrMap, way: Way, goal_m: float, heads: Sequence[Head], vehicles: int
-) -> tuple[str, ...]:
-    """Return what was chosen, and the signs of the whole map by their type."""
+def _said(way: Way, goal_m: float, heads: Sequence[Head], vehicles: int) -> tuple[str, ...]:
+    """Return what was chosen."""
     notes = [
         f"route of {goal_m:.0f} m from lane {way.lane_ids[0]}, with {vehicles} vehicles; the map "
         f"within {AROUND_M:.0f} m of it is used"
     ]
-    signals = [one for road in odr.roads for one in road.signals]
-    signs = Counter(one.kind for one in signals if not one.dynamic)
-    if signals:
-        listed = ", ".join(f"{kind} ({n})" for kind, n in sorted(signs.items()))
-        notes.append(
-            f"{sum(signs.values())} signs by type: {listed or 'none'}; "
-            f"{len(signals) - sum(signs.values())} traffic lights"
-        )
     if heads:
         notes.append(f"the map has no times of its lights: {CYCLE}")
     return tuple(notes)

@@ -20,7 +20,7 @@ import scipy
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, densify
-from alpasim_plugin.core.lane_areas import HALF_WIDTH_M
+from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap
 from alpasim_plugin.world.ground import flat, from_points
 
@@ -47,6 +47,13 @@ def ground_of(lane_map: LaneMap, drive: F64) -> HeightField:
     if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0:
         return flat(0.0)
     return from_points(points, drive=drive)
+
+
+def bordered(lanes: Mapping[str, Lane], beside: LaneMap) -> LaneMap:
+    """Return a map with lanes and the border of their surface added."""
+    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
+    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
+    return replace(beside, lanes=lanes, road_edges=edges)
 
 
 def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:

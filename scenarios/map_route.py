@@ -15,7 +15,7 @@ from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 STATION_M = 2.0  # of the driven line, which is smooth in between
 CHANGE_M = 40.0  # length of a lane change, where the lanes are as long
 SHORTEST_CHANGE_M = 20.0
-NARROWEST_M = 2.2  # of a lane on which a car fits
+NARROWEST_M, WIDEST_M = 2.2, 15.0  # of a lane on which a car fits, and whose edges run together
 CHANGE_COST_M = 50.0  # a way is so much longer before a lane change is worth it
 
 
@@ -40,14 +40,14 @@ class Way:
 
 class LaneGraph:
     """Lanes for vehicles and how they follow one another; a lane that opens or closes, narrow at one
-    end, is not among them.
+    end, is not among them, nor is one whose edges do not run side by side.
     """
 
     def __init__(self, lanes: Mapping[str, Lane]) -> None:
         self.lanes = {
             key: lane
             for key, lane in lanes.items()
-            if lane.kind in ("vehicle", "bus") and _least_width_m(lane) >= NARROWEST_M
+            if lane.kind in ("vehicle", "bus") and _is_even(lane)
         }
         self.length_m = {k: float(arc_lengths(v.centre)[-1]) for k, v in self.lanes.items()}
 
@@ -162,8 +162,9 @@ class LaneGraph:
         return abs(float(wrap_angle(last - first)))
 
 
-def _least_width_m(lane: Lane) -> float:
-    """Return the width of a lane where it is narrowest; its edges have the same stations."""
+def _is_even(lane: Lane) -> bool:
+    """Return whether a car fits on a lane everywhere; its edges have the same stations."""
     assert lane.left is not None
     assert lane.right is not None
-    return float(np.linalg.norm((lane.left - lane.right)[:, :2], axis=1).min())
+    widths_m = np.linalg.norm((lane.left - lane.right)[:, :2], axis=1)
+    return bool(widths_m.min() >= NARROWEST_M and widths_m.max() <= WIDEST_M)

@@ -15,13 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from alpasim_plugin.core.geometry import densify
-from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.geometry import densify, project
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
-from scenarios.map_lines import border_lines, lane_edges, merge_areas
+from scenarios.map_lines import bordered
+from scenarios.map_route import Spot
 from scenarios.opendrive_road import (
     JOIN_M,
     MAX_ROAD_M,
@@ -36,13 +37,17 @@ from scenarios.opendrive_road import (
     gap_m,
     lane_borders,
     lane_key,
+    lanes_at,
     missing_m,
+    parse_map,
+    placed,
     reference_line,
     road_points,
     sided,
 )
-from scenarios.opendrive_signals import roadside
+from scenarios.opendrive_signals import roadside, traffic_lights
 from scenarios.recorded import SourceFiles
+from scenarios.street_map import StreetMap
 
 # WGS 84 ellipsoid (NIMA TR8350.2).
 SEMI_MAJOR_M = 6378137.0
@@ -222,20 +227,22 @@ def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
     return values["lat_0"], values["lon_0"], values.get("alt_0", 0.0)
 
 
+def earth_xyz(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike) -> F64:
+    """Return earth-centred, earth-fixed coordinates ``(..., 3)`` in metres."""
+    lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
+    e2 = FLATTENING * (2.0 - FLATTENING)
+    n = SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    level = (n + height_m) * np.cos(lat)
+    z = (n * (1.0 - e2) + height_m) * np.sin(lat)
+    return np.stack([level * np.cos(lon), level * np.sin(lon), z], axis=-1)
+
+
 def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
     """Return the ``(4, 4)`` transform from earth-centred coordinates to east, north, up at a
     place.
     """
     lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
-    e2 = FLATTENING * (2.0 - FLATTENING)
-    n = SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
-    place = np.array(
-        [
-            (n + height_m) * np.cos(lat) * np.cos(lon),
-            (n + height_m) * np.cos(lat) * np.sin(lon),
-            (n * (1.0 - e2) + height_m) * np.sin(lat),
-        ]
-    )
+    place = earth_xyz(lat_deg, lon_deg, height_m)
     east = [-np.sin(lon), np.cos(lon), 0.0]
     north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
     up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
@@ -257,7 +264,7 @@ def lane_map_of(
     """
     odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     lanes, notes = read_lanes(files, where, odr, T_local_map)
-    return bordered(odr, lanes, T_local_map), notes
+    return bordered(lanes, roadside(odr, lanes, T_local_map)), notes
 
 
 def read_lanes(
@@ -313,13 +320,53 @@ def read_lanes(
     return linked, (*notes, *link_notes, *odr.notes)
 
 
-def bordered(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMap:
-    """Return the map of lanes with the border of their surface, and what the roads of these lanes
-    have on and beside them.
+def read_street(files: SourceFiles, path: Path) -> StreetMap:
+    """Read a map for a drive on it. Its origin is the start of the first road, in whole metres: the
+    subtraction loses nothing.
+
+    Raises:
+        InputError: The file is no map, or broken.
     """
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
-    return replace(roadside(odr, lanes, T_local_map), lanes=lanes, road_edges=edges)
+    odr = parse_map(files, path, files.read_xml(path))
+    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
+    starts = [road.records[0] for road in odr.roads if road.records]
+    origin = (np.round(starts[0].x_m), np.round(starts[0].y_m), 0.0) if starts else (0.0, 0.0, 0.0)
+    T_local_map = np.eye(4)
+    T_local_map[:3, 3] = np.negative(origin)
+    lanes, notes = read_lanes(files, path, odr, T_local_map)
+    heads, light_notes = traffic_lights(odr, lanes, T_local_map)
+    roads = {road.road_id: road for road in odr.roads if road.records and road.sections}
+
+    def spots(name: str, s_m: float) -> list[Spot]:
+        road, found = roads[name], []
+        for _, key, inner_t, outer_t in lanes_at(road, s_m):
+            if key in lanes:
+                middle = np.array([[s_m, (inner_t + outer_t) / 2]])
+                point = placed(road, middle, T_local_map)[0]
+                found.append(Spot(key, project(lanes[key].centre, point)[0]))
+        return found
+
+    return StreetMap(
+        lanes,
+        roadside(odr, lanes, T_local_map),
+        heads,
+        {name: road.length_m for name, road in roads.items()},
+        spots,
+        origin,
+        (*_signs_by_type(odr), *notes, *light_notes),
+    )
+
+
+def _signs_by_type(odr: OdrMap) -> tuple[str, ...]:
+    signals = [one for road in odr.roads for one in road.signals]
+    if not signals:
+        return ()
+    signs = Counter(one.kind for one in signals if not one.dynamic)
+    listed = ", ".join(f"{kind} ({n})" for kind, n in sorted(signs.items()))
+    return (
+        f"{signs.total()} signs by type: {listed or 'none'}; "
+        f"{len(signals) - signs.total()} traffic lights",
+    )
 
 
 def _section(

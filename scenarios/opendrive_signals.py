@@ -1,9 +1,5 @@
-"""What stands on and beside the roads of an OpenDRIVE map: crosswalks, stop lines, signs, and traffic
-lights with a stated cycle.
-
-OpenDRIVE says which light is switched by which controller, and no times. The cycle here is assumed:
-the lights of one controller (without one: of one road) are green together, the groups of a
-junction one after the other, and people cross a road while its own traffic has red.
+"""What stands on and beside the roads of an OpenDRIVE map: crosswalks, stop lines, signs and traffic
+lights. The lights of one controller (without one: of one road) are one group.
 
 Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 """
@@ -11,7 +7,6 @@ Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,26 +23,11 @@ from scenarios.opendrive_road import (
     placed,
     reference_line,
 )
+from scenarios.street_map import Head
 
 PEDESTRIAN_LIGHT = "1000002"
-GREEN_S, YELLOW_S, CLEAR_S = 6.0, 3.0, 2.0  # of each group; all are red between two groups
-WALK_END_S = 5.0  # people have red so long before the traffic may drive
-TURN_S = GREEN_S + YELLOW_S + CLEAR_S
-CYCLE = (
-    f"assumed {GREEN_S:g} s green, {YELLOW_S:g} s yellow, {CLEAR_S:g} s red for all, groups in turn"
-)
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
 PLATE_M = 0.1  # what is lower than this is painted on the road
-
-
-@dataclass(frozen=True)
-class Head:
-    """A traffic light, where one waits for it, and the group that it belongs to."""
-
-    signal: Signal  # without its cycle
-    junction: str
-    group: str
-    road_id: str
 
 
 def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMap:
@@ -99,38 +79,6 @@ def traffic_lights(
             loose += [] if found else [one.signal_id]
     notes = [f"{len(loose)} traffic lights hold back no lane: {', '.join(loose)}"] if loose else []
     return tuple(heads), tuple(notes)
-
-
-def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Signal, ...]:
-    """Return the lights with their cycles.
-
-    Args:
-        heads: All lights.
-        begins_us: Junction to the time at which its first group turns green; others begin at 0.
-    """
-    groups: dict[str, list[str]] = {}
-    of_road: dict[str, str] = {}
-    for head in heads:
-        known = groups.setdefault(head.junction, [])
-        if not head.signal.pedestrians:
-            known.append(head.group)
-            of_road[head.road_id] = head.group
-    out = []
-    for head in heads:
-        known = sorted(set(groups[head.junction]), key=lambda name: (len(name), name))
-        group = of_road.get(head.road_id, head.group)
-        turn = known.index(group) if group in known else 0
-        cycle_s = TURN_S * max(len(known), 2)
-        if head.signal.pedestrians:
-            walk_s = cycle_s - TURN_S - WALK_END_S
-            phases, first_s = [("green", walk_s), ("red", cycle_s - walk_s)], TURN_S
-        else:
-            rest_s = cycle_s - GREEN_S - YELLOW_S
-            phases, first_s = [("green", GREEN_S), ("yellow", YELLOW_S), ("red", rest_s)], 0.0
-        offset_us = begins_us.get(head.junction, 0) + round((turn * TURN_S + first_s) * 1e6)
-        timed = tuple((colour, round(lasts_s * 1e6)) for colour, lasts_s in phases)
-        out.append(replace(head.signal, phases=timed, offset_us=offset_us))
-    return tuple(out)
 
 
 def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:

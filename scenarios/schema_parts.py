@@ -241,7 +241,7 @@ class MapRoute(Part):
     from_: Place | None = Field(
         default=None,
         alias="from",
-        description="Start of the rear axle, ROAD:S: metres along the road.",
+        description="Start of the rear axle, ROAD:S: metres along the road (of Lanelet2: the lanelet).",
     )
     to: Place | None = Field(default=None, description="End, ROAD:S.")
 
@@ -249,7 +249,12 @@ class MapRoute(Part):
 class MapSpec(Part):
     """A map without a drive: an expert drives a route on it, and the street is built around."""
 
-    opendrive: str = Field(min_length=1, description="OpenDRIVE file, relative to this file.")
+    opendrive: str | None = Field(
+        default=None, min_length=1, description="OpenDRIVE file, relative to this file."
+    )
+    lanelet2: str | None = Field(
+        default=None, min_length=1, description="Lanelet2 file; give it or opendrive."
+    )
     route: Annotated[
         Annotated[Literal["random"], Tag("(drawn)")] | Annotated[MapRoute, Tag("(named)")],
         Discriminator(lambda given: "(drawn)" if isinstance(given, str) else "(named)"),
@@ -257,6 +262,19 @@ class MapSpec(Part):
     vehicles: int = Field(
         default=6, ge=0, le=100, description="Vehicles near the route, which react (IDM)."
     )
+
+    @model_validator(mode="after")
+    def _one(self) -> MapSpec:
+        if (self.opendrive is None) == (self.lanelet2 is None):
+            raise ValueError("neither or both of opendrive and lanelet2 | give one of them")
+        return self
+
+    @property
+    def source(self) -> tuple[str, str]:
+        """Return the key of the map's format, and the file."""
+        if self.opendrive is not None:
+            return "opendrive", self.opendrive
+        return "lanelet2", str(self.lanelet2)
 
 
 class _Actor(Part):

@@ -22,7 +22,7 @@ SCENARIO_FILE = "scenario.yaml"  # of an imported drive
 MODELS = (".ply", ".splat", ".spz", ".sog")
 FILMS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
 DRIVES = ("transforms.json", "calib.txt", "cameras.bin", "cameras.txt", "sparse", "colmap")
-MAP = "opendrive"
+MAPS = {".xodr": "opendrive", ".osm": "lanelet2"}
 DRIVE_FILE = "drive.json"  # of an imported drive, as `scenarios.drive` has it
 
 
@@ -103,8 +103,8 @@ def open_document(path: Path, source: str | None) -> Document:
         InputError: Nothing recognises the path, the file is broken, or it is a suite.
     """
     kind = source or detect(path)
-    if kind == MAP:
-        return Document({"version": 1, "map": {MAP: str(real(path))}}, {}, str(path))
+    if kind in MAPS.values():
+        return Document({"version": 1, "map": {kind: str(real(path))}}, {}, str(path))
     if kind != "yaml":
         place = str(real(path))
         log = {kind: place} if kind in SHIPPED else {"source": kind, "path": place}
@@ -127,15 +127,15 @@ def source_of(path: Path) -> str | None:
 
 
 def detect(path: Path) -> str:
-    """Return ``yaml``, ``opendrive`` or the name of the source that a path is.
+    """Return ``yaml``, a format of maps or the name of the source that a path is.
 
     Raises:
         InputError: Nothing recognises it.
     """
     if path.suffix in (".yaml", ".yml") and not os.path.isdir(path):
         return "yaml"
-    if path.suffix == ".xodr":
-        return MAP
+    if path.suffix in MAPS:
+        return MAPS[path.suffix]
     name = source_of(path)
     if name is not None:
         return name
@@ -146,7 +146,7 @@ def detect(path: Path) -> str:
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
     raise InputError(
         f"{path}: {what} that no reader recognises",
-        f"give a scenario .yaml, an OpenDRIVE .xodr, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)",
+        f"give a scenario .yaml, a map (OpenDRIVE .xodr, Lanelet2 .osm), or one of: {formats}; a reader of your own is named with --source (docs/extending.md)",
     )
 
 

@@ -108,6 +108,10 @@ def run(
             "--set",
         ),
     ] = (),
+    start: Annotated[
+        str | None, Flag("Start of the route on a map, ROAD:S; by default drawn.", "--from")
+    ] = None,
+    goal: Annotated[str | None, Flag("End of the route, ROAD:S.", "--to")] = None,
     source: Annotated[
         str | None,
         Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
@@ -167,7 +171,9 @@ def run(
     """
     ray = parse_executor(executor)
     find_preset(options.preset)
-    of_scene, of_fixer = split_overrides(overrides)
+    ends = {"from": start, "to": goal}
+    route = [f"map.route.{key}={place}" for key, place in ends.items() if place is not None]
+    of_scene, of_fixer = split_overrides((*overrides, *route))
     listed: dict[tuple[ScenarioRef, ...], str] = {}
     for item in scenarios:
         found = tuple(expand(item, of_scene, source))

@@ -15,8 +15,9 @@ from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
 from scenarios.opendrive import read_lanes
 from scenarios.opendrive_road import parse_map
-from scenarios.opendrive_signals import traffic_lights, with_cycles
+from scenarios.opendrive_signals import traffic_lights
 from scenarios.recorded import SourceFiles
+from scenarios.street_map import with_cycles
 from tests.files.test_opendrive import lane, road, section
 
 FILES = SourceFiles()
@@ -182,7 +183,8 @@ def test_what_stands_beside_a_road_is_part_of_the_map_and_what_does_not_fit_is_s
     sign = '<signal id="s" s="30" t="-5" type="205" dynamic="no" orientation="+" zOffset="2" height="0.9" width="0.8"/>'
     lost = '<signalReference id="nobody" s="1" t="0" orientation="+"/>'
     first, second = two_roads(sign, lost, light("in the field", 150, t=40))
-    made = scenario(tmp_path, (first.replace("</road>", f"{objects}</road>"), second))
+    parts = (first.replace("</road>", f"{objects}</road>"), second)
+    made = scenario(tmp_path, parts, *named("1:0", "2:150"))
     x = made.world_origin[0]
     (ring,) = made.lane_map.crosswalks
     assert ring[:3, :2] + [x, made.world_origin[1]] == pytest.approx(

@@ -1,0 +1,434 @@
+"""Lanelet2 maps: OSM XML of nodes, ways for the bounds of lanes, and relations for lanelets and
+regulatory elements.
+
+A lanelet's left bound is on its left in driving direction, however its ways are drawn. Lanelets that
+share the end points of both bounds follow each other; those that share a bound lie side by side. A
+lanelet that is driven both ways becomes two lanes, the second one named ``-ID``.
+
+Source: Poggenhans and others, Lanelet2: A high-definition map framework (ITSC 2018), and the
+format's public description (LaneletPrimitives, RegulatoryElementTagging).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import scipy
+
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, transform_points
+from alpasim_plugin.core.reading import some_of
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Signal
+from scenarios.commonroad_map import mark_intersections
+from scenarios.map_lines import is_left_of, rails
+from scenarios.map_route import Spot
+from scenarios.opendrive import T_enu_earth, earth_xyz
+from scenarios.recorded import SourceFiles
+from scenarios.street_map import Head, StreetMap
+
+KINDS = {
+    **dict.fromkeys(("road", "highway", "play_street", "exit"), "vehicle"),
+    "bus_lane": "bus",
+    "bicycle_lane": "bike",
+    **dict.fromkeys(("emergency_lane", "road_shoulder"), "shoulder"),
+}
+MARKS = ("line_thin", "line_thick", "bike_marking")  # ways that are painted on the road
+UNMARKED = ("virtual", "road_border", "curbstone", "guard_rail", "wall", "fence", "rail")
+SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(km/h|kmh|mph|m/s|mps|)", re.ASCII)
+MPS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0}
+JUNCTION_M = 60.0  # lights whose lines lie nearer to each other belong to one junction
+LIGHT_M, SIGN_M, PLATE_M = 3.0, 2.1, 0.6  # height of lights, of signs, and of a sign itself
+
+
+@dataclass(frozen=True)
+class Item:
+    """A node, way or relation: its tags and, of the latter two, its members by role."""
+
+    tags: Mapping[str, str]
+    members: tuple[tuple[str, str, str], ...] = ()  # type, role, id
+
+    def of(self, role: str, kind: str) -> list[str]:
+        """Return the ids of the members of one type that have a role."""
+        return [ref for of_kind, of_role, ref in self.members if (of_kind, of_role) == (kind, role)]
+
+
+class Osm:
+    """The elements of a file, with an error for each that is missing, and places in metres.
+
+    Args:
+        files: Reads and hashes.
+        path: The file.
+
+    Raises:
+        InputError: No OSM file, or one id twice.
+    """
+
+    def __init__(self, files: SourceFiles, path: Path) -> None:
+        self.files, self.path = files, path
+        root = files.read_xml(path)
+        if root.tag != "osm":
+            raise files.fail(path, f"root element {root.tag!r}", "give a Lanelet2 map (OSM XML)")
+        self.items: dict[str, dict[str, Item]] = {"node": {}, "way": {}, "relation": {}}
+        places: dict[str, dict[str, str]] = {}
+        for element in root:
+            of_kind = self.items.get(element.tag)
+            if of_kind is None or element.get("action") == "delete":
+                continue
+            key = str(element.get("id"))
+            if key in of_kind:
+                raise files.fail(path, f"{element.tag} {key} twice", "give each its own id")
+            of_kind[key] = _item(element)
+            if element.tag == "node":
+                places[key] = {**element.attrib, **of_kind[key].tags}
+        self.lanelets = self.relations("lanelet")
+        self.rules = self.relations("regulatory_element")
+        used = {ref for way in self._used_ways() for ref in self.nodes(way)}
+        self.xyz, self.origin, self.notes = self._placed({key: places[key] for key in sorted(used)})
+
+    def relations(self, kind: str) -> dict[str, Item]:
+        """Return the relations of one type."""
+        found = self.items["relation"].items()
+        return {key: item for key, item in found if item.tags.get("type") == kind}
+
+    def ways(self, kind: str) -> list[str]:
+        """Return the ways of one type."""
+        return [key for key, way in self.items["way"].items() if way.tags.get("type") == kind]
+
+    def nodes(self, way: str) -> list[str]:
+        """Return the nodes of a way, each once in a row.
+
+        Raises:
+            InputError: The way is missing or shorter than two nodes, or one of them is missing.
+        """
+        item = self.items["way"].get(way)
+        if item is None:
+            raise self.files.fail(self.path, f"way {way}, which is missing", "add it to the map")
+        refs = item.of("", "node")
+        lost = next((ref for ref in refs if ref not in self.items["node"]), None)
+        where = f"{self.path}, way {way}"
+        if lost is not None:
+            raise self.files.fail(where, f"node {lost}, which is missing", "add it to the map")
+        refs = refs[:1] + [after for before, after in pairwise(refs) if after != before]
+        if len(refs) < 2:
+            raise self.files.fail(where, f"{len(refs)} node", "give it at least two")
+        return refs
+
+    def line(self, nodes: Iterable[str]) -> F64:
+        """Return the points ``(N, 3)`` of nodes."""
+        return np.array([self.xyz[node] for node in nodes])
+
+    def _used_ways(self) -> list[str]:
+        beside = ("stop_line", "traffic_sign", "traffic_light")
+        found = [key for kind in beside for key in self.ways(kind)]
+        for lanelet in self.lanelets.values():
+            found += [*lanelet.of("left", "way"), *lanelet.of("right", "way")]
+        for rule in self.rules.values():
+            found += rule.of("ref_line", "way")
+        return found
+
+    def _placed(
+        self, places: Mapping[str, Mapping[str, str]]
+    ) -> tuple[dict[str, F64], tuple[float, float, float], tuple[str, ...]]:
+        """Return the nodes' places in metres, what was subtracted, and notes on the frame.
+
+        Metres ``local_x``, ``local_y`` go before latitude and longitude, which are projected onto
+        the plane that touches the earth in the middle of the map.
+        """
+        local = {key for key, place in places.items() if "local_x" in place or "local_y" in place}
+        if local and len(local) < len(places):
+            key = next(key for key in places if key not in local)
+            raise self.files.fail(
+                f"{self.path}, node {key}",
+                f"no local_x and local_y, which {len(local)} of {len(places)} nodes have",
+                "give them to all nodes, or to none",
+            )
+        axes = ("local_x", "local_y") if local else ("lon", "lat")
+        xy = np.array([[self._number(k, p, axis) for axis in axes] for k, p in places.items()])
+        xy = xy.reshape(-1, 2)
+        high = all("ele" in place for place in places.values())
+        z = np.array([self._number(k, p, "ele") if high else 0.0 for k, p in places.items()])
+        notes = [] if high else ["not all points have a height (ele): the map is level"]
+        if local:
+            shift = np.round(xy[0])
+            origin = (float(shift[0]), float(shift[1]), 0.0)
+            points = np.column_stack([xy - shift, z])
+        else:
+            if not (np.abs(xy) <= (180.0, 90.0)).all():
+                key = list(places)[int(np.argmax((np.abs(xy) > (180.0, 90.0)).any(axis=1)))]
+                raise self.files.fail(
+                    f"{self.path}, node {key}", "no place on the earth", "correct lat and lon"
+                )
+            origin = (0.0, 0.0, 0.0)
+            lon, lat = np.round((xy.min(axis=0) + xy.max(axis=0)) / 2, 3) if len(xy) else (0.0, 0.0)
+            earth = earth_xyz(xy[:, 1], xy[:, 0], np.zeros(len(xy)))
+            points = transform_points(T_enu_earth(lat, lon, 0.0), earth)
+            points[:, 2] = z
+            notes.append(f"origin at latitude {lat:.3f}, longitude {lon:.3f}; x east, y north")
+        self.files.near(self.path, points)
+        return dict(zip(places, points, strict=True)), origin, tuple(notes)
+
+    def _number(self, key: str, place: Mapping[str, str], name: str) -> float:
+        try:
+            value = float(place[name])
+        except (KeyError, ValueError):
+            value = float("nan")
+        if not np.isfinite(value):
+            found = f"{name} = {place.get(name)!r}"
+            raise self.files.fail(f"{self.path}, node {key}", found, "give a number")
+        return value
+
+
+def _item(element: Element) -> Item:
+    tags = {str(tag.get("k")): str(tag.get("v")) for tag in element.iter("tag")}
+    nodes = [("node", "", str(nd.get("ref"))) for nd in element.iter("nd")]
+    members = [
+        (str(one.get("type")), str(one.get("role")), str(one.get("ref")))
+        for one in element.iter("member")
+    ]
+    return Item(tags, (*nodes, *members))
+
+
+@dataclass(frozen=True)
+class Bound:
+    """One bound of a lane in driving direction."""
+
+    way: str
+    nodes: tuple[str, ...]
+
+    def turned(self) -> Bound:
+        """Return the bound in the other direction."""
+        return Bound(self.way, self.nodes[::-1])
+
+
+def read_street(files: SourceFiles, path: Path) -> StreetMap:
+    """Read a map for a drive on it.
+
+    Raises:
+        InputError: The file is no Lanelet2 map, an element that is used is missing or broken, or no
+            lanelet is for vehicles.
+    """
+    osm = Osm(files, path)
+    left_out: Counter[str] = Counter()
+    crosswalks: list[F64] = []
+    bounds: dict[str, tuple[Bound, Bound]] = {}
+    lanes: dict[str, Lane] = {}
+    limits, unread = _limits(osm)
+    for key, lanelet in osm.lanelets.items():
+        left, right = _bounds(osm, key, lanelet)
+        subtype = lanelet.tags.get("subtype", "road")
+        kind = KINDS.get(subtype)
+        if subtype == "crosswalk":
+            crosswalks.append(osm.line((*left.nodes, *right.nodes[::-1], left.nodes[0])))
+        if kind is None or (kind != "bike" and not _for_vehicles(lanelet)):
+            left_out[subtype] += 1
+            continue
+        bounds[key] = left, right
+        lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
+    if not any(lane.kind == "vehicle" for lane in lanes.values()):
+        raise files.fail(path, "a map without a lanelet for vehicles", "use one with a road")
+    lanes = mark_intersections(_linked(lanes, bounds))
+    for key in [key for key in lanes if osm.lanelets[key].tags.get("one_way") in ("no", "false")]:
+        left, right = bounds[key]
+        bounds[f"-{key}"] = right.turned(), left.turned()
+        back = _lane(osm, f"-{key}", lanes[key].kind, *bounds[f"-{key}"], limits.get(key))
+        lanes[f"-{key}"] = replace(back, is_intersection=lanes[key].is_intersection)
+    lanes = _linked(lanes, bounds)
+    lengths = {key: float(arc_lengths(lane.centre)[-1]) for key, lane in lanes.items()}
+
+    def spots(name: str, s_m: float) -> list[Spot]:
+        there = {name: s_m, f"-{name}": lengths[name] - s_m}
+        return [Spot(key, at_m) for key, at_m in there.items() if key in lanes]
+
+    heads = _heads(osm, lanes)
+    notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
+    if unread:
+        notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
+    areas = len(osm.relations("multipolygon"))
+    notes += [f"areas (multipolygon) left out: {areas}"] if areas else []
+    return StreetMap(
+        lanes,
+        LaneMap(
+            {},
+            crosswalks=tuple(crosswalks),
+            stop_lines=tuple(osm.line(osm.nodes(way)) for way in osm.ways("stop_line")),
+            poles=_posts(osm),
+            signs=tuple(_sign(osm, way) for way in osm.ways("traffic_sign")),
+        ),
+        heads,
+        lengths,
+        spots,
+        osm.origin,
+        (*osm.notes, *notes),
+    )
+
+
+def _for_vehicles(lanelet: Item) -> bool:
+    """Return whether vehicles may use a lanelet: where participants are named, only those may."""
+    named = [key for key in lanelet.tags if key.startswith("participant:")]
+    return not named or any(
+        key.startswith("participant:vehicle") and lanelet.tags[key] == "yes" for key in named
+    )
+
+
+def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
+    """Return the bounds of a lanelet, both in the direction that has the left one on the left."""
+    where = f"{osm.path}, lanelet {key}"
+    found = []
+    for side in ("left", "right"):
+        ways = lanelet.of(side, "way")
+        if len(ways) != 1:
+            raise osm.files.fail(where, f"{len(ways)} ways as {side} bound", "give it one")
+        found.append(Bound(ways[0], tuple(osm.nodes(ways[0]))))
+    left, right = found
+    ends = [osm.line((bound.nodes[0], bound.nodes[-1])) for bound in found]
+    apart = np.linalg.norm(ends[0] - ends[1], axis=1).sum()
+    if np.linalg.norm(ends[0] - ends[1][::-1], axis=1).sum() < apart:
+        right = right.turned()
+    lines = osm.line(left.nodes), osm.line(right.nodes)
+    if left.way == right.way or min(float(arc_lengths(line)[-1]) for line in lines) <= 0.0:
+        raise osm.files.fail(where, "a bound without length, or one for both sides", "correct it")
+    if not is_left_of(*lines):
+        left, right = left.turned(), right.turned()
+    return left, right
+
+
+def _lane(
+    osm: Osm, key: str, kind: str, left: Bound, right: Bound, limit_mps: float | None
+) -> Lane:
+    lines = osm.line(left.nodes), osm.line(right.nodes)
+    lane = Lane(
+        key,
+        centre_line(*lines),
+        *lines,
+        kind,
+        left_paint=_paint(osm.items["way"][left.way]),
+        right_paint=_paint(osm.items["way"][right.way]),
+        speed_limit_mps=limit_mps,
+    )
+    even_left, even_right = rails(lane)
+    return replace(lane, left=even_left, right=even_right)
+
+
+def _linked(
+    lanes: Mapping[str, Lane], bounds: Mapping[str, tuple[Bound, Bound]]
+) -> dict[str, Lane]:
+    """Return the lanes with what follows them and what lies beside them."""
+    begins: dict[tuple[str, str], list[str]] = {}
+    of_left: dict[Bound, str] = {}
+    of_right: dict[Bound, str] = {}
+    for key in lanes:
+        left, right = bounds[key]
+        begins.setdefault((left.nodes[0], right.nodes[0]), []).append(key)
+        of_left[left], of_right[right] = key, key
+    return {
+        key: replace(
+            lane,
+            successors=tuple(begins.get((bounds[key][0].nodes[-1], bounds[key][1].nodes[-1]), ())),
+            left_neighbour=of_right.get(bounds[key][0]),
+            right_neighbour=of_left.get(bounds[key][1]),
+        )
+        for key, lane in lanes.items()
+    }
+
+
+def _paint(way: Item) -> Paint:
+    """Return the paint of a bound; colours other than yellow are white."""
+    kind, subtype = way.tags.get("type"), way.tags.get("subtype", "")
+    if kind in UNMARKED:
+        return "none"
+    if kind not in MARKS or (not subtype and kind != "bike_marking"):
+        return "unknown"
+    yellow = way.tags.get("color") == "yellow"
+    if "solid" not in subtype:
+        return "dashed_yellow" if yellow else "dashed_white"
+    if not yellow:
+        return "solid_white"
+    return "double_yellow" if "_" in subtype else "solid_yellow"
+
+
+def _limits(osm: Osm) -> tuple[dict[str, float], list[str]]:
+    """Return lanelets' speed limits in m/s, by their own tags or by a regulatory element, and those
+    that name no number.
+    """
+    limits: dict[str, float] = {}
+    unread: list[str] = []
+    for key, lanelet in osm.lanelets.items():
+        texts = [lanelet.tags["speed_limit"]] if "speed_limit" in lanelet.tags else []
+        rules = [_rule(osm, key, r) for r in lanelet.of("regulatory_element", "relation")]
+        speeds = [rule for rule in rules if rule.tags.get("subtype") == "speed_limit"]
+        texts += [rule.tags.get("sign_type", "") for rule in speeds]
+        for text in texts:
+            found = SPEED.fullmatch(text.strip())
+            if found is None:
+                unread.append(f"{text!r} of lanelet {key}")
+            else:
+                limits.setdefault(key, float(found[1]) * MPS[found[2]])
+    return limits, unread
+
+
+def _rule(osm: Osm, lanelet: str, ref: str) -> Item:
+    if ref not in osm.rules:
+        raise osm.files.fail(
+            f"{osm.path}, lanelet {lanelet}",
+            f"regulatory element {ref}, which is missing",
+            "add it to the map",
+        )
+    return osm.rules[ref]
+
+
+def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
+    """Return the traffic lights: those of one line are one group, those of lines that lie close
+    together one junction.
+    """
+    held: dict[tuple[str, str], list[str]] = {}  # stop line or else lanelet, and element
+    for key in (key for key in lanes if key in osm.lanelets):
+        for ref in osm.lanelets[key].of("regulatory_element", "relation"):
+            if osm.rules[ref].tags.get("subtype") == "traffic_light":
+                line = next(iter(osm.rules[ref].of("ref_line", "way")), f"end of {key}")
+                held.setdefault((line, ref), []).append(key)
+    signals = []
+    for (line, ref), keys in held.items():
+        lane = lanes[keys[0]]
+        assert lane.left is not None
+        assert lane.right is not None
+        ends = np.stack([lane.left[-1], lane.right[-1]])
+        if line in osm.items["way"]:
+            ends = osm.line(osm.nodes(line))[[0, -1]]
+        along = lane.centre[-1, :2] - lane.centre[-2, :2]
+        heading_rad = float(np.arctan2(along[1], along[0]))
+        signals.append(Signal(ends, heading_rad, (), 0, ref, tuple(keys)))
+    if not signals:
+        return ()
+    middles = np.array([signal.stop.mean(axis=0)[:2] for signal in signals])
+    close = scipy.spatial.distance.cdist(middles, middles) < JUNCTION_M
+    _, junction = scipy.sparse.csgraph.connected_components(close)
+    return tuple(
+        Head(signal, str(number), line, line)
+        for signal, number, (line, _) in zip(signals, junction, held, strict=True)
+    )
+
+
+def _posts(osm: Osm) -> tuple[F64, ...]:
+    """Return a post for each way that is a traffic light, as high as lights hang."""
+    lights = [osm.line(osm.nodes(way))[0] for way in osm.ways("traffic_light")]
+    return tuple(np.stack([foot, foot + np.array([0.0, 0.0, LIGHT_M])]) for foot in lights)
+
+
+def _sign(osm: Osm, way: str) -> tuple[F64, Box]:
+    """Return the middle of a sign, which stands along its way, and its size."""
+    line = osm.line(osm.nodes(way))
+    along = line[-1] - line[0]
+    width_m = float(np.hypot(along[0], along[1]))
+    pose = np.eye(4)
+    heading_rad = np.arctan2(along[1], along[0]) + np.pi / 2
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = line.mean(axis=0)
+    pose[2, 3] += SIGN_M + PLATE_M / 2
+    return pose, Box(0.05, max(width_m, PLATE_M), PLATE_M)

@@ -1,0 +1,206 @@
+"""Lanelet2 maps: lanes and links, both kinds of coordinates, traffic lights, limits, drives on them,
+and what is refused.
+
+Small maps are made here. The real one is compared with facts, and with the library lanelet2 where it
+is installed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
+from scenarios.lanelet2 import read_street
+from scenarios.load import load_scenario
+from scenarios.recorded import SourceFiles
+
+ROAD = {"type": "lanelet", "subtype": "road"}
+SOLID = {"type": "line_thin", "subtype": "solid"}
+
+
+def tags(values: dict[str, str]) -> str:
+    return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in values.items())
+
+
+def node(key: int, x: float, y: float) -> str:
+    return f'<node id="{key}" lat="" lon="">{tags({"local_x": str(x), "local_y": str(y)})}</node>'
+
+
+def way(key: int, *nodes: int, **more: str) -> str:
+    listed = "".join(f'<nd ref="{n}"/>' for n in nodes)
+    return f'<way id="{key}">{listed}{tags(more)}</way>'
+
+
+def relation(key: int, members: list[tuple[str, str, int]], more: dict[str, str]) -> str:
+    listed = "".join(f'<member type="{t}" role="{r}" ref="{i}"/>' for t, r, i in members)
+    return f'<relation id="{key}">{listed}{tags(more)}</relation>'
+
+
+def lanelet(key: int, left: int, right: int, *rules: int, **more: str) -> str:
+    members = [("way", "left", left), ("way", "right", right)]
+    members += [("relation", "regulatory_element", rule) for rule in rules]
+    return relation(key, members, {**ROAD, **more})
+
+
+def places(x0: float = 1000.0) -> list[str]:
+    """Three rows of nodes 3.5 m apart, at 0, 150 and 300 m: 11 12 13, 21 22 23, 31 32 33."""
+    return [
+        node(10 * row + column, x0 + 150.0 * (column - 1), 3.5 * row)
+        for row in (1, 2, 3)
+        for column in (1, 2, 3)
+    ]
+
+
+# Bounds against the driving direction where their number ends on 9.
+WAYS = (
+    way(112, 11, 12, type="road_border"),
+    way(139, 13, 12, type="road_border"),
+    way(212, 21, 22, **{**SOLID, "color": "yellow"}),
+    way(223, 22, 23, type="line_thin", subtype="dashed"),
+    way(329, 33, 32, 31, type="curbstone"),
+    way(312, 31, 32),
+    way(90, 12, 22, type="stop_line"),
+)
+LIGHT = relation(
+    7, [("way", "ref_line", 90)], {"type": "regulatory_element", "subtype": "traffic_light"}
+)
+STREET = (
+    *places(),
+    *WAYS,
+    lanelet(1, 212, 112, 7, speed_limit="30 km/h"),
+    lanelet(2, 223, 139, one_way="no"),
+    lanelet(3, 312, 212),
+    LIGHT,
+)
+
+
+def written(folder: Path, parts: tuple[str, ...]) -> Path:
+    file = folder / "map.osm"
+    file.write_text(f"<osm version='0.6'>{''.join(parts)}</osm>", encoding="utf-8")
+    return file
+
+
+def street(folder: Path, parts: tuple[str, ...] = STREET):
+    return read_street(SourceFiles(), written(folder, parts))
+
+
+def test_lanes_run_with_the_left_bound_on_the_left_and_follow_by_shared_ends(tmp_path):
+    made = street(tmp_path)
+    lanes = made.lanes
+    assert set(lanes) == {"1", "2", "-2", "3"}
+    assert lanes["1"].successors == ("2",)
+    assert not lanes["-2"].successors
+    assert lanes["1"].centre[[0, -1], :2] + made.origin[:2] == pytest.approx(
+        np.array([[1000.0, 5.25], [1150.0, 5.25]])
+    )
+    assert lanes["-2"].centre[0, :2] + made.origin[:2] == pytest.approx([1300.0, 5.25])
+    assert (lanes["1"].left_neighbour, lanes["3"].right_neighbour) == ("3", "1")
+    assert (lanes["1"].left_paint, lanes["1"].right_paint) == ("solid_yellow", "none")
+    assert lanes["2"].left_paint == lanes["-2"].right_paint == "dashed_white"
+    assert lanes["1"].speed_limit_mps == pytest.approx(30 / 3.6)
+    assert lanes["2"].speed_limit_mps is None
+
+
+def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_path):
+    file = written(tmp_path, STREET)
+    route = ("map.route.from=1:10", "map.route.to=2:80", "map.vehicles=0")
+    made = load_scenario(file, None, route)
+    (signal,) = made.lane_map.signals
+    assert (signal.name, signal.lanes) == ("7", ("1",))
+    assert signal.stop[:, 0] + made.world_origin[0] == pytest.approx([1150.0, 1150.0])
+    x = made.ego_log.xyz[:, 0] + made.world_origin[0]
+    front = x + made.vehicle.rear_axle_to_centre_m + made.vehicle.box.length_m / 2
+    assert signal.colour_at(int(made.ego_log.t_us[np.searchsorted(front, 1150.0)])) != "red"
+    assert (np.diff(x) < 1e-6).any()
+    assert x[-1] == pytest.approx(1230.0, abs=1.5)
+    assert made.source == "lanelet2"
+
+
+def test_latitude_and_longitude_become_east_and_north(tmp_path):
+    def globe(text: str) -> str:
+        return text.replace('lat="" lon=""', 'lat="{}" lon="{}"')
+
+    nodes = [
+        f'<node id="{10 * row + c}" lat="{49.0 + 4e-5 * row}" lon="{8.4 + 2e-3 * c}"/>'
+        for row in (1, 2, 3)
+        for c in (1, 2, 3)
+    ]
+    made = street(tmp_path, (*nodes, *STREET[9:]))
+    length_m = float(arc_lengths(made.lanes["1"].centre)[-1])
+    circle_m = 6378137.0 / np.sqrt(1 - 0.00669438 * np.sin(np.deg2rad(49.0)) ** 2)
+    assert length_m == pytest.approx(np.deg2rad(2e-3) * circle_m * np.cos(np.deg2rad(49)), rel=1e-5)
+    assert any("latitude 49.000" in note for note in made.notes)
+
+
+BROKEN = {
+    "node 12": tuple(p for p in STREET if 'node id="12"' not in p),
+    "way 212": tuple(p for p in STREET if 'way id="212"' not in p),
+    "regulatory element 7": STREET[:-1],
+    "lanelet 3": (*STREET[:-2], lanelet(3, 212, 212), LIGHT),
+    "way 112": (*places(), way(112, 11, 11), *WAYS[1:], *STREET[-4:]),
+    "node 21": (
+        *(p for p in STREET if 'node id="21"' not in p),
+        '<node id="21" lat="49" lon="8"/>',
+    ),
+    "node 31": tuple(p.replace('k="local_y" v="10.5"', 'k="local_y" v="inf"') for p in STREET),
+    "node 11 twice": (*STREET, places()[0]),
+    "relation": (places()[0],),
+    "km": (*places(), node(99, 9e6, 0), way(91, 11, 99, type="stop_line"), *STREET[9:]),
+}
+
+
+@pytest.mark.parametrize("named", BROKEN)
+def test_a_broken_map_is_refused_by_the_name_of_its_element(tmp_path, named):
+    with pytest.raises(InputError) as error:
+        street(tmp_path, BROKEN[named])
+    assert named == "relation" or named in error.value.message
+
+
+def test_entities_are_refused(tmp_path):
+    file = written(tmp_path, STREET)
+    bomb = '<!DOCTYPE osm [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]>'
+    file.write_text(bomb + file.read_text(encoding="utf-8"), encoding="utf-8")
+    with pytest.raises(InputError):
+        load_scenario(file)
+
+
+@pytest.fixture(scope="module")
+def karlsruhe(shared_data):
+    return shared_data / "lanelet2" / "mapping_example.osm"
+
+
+def test_a_real_map_has_what_its_source_states_and_is_driven(karlsruhe):
+    made = read_street(SourceFiles(), karlsruhe)
+    assert sum(not key.startswith("-") for key in made.lanes) + 8 + 2 + 2 + 17 == 371
+    assert len({head.signal.name for head in made.heads}) == 6
+    assert len(made.beside.crosswalks) == 8
+    scene = load_scenario(karlsruhe, 7)
+    driven_m = np.linalg.norm(np.diff(scene.ego_log.xyz[:, :2], axis=0), axis=1).sum()
+    assert driven_m == pytest.approx(200.0, abs=2.0)
+
+
+def test_lanelet2_finds_the_same_lanes_links_and_lengths(karlsruhe):
+    oracle = pytest.importorskip("lanelet2")
+    rules = oracle.traffic_rules
+    german = rules.create(rules.Locations.Germany, rules.Participants.Vehicle)
+    projector = oracle.projection.LocalCartesianProjector(oracle.io.Origin(49.006, 8.436))
+    loaded = oracle.io.load(str(karlsruhe), projector)
+    graph = oracle.routing.RoutingGraph(loaded, german)
+    made = read_street(SourceFiles(), karlsruhe)
+    lanes = {key: lane for key, lane in made.lanes.items() if lane.kind == "vehicle"}
+    found = set()
+    for one in loaded.laneletLayer:
+        senses = [] if not german.canPass(one) else [one]
+        senses += [] if not senses or german.isOneWay(one) else [one.invert()]
+        for sense in senses:
+            key = f"-{sense.id}" if sense.inverted() else str(sense.id)
+            found.add(key)
+            after = {f"{'-' * s.inverted()}{s.id}" for s in graph.following(sense)}
+            assert set(lanes[key].successors) & set(lanes) == after
+            begin = sense.leftBound[0]
+            assert lanes[key].left[0, :2] == pytest.approx([begin.x, begin.y], abs=1e-3)
+    assert found == set(lanes)
