@@ -10,16 +10,17 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.cli.options import Json, Run, run_or_newest
+from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import PAGES
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.self_test import run_self_test
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
+from evaluators.numbers import plural
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
 from evaluators.statistics.baselines import (
@@ -30,7 +31,9 @@ from evaluators.statistics.baselines import (
     write_baseline,
 )
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import GateVerdict, judge, load_gate
+from evaluators.statistics.gate import GateVerdict, check_number_of_scenes, judge, load_gate
+from scenarios.load import load_scenario
+from scenarios.suite import load_suite
 
 EPILOG = """
 Examples:
@@ -38,6 +41,8 @@ Examples:
 - `simrun gate runs/nightly --gate default`
 
 - `simrun gate runs/main --write-baseline baseline.json`, then `simrun gate runs/change --gate gate.yaml --baseline-file baseline.json`
+
+- `simrun gate suites/urban --gate release.yaml`: whether these scenes can decide, before they are driven
 
 - `simrun gate --self-test`
 
@@ -47,7 +52,10 @@ Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken poli
 
 
 def gate(
-    run: Run = None,
+    run: Annotated[
+        Path | None,
+        Positional("A run folder; by default the newest. Or a suite that has not been driven."),
+    ] = None,
     gate_file: Annotated[
         str, Flag("A gate file, or the name of a shipped gate.", "--gate")
     ] = "default",
@@ -61,13 +69,19 @@ def gate(
     out: Annotated[Path | None, Flag("Where gate.md and gate.junit.xml go.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Check a run against a gate, or test the gate on broken renderers."""
+    """Check a run against a gate, or test the gate on broken renderers.
+
+    Of a suite it says, before anything is driven, whether its scenes are enough for the gate.
+    """
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError(
                 "--self-test: a run or baseline is named", "Give --gate and --out only."
             )
         raise typer.Exit(_self_test(gate_file, out, as_json))
+    if run is not None and not os.path.isdir(run):
+        _check_suite(str(run), gate_file, baseline_file or approve or out, as_json)
+        return
     run = run_or_newest(run)
     ensure_tables(run, warn)
     stored_run = read_run(run)
@@ -123,6 +137,23 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     code = verdict.exit_code
     title = f"{outcome.title} (exit code {code}), compared with {verdict.baseline}"
     return [*lines, f"{title}; {verdict.about}"]
+
+
+def _check_suite(suite: str, gate_file: str, other: Path | None, as_json: bool) -> None:
+    if other is not None:
+        raise InputError(
+            f"{suite}: has not been driven, and {other} is named beside it", "Give --gate only."
+        )
+    try:
+        refs = load_suite(suite)
+    except InputError as error:
+        hint = f"{error.hint}; 'simrun list runs' shows run folders"
+        raise InputError(error.message, hint) from error
+    spec, source = load_gate(gate_file)
+    scenes = {load_scenario(ref.path, ref.seed, ref.overrides).scene_id for ref in refs}
+    check_number_of_scenes(spec, len(scenes))
+    facts = {"suite": suite, "gate": source, "population": spec.population, "scenes": len(scenes)}
+    show(as_json, facts, f"{suite}: its {plural(len(scenes), 'scene')} can pass the gate {source}")
 
 
 def _self_test(gate_file: str, out: Path | None, as_json: bool) -> int:

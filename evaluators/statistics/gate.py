@@ -7,7 +7,6 @@ were drawn from (`evaluators.statistics.paired`).
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -89,6 +88,10 @@ class MetricRule(_Strict):
     def is_paired(self) -> bool:
         """Tell whether the rule compares with a baseline."""
         return self.margin is not None or self.max_new is not None
+
+    def margin_of(self, metric: MetricInfo) -> float:
+        """Return the accepted change: the rule's own, or what the metric names."""
+        return metric.accepted if self.margin is None else self.margin
 
 
 class GateSpec(_Strict):
@@ -398,20 +401,15 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
     Raises:
         InputError: There are too few scenes for any answer that passes.
     """
-    n_scenes = len({scene for _, scene, _ in set(pair.side.cells) & set(pair.base.cells)})
-    rules = {name: rule for name, rule in spec.metrics.items() if rule.is_paired}
+    check_number_of_scenes(
+        spec, len({scene for _, scene, _ in set(pair.side.cells) & set(pair.base.cells)}), known
+    )
     checks = []
-    for name, rule in rules.items():
+    for name, rule in spec.metrics.items():
+        if not rule.is_paired:
+            continue
         metric = known.info(name)
-        margin = metric.accepted if rule.margin is None else rule.margin
-        least = least_scenes(metric, margin) if margin else None
-        needed = math.inf if least is None else max(spec.min_scenes, least)
-        if rule.must_decide and n_scenes < needed:
-            number = "no number of scenes passes" if least is None else f"it takes {needed} to pass"
-            raise InputError(
-                f"{plural(n_scenes, 'scene')}, and a gate about other scenes: {number} {name} with margin {margin:g}",
-                "Run more scenes, accept a larger margin, or use population: suite.",
-            )
+        margin = rule.margin_of(metric)
         entry = compare(pair.side, pair.base, metric, pair.label, margin)
         cause = CAUSES[entry["verdict"]]
         binding = rule.must_decide or cause == "regression"
@@ -421,6 +419,33 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
         entry["worst"] = change_of(pair.side, pair.base, metric, margin, ()).worst()
         checks.append(pair.check(metric, cause, text, entry, binding))
     return checks
+
+
+def check_number_of_scenes(spec: GateSpec, n_scenes: int, known: MetricTable = METRICS) -> None:
+    """Refuse a number of scenes with which a gate cannot pass, whatever they show.
+
+    Raises:
+        InputError: There are fewer than `min_scenes`, or too few for a gate about other scenes.
+    """
+    if n_scenes < spec.min_scenes:
+        raise InputError(
+            f"{plural(n_scenes, 'scene')}, and the gate wants at least {spec.min_scenes}",
+            "Name more scenes.",
+        )
+    if spec.population == "suite":
+        return
+    for name, rule in spec.metrics.items():
+        if not rule.is_paired or not rule.must_decide:
+            continue
+        metric = known.info(name)
+        margin = rule.margin_of(metric)
+        least = least_scenes(metric, margin) if margin else None
+        if least is None or n_scenes < least:
+            number = "no number of scenes passes" if least is None else f"it takes {least} to pass"
+            raise InputError(
+                f"{plural(n_scenes, 'scene')}, and a gate about other scenes: {number} {name} with margin {margin:g}",
+                "Name more scenes, accept a larger margin, or use population: suite.",
+            )
 
 
 def _of_suite(
@@ -434,8 +459,7 @@ def _of_suite(
     changes = []
     for name in (*rules, *unnamed):
         metric = known.info(name)
-        margin = rules[name].margin if name in rules else None
-        accepted = metric.accepted if margin is None else margin
+        accepted = rules[name].margin_of(metric) if name in rules else metric.accepted
         changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
     is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
     p_values: Sequence[float | None] = [None] * len(changes)

@@ -375,3 +375,20 @@ def test_an_undecided_rule_that_need_not_decide_is_skipped_in_junit(runs, gate_f
     assert gate.attrib["skipped"] == "1"
     Path(gate_file).write_text(EASY.replace(", must_decide: false", ""))
     assert run_command(command) == 3
+
+
+@pytest.mark.parametrize(
+    ("population", "suite", "code"),
+    [("suite", "suites/urban", 0), ("scenes", "suites/urban", 2), ("scenes", "suites/all", 0)],
+)
+def test_a_suite_that_has_not_been_driven_is_refused_if_its_scenes_cannot_decide(
+    population, suite, code, tmp_path, capsys
+):
+    gate = tmp_path / "gate.yaml"
+    gate.write_text(
+        f"version: 1\npopulation: {population}\nmetrics: {{offroad: {{margin: 0.1}}}}\n"
+    )
+    assert run_command(["gate", suite, "--gate", str(gate)]) == code
+    printed = capsys.readouterr()
+    assert ("36" in printed.err) == (code == 2)
+    assert run_command(["gate", suite, "--gate", str(gate), "--out", str(tmp_path)]) == 2
