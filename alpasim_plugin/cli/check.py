@@ -80,7 +80,7 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
     """
     root = run_or_newest(run)
     inspection = inspect_run(root, full=True)
-    problems = [str(damage) for damage in (*inspect_files(root, full=True), *inspection.damage)]
+    problems = [str(damage) for damage in (*inspect_files(root), *inspection.damage)]
     problems += [f"{cell}: the rollout is unfinished" for cell in inspection.unfinished]
     code = BROKEN if problems else 0
     facts = {

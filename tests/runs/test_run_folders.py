@@ -147,7 +147,10 @@ def test_every_file_of_the_run_is_verified_and_written_again(made, root, capsys)
 def test_no_verdict_comes_of_a_file_that_was_changed(root, verb):
     for file in ("run.json", SCENE, f"{CELL}/manifest.json", f"{CELL}/rollout.asl"):
         before = (root / file).read_bytes()
+        state = (root / file).stat()
         flip(root / file)
+        if CELL not in file:  # it is read in full, whatever its size and time
+            os.utime(root / file, ns=(state.st_atime_ns, state.st_mtime_ns))
         assert run_command([verb, str(root)]) == 2, file
         (root / file).write_bytes(before)
     (root / CELL / "manifest.json").write_bytes((root / CELL / "../1/manifest.json").read_bytes())

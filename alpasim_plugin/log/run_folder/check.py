@@ -67,13 +67,9 @@ def inspect_run(root: Path, full: bool = False) -> Inspection:
     return Inspection(cells, tuple(manifests), tuple(damage), tuple(unfinished))
 
 
-def inspect_files(root: Path, full: bool = False) -> list[Damage]:
+def inspect_files(root: Path) -> list[Damage]:
     """Compare the files of a run folder outside of its rollouts' folders with ``files.json``, which
-    is written last.
-
-    Args:
-        root: The run folder.
-        full: Read every file, even where size and time are as stated.
+    is written last. Each is read in full: every number that a verb prints comes from them.
     """
     try:
         stated = stated_files(root)
@@ -82,7 +78,7 @@ def inspect_files(root: Path, full: bool = False) -> list[Damage]:
     damage = _without_digest(name for name in (RUN_INFO, *TABLES) if name not in stated)
     for name, facts in stated.items():
         path = inside(root, name)
-        problem = "not in the run folder" if path is None else problem_of(path, facts, full)
+        problem = "not in the run folder" if path is None else problem_of(path, facts, full=True)
         if problem is not None:
             damage.append(Damage("", name, problem))
     return damage

@@ -1,7 +1,7 @@
 """Digests of files, so that damage is noticed before a file is trusted.
 
-A file with the stated size and time is taken as it is, since reading gigabytes before every command
-would cost more than it finds; any other is read in full.
+A log or a film with the stated size and time is taken as it is, since reading gigabytes before
+every command would cost more than it finds; any other file is read in full.
 """
 
 from __future__ import annotations
