@@ -36,6 +36,7 @@ from alpasim_plugin.core.types import (
     Plan,
     Route,
     Scenario,
+    read_only,
 )
 from policies.base import make_policy
 from policies.painted_road import PaintedRoad, pinhole_camera
@@ -437,8 +438,7 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
             seen_us = now - situation.frame_age_us
             rgb = shown.image(camera, shown.pose(along(seen_us)), seed=step)
             rgb = np.full_like(rgb, 128) if situation.is_blank else rgb
-            rgb.setflags(write=False)  # a policy that scribbles on its input is found out
-            frames[name] = Frame(seen_us, name, rgb)
+            frames[name] = read_only(Frame(seen_us, name, rgb))
         T_ahead_rig = ahead.pose(along(now))
         points = [ahead.pose(along(now) + 80 / 19 * number)[:3, 3] for number in range(20)]
         route = transform_points(inverse(T_ahead_rig), np.array(points))
@@ -448,7 +448,8 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
         ego = EgoState(now, pose(now), situation.speed_mps, 0.0, yaw_rate)
         times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
-        yield Observation(now, frames, cameras, ego, history, route)
+        shown = {name: read_only(camera) for name, camera in cameras.items()}
+        yield Observation(now, frames, shown, read_only(ego), read_only(history), route)
 
 
 def _drive(

@@ -11,8 +11,8 @@ images are HWC uint8 sRGB.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,7 @@ F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
+RecordT = TypeVar("RecordT")
 
 
 # --- motion
@@ -245,6 +246,17 @@ class RecordedFrame:
 
 
 # --- policy
+
+
+def read_only(record: RecordT) -> RecordT:
+    """Return a record whose arrays are views that cannot be written, for code that is not ours."""
+    views = {}
+    for one in fields(record):  # type: ignore[arg-type]
+        value = getattr(record, one.name)
+        if isinstance(value, np.ndarray):
+            views[one.name] = value.view()
+            views[one.name].flags.writeable = False
+    return replace(record, **views)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     SensorSpec,
     Trajectory,
+    read_only,
 )
 from alpasim_plugin.runs.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
 
@@ -151,7 +152,7 @@ class CameraRig:
                     f"camera {sensor.camera!r}: period {period} us is no multiple of the control period {clock.rates.control_us} us",
                     "choose a whole multiple",
                 )
-            self._due.append((known[sensor.camera], period))
+            self._due.append((read_only(known[sensor.camera]), period))
 
     @property
     def specs(self) -> dict[str, CameraSpec]:
@@ -185,9 +186,8 @@ class CameraRig:
                 exposure = rolling_exposure(
                     camera, self._before, shown, self._clock.rates.control_us
                 )
-                self._held.append(
-                    RenderRequest(tick.t_us, camera, T_world_camera, shown, ahead, exposure)
-                )
+                request = RenderRequest(tick.t_us, camera, T_world_camera, shown, ahead, exposure)
+                self._held.append(read_only(request))
         self._before = shown
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []

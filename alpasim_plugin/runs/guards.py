@@ -13,7 +13,15 @@ from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
-from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
+from alpasim_plugin.core.types import (
+    Frame,
+    Observation,
+    Plan,
+    RenderRequest,
+    Route,
+    SensorSpec,
+    read_only,
+)
 
 ALPHA, DEPTH_M = 1.0, 1e6  # largest values of a frame's planes
 ROUNDING = 1e-3
@@ -99,7 +107,7 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
         PolicyError: The policy raised.
     """
     with blaming(PolicyError, type(policy).__name__, defined(policy, "reset")):
-        policy.reset(seed, route)
+        policy.reset(seed, read_only(route))
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:

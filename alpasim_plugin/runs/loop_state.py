@@ -39,6 +39,7 @@ from alpasim_plugin.core.types import (
     RenderRequest,
     Scenario,
     Trajectory,
+    read_only,
 )
 from alpasim_plugin.runs.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import ActorForecast, Actors
@@ -51,10 +52,13 @@ SPEED_SPAN_US = 500_000
 
 
 def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
-    """Return the poses of the actors that are drawn: what stands in a reconstruction is in its
-    pictures already.
+    """Return the poses of the actors that are drawn, as views that cannot be written: what stands
+    in a reconstruction is in its pictures already.
     """
-    return {name: T for name, T in actors.items() if not name.startswith(STANDING_ID)}
+    shown = {name: T.view() for name, T in actors.items() if not name.startswith(STANDING_ID)}
+    for T in shown.values():
+        T.flags.writeable = False
+    return shown
 
 
 @dataclass
@@ -189,9 +193,17 @@ class LoopState:
         return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
 
     def observe(self, cameras: Mapping[str, CameraSpec]) -> Observation:
-        """Return the policy's observation at the present instant."""
-        route = route_in_rig(self.scenario.route, self.ego.T_world_rig)
-        return Observation(self.ego.t_us, dict(self.frames), cameras, self.ego, self.history, route)
+        """Return the policy's observation at the present instant. Its arrays cannot be written,
+        since the world, the fixer's history and the log hold the same ones.
+        """
+        return Observation(
+            self.ego.t_us,
+            {name: read_only(frame) for name, frame in self.frames.items()},
+            dict(cameras),
+            read_only(self.ego),
+            read_only(self.history),
+            route_in_rig(self.scenario.route, self.ego.T_world_rig),
+        )
 
     def to_world(self, plan: Plan) -> list[Trajectory]:
         """Map a plan and its samples from the present rig frame to world poses.

@@ -178,6 +178,38 @@ def test_a_broken_renderer_is_named_and_its_frame_not_used(straight_road, render
         run_rollout(straight_road, renderer(), StandStill(), 0)
 
 
+class Writes(StandStill):
+    """Writes into an array that it receives, as `pose -= origin` does by accident."""
+
+    def __init__(self, array_of, at_reset=False):
+        self.array_of, self.at_reset = array_of, at_reset
+
+    def reset(self, seed, route):
+        super().reset(seed, route)
+        if self.at_reset:
+            self.array_of(route)[...] = 0
+
+    def act(self, observation):
+        if not self.at_reset:
+            self.array_of(observation)[...] = 0
+        return super().act(observation)
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        Writes(lambda seen: seen.ego.T_world_rig),
+        Writes(lambda seen: seen.history.xyz),
+        Writes(lambda seen: seen.frames["front"].rgb),
+        Writes(lambda seen: seen.cameras["front"].K),
+        Writes(lambda route: route.xyz, at_reset=True),
+    ],
+)
+def test_a_policy_that_writes_into_what_it_receives_is_named(straight_road, policy):
+    with pytest.raises(PolicyError, match="read-only"):
+        run_rollout(straight_road, make_renderer("clean", straight_road), policy, 0)
+
+
 class Black:
     """Gives black frames of the right form."""
 
@@ -187,6 +219,26 @@ class Black:
             request.camera.name,
             np.zeros((request.camera.height, request.camera.width, 3), np.uint8),
         )
+
+
+class WritesIntoItsRequest(Black):
+    """Moves the camera that it was asked to render, in place."""
+
+    def __init__(self, array_of):
+        self.array_of = array_of
+
+    def render(self, request):
+        self.array_of(request)[...] = 0
+        return super().render(request)
+
+
+@pytest.mark.parametrize(
+    "array_of",
+    [lambda request: request.T_world_camera, lambda request: request.camera.T_rig_camera],
+)
+def test_a_renderer_that_writes_into_its_request_is_named(straight_road, array_of):
+    with pytest.raises(RendererError, match="read-only"):
+        run_rollout(straight_road, WritesIntoItsRequest(array_of), StandStill(), 0)
 
 
 def test_black_frames_are_counted_not_dropped(straight_road):
