@@ -173,6 +173,17 @@ def _table(
         numbers = (row.diff.text, row.p_value.text, entry["difference"], row.interval.text)
         lines.append((row.metric, *numbers, margin, pairs, verdict))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    if 2 * len(widths) + sum(widths) > terminal_width():
+        labels = lines[0][2:]
+        return [
+            line
+            for name, difference, *others in lines[1:]
+            for line in (
+                f"  {name}  {difference}",
+                "      "
+                + ", ".join(f"{label}: {text}" for label, text in zip(labels, others, strict=True)),
+            )
+        ]
     texts = []
     for line in lines:
         whole = [cell.replace(" ", "\u00a0") for cell in line]

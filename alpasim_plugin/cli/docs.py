@@ -42,16 +42,17 @@ def docs(
             "Install the wheel with pip, or use a checkout.",
         )
     texts = {path.stem: read_text(path) for path in sorted(folder.glob("*.md"))}
+    titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in texts.items()}
     if page is None:
-        titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in texts.items()}
         show(as_json, titles, *(f"{name:<24}{title}" for name, title in titles.items()))
         return
     name = Path(page).stem
     if name not in texts:
-        near = difflib.get_close_matches(name, texts, 1) or ["index"]
+        near = difflib.get_close_matches(name, texts, 1)
+        near = near or [one for one, title in titles.items() if name.lower() in title.lower()]
+        guess = f"did you mean {' or '.join(map(repr, near[:3]))}? " if near else ""
         raise InputError(
-            f"{page}: no such page among {len(texts)}",
-            f"did you mean {near[0]!r}? simrun docs lists all",
+            f"{page}: no such page among {len(texts)}", f"{guess}simrun docs lists all"
         )
     facts = {"page": name, "path": str(folder / f"{name}.md"), "text": texts[name]}
     if as_json or not sys.stdout.isatty():
