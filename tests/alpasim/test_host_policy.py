@@ -15,6 +15,7 @@ import grpc
 import numpy as np
 import pytest
 
+from alpasim_plugin.alpasim.server import hosting
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.caches import SceneCache
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService, _unknown_scene
@@ -133,6 +134,21 @@ def test_calls_whose_message_never_comes_hold_nobody_up(name, of):
         assert is_served(host, name)
         for call in calls:
             call.cancel()
+        silence.over.set()
+
+
+def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are_cancelled(
+    monkeypatch,
+):
+    monkeypatch.setattr(hosting, "RECEIVING", 4)
+    monkeypatch.setattr(hosting, "SENDING_S", 0.5)
+    monkeypatch.setattr(hosting, "UPKEEP_S", 0.1)
+    name, silence = "EgodriverService", Silence()
+    with served(name) as host, channel_to(host) as channel:
+        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(8)]
+        assert is_served(host, name)
+        for call in calls:
+            assert failure(lambda call=call: next(call))[0] is Code.CANCELLED
         silence.over.set()
 
 

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,10 +27,13 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.reading import read_bytes, read_text
 from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.log.wire.services import OPTIONS, handlers
+from alpasim_plugin.log.wire.services import MESSAGE_BYTES, handlers
 
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
+RECEIVING = 128  # calls whose message is in memory and that are not worked on yet
+RECEIVED_BYTES = 16 << 20  # of one message: an image as JPEG or PNG, or a request to render
+SENDING_S = 30.0  # a caller that has not sent its message after so long is cancelled
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
 SESSIONS = 64  # sessions at a time
@@ -281,7 +284,8 @@ class Health:
 
 
 class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
-    """Check the token of every call, and limit how many calls are worked on at the same time.
+    """Check the token of every call, and limit how many messages are in memory and how many calls
+    are worked on at the same time. A message stays with its caller until there is a place for it.
 
     Args:
         token: None: no token is asked for.
@@ -290,7 +294,9 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def __init__(self, token: str | None, workers: int) -> None:
         self._wanted = None if token is None else f"Bearer {token}".encode()
-        self._places = threading.Semaphore(workers)
+        self._working = threading.Semaphore(workers)
+        self._receiving = threading.Semaphore(RECEIVING)
+        self._senders: dict[Any, float] = {}  # context of a call -> since when it sends
         # A handler of a stream starts before the message has come: a refused call holds no thread.
         self._refusal = grpc.stream_unary_rpc_method_handler(unauthenticated)
 
@@ -303,11 +309,18 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         handler = continuation(details)
         if handler is None or details.method.startswith(OPEN_CALLS):
             return handler
-        return grpc.unary_unary_rpc_method_handler(
+        return grpc.stream_unary_rpc_method_handler(
             partial(self._answer, handler.unary_unary),
             handler.request_deserializer,
             handler.response_serializer,
         )
+
+    def cancel_slow_senders(self) -> None:
+        """Cancel the calls that have not sent their message in time."""
+        latest_s = time.monotonic() - SENDING_S
+        for context, since_s in list(self._senders.items()):
+            if since_s < latest_s:
+                context.cancel()
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -316,12 +329,30 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         given = given.encode() if isinstance(given, str) else given
         return hmac.compare_digest(given, self._wanted)
 
-    def _answer(self, call: Callable[[Any, Any], Any], request: Any, context: Any) -> Any:
+    def _answer(self, call: Callable[[Any, Any], Any], messages: Any, context: Any) -> Any:
+        left = CallTime(context)
         try:
-            with CallTime(context).holding(self._places):
+            with ExitStack() as place:
+                with left.holding(self._receiving):
+                    request = self._received(messages, context)
+                    place.enter_context(left.holding(self._working))
                 return call(request, context)
         except Late as late:
             context.abort(grpc.StatusCode.CANCELLED, str(late))
+
+    def _received(self, messages: Any, context: Any) -> Any:
+        """Wait for the message of a call.
+
+        Raises:
+            Late: It did not come.
+        """
+        self._senders[context] = time.monotonic()
+        try:
+            for message in messages:
+                return message
+        finally:
+            del self._senders[context]
+        raise Late("the message did not come")
 
 
 def unauthenticated(messages: Any, context: Any) -> None:
@@ -356,15 +387,17 @@ class Host:
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
         # not retry. Calls wait instead.
         options = [
-            *OPTIONS,
+            ("grpc.max_receive_message_length", RECEIVED_BYTES),
+            ("grpc.max_send_message_length", MESSAGE_BYTES),
             ("grpc.so_reuseport", 0),
             ("grpc.max_concurrent_streams", STREAMS),
             ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S)),
         ]
+        self._gate = gate = Gate(read_token(policy.token_file), workers)
         self._server = grpc.server(
             ThreadPoolExecutor(CALLS, thread_name_prefix="serve"),
             options=options,
-            interceptors=(Gate(read_token(policy.token_file), workers),),
+            interceptors=(gate,),
         )
         made = [handlers(name, service) for name, service in services.items()]
         self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health)))
@@ -420,4 +453,5 @@ class Host:
 
     def _repeat(self) -> None:
         while not self._ended.wait(UPKEEP_S):
+            self._gate.cancel_slow_senders()
             self._every()
