@@ -148,11 +148,10 @@ def key_tables() -> str:
         rows = [key_row(name, field) for name, field in model.model_fields.items()
                 if not (kind and name == "kind")]  # fmt: skip
         new = [row for row in rows if row not in shown.setdefault(owner, set())]
-        alike = "" if len(new) == len(rows) else " Other keys as above."
         shown[owner] |= set(rows)
         summary = " ".join((model.__doc__ or "").partition("\n\n")[0].split())
         keys = "\n" + table(("key", "type", "default", "meaning"), new) if new else ""
-        sections.append(f"## {f'`{where}`' if where else 'Top level'}\n{summary}{alike}\n{keys}")
+        sections.append(f"## {f'`{where}`' if where else 'Top level'}\n{summary}\n{keys}")
     return "\n".join(sections)
 
 
