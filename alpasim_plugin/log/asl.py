@@ -1,7 +1,7 @@
 """Frame ASL logs: a 4-byte big-endian length before each serialised ``LogEntry``, and nothing else.
 
 The format has no header, index or checksum. A log whose writer was killed ends inside an entry: the
-reader gives everything before it and a `TruncatedTail`. Damage anywhere else is an error.
+reader gives everything before it and says so. Damage anywhere else is an error.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -19,6 +18,7 @@ from google.protobuf.message import DecodeError
 
 from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.interfaces import EMPTY
 from alpasim_plugin.core.limits import ENTRY_BYTES, LOG_BYTES
 from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.log.wire import logging_pb2
@@ -28,42 +28,14 @@ _COPY_AGAIN = (
     "copy the log again from where it was written; nothing after this point can be trusted"
 )
 
-Stage = Callable[[logging_pb2.LogEntry], Iterable[logging_pb2.LogEntry]]
-
-
-@dataclass(frozen=True)
-class TruncatedTail:
-    """Describe an unfinished last entry, as a killed writer leaves it.
-
-    Attributes:
-        path: The log.
-        entries: Number of whole entries before it.
-        offset: Byte position of its length field.
-        announced: Its length in bytes, or None if even the length field is cut.
-        present: Bytes of it that are there, without the length field.
-    """
-
-    path: Path
-    entries: int
-    offset: int
-    announced: int | None
-    present: int
-
-    def __str__(self) -> str:
-        size = (
-            "its length is cut too"
-            if self.announced is None
-            else f"{self.present} of {self.announced} bytes"
-        )
-        return f"{self.path}: last entry cut at byte {self.offset} ({size}); {self.entries} whole entries read"
-
 
 class AslReader:
     """Iterate over the entries of a log, one in memory at a time.
 
     Attributes:
         path: The log.
-        truncated: Set once iteration has met an unfinished last entry; None otherwise.
+        truncated: Says what of an unfinished last entry is there, once iteration has met one;
+            empty otherwise.
 
     Example:
         >>> for entry in AslReader("rollout.asl"):  # doctest: +SKIP
@@ -72,7 +44,7 @@ class AslReader:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.truncated: TruncatedTail | None = None
+        self.truncated = ""
 
     def __iter__(self) -> Iterator[logging_pb2.LogEntry]:
         """Yield the entries in file order.
@@ -80,7 +52,7 @@ class AslReader:
         Raises:
             InputError: Missing or empty file, or damage before the last entry.
         """
-        self.truncated = None
+        self.truncated = ""
         with open_regular(self.path, LOG_BYTES) as stream:
             index = 0
             while (body := self._next(stream, index)) is not None:
@@ -94,29 +66,26 @@ class AslReader:
                     ) from error
                 yield entry
                 index += 1
-        if index == 0 and self.truncated is None:
+        if index == 0 and not self.truncated:
             raise InputError(f"{self.path}: an empty file", "run the rollout again")
 
     def _next(self, stream: BinaryIO, index: int) -> bytes | None:
-        """Return the bytes of the next entry, or None at the end; notes an unfinished one."""
+        """Return the bytes of the next entry, or None at the end; notes an unfinished one.
+
+        A length that was overwritten with a larger one reads as an unfinished entry: what follows it
+        cannot be found.
+        """
         offset = stream.tell()
         prefix = stream.read(_LENGTH.size)
         if not prefix:
             return None
-        if len(prefix) < _LENGTH.size:
-            self.truncated = TruncatedTail(self.path, index, offset, None, 0)
-            return None
-        announced = _LENGTH.unpack(prefix)[0]
-        if announced == 0 or announced > ENTRY_BYTES.high:
+        announced = int.from_bytes(prefix, "big")
+        if len(prefix) == _LENGTH.size and not ENTRY_BYTES.holds(announced):
             raise self._damaged(index, offset, f"a length of {announced} bytes")
-        body = stream.read(announced)
-        if len(body) == announced:
+        body = stream.read(announced) if len(prefix) == _LENGTH.size else b""
+        if body and len(body) == announced:
             return body
-        if not _may_begin_entry(body, announced):
-            raise self._damaged(
-                index, offset, f"a length of {announced} bytes that does not fit what follows"
-            )
-        self.truncated = TruncatedTail(self.path, index, offset, announced, len(body))
+        self.truncated = f"{self.path}: last entry cut at byte {offset}; {index} whole entries read"
         return None
 
     def _damaged(self, index: int, offset: int, found: str) -> InputError:
@@ -202,75 +171,21 @@ class AslFile:
             self.abandon()
 
 
-def _may_begin_entry(head: bytes, announced: int) -> bool:
-    """Tell whether `head` can be the beginning of an entry of `announced` bytes.
-
-    An entry is one length-delimited field, so its own inner length must reach exactly to its end.
-    This tells a cut file from a length field that was overwritten.
-    """
-    tag, at = _varint(head, 0)
-    if at is None:
-        return True
-    inner, at = _varint(head, at)
-    if at is None:
-        return tag & 7 == 2
-    return tag & 7 == 2 and at + inner == announced
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int | None]:
-    """Return a base-128 number and the position after it; None where the data end first."""
-    value = 0
-    for shift in range(0, 64, 7):
-        if at >= len(data):
-            return value, None
-        value |= (data[at] & 0x7F) << shift
-        at += 1
-        if not data[at - 1] & 0x80:
-            return value, at
-    return value, at
-
-
-@dataclass(frozen=True)
-class Renaming:
-    """What is called otherwise.
-
-    Attributes:
-        session_uuid: The new session id; empty keeps the log's.
-        cameras: Old name -> new name; others keep theirs.
-        renderer: The new name of the renderer in the header; empty keeps the log's.
-    """
-
-    session_uuid: str = ""
-    cameras: Mapping[str, str] = field(default_factory=dict)
-    renderer: str = ""
-
-    def __call__(self, entry: logging_pb2.LogEntry) -> list[logging_pb2.LogEntry]:
-        """Rename within an entry, in place; a stage of `copy_log`."""
-        kind = entry.WhichOneof("log_entry")
-        if kind is None:
-            return [entry]
-        message = getattr(entry, kind)
-        owner = message.session_metadata if kind == "rollout_metadata" else message
-        if self.session_uuid and "session_uuid" in owner.DESCRIPTOR.fields_by_name:
-            owner.session_uuid = self.session_uuid
-        if self.renderer and kind == "rollout_metadata":
-            message.version_ids.sensorsim_version.version_id = self.renderer
-        if self.cameras:
-            for holder, name in _names(kind, message):
-                old = getattr(holder, name)
-                if old in self.cameras:
-                    setattr(holder, name, self.cameras[old])
-        return [entry]
-
-
-def copy_log(source: Path, target: Path, *stages: Stage) -> int:
-    """Copy a log and return its number of entries.
+def copy_log(
+    source: Path,
+    target: Path,
+    session_uuid: str = "",
+    renderer: str = "",
+    cameras: Mapping[str, str] = EMPTY,
+) -> None:
+    """Copy a log under other names.
 
     Args:
         source: A finished log.
         target: The file to write; its folder exists.
-        stages: Each makes the entries to write of an entry; the next one receives them. Without
-            any, the copy is equal.
+        session_uuid: The new session id; empty keeps the log's.
+        renderer: The new name of the renderer in the header; empty keeps the log's.
+        cameras: Old name -> new name; others keep theirs.
 
     Raises:
         InputError: The source is damaged, or ends inside an entry.
@@ -279,17 +194,23 @@ def copy_log(source: Path, target: Path, *stages: Stage) -> int:
     reader = AslReader(source)
     with AslFile(target) as out:
         for entry in reader:
-            entries: Iterable[logging_pb2.LogEntry] = [entry]
-            for stage in stages:
-                entries = [made for one in entries for made in stage(one)]
-            for made in entries:
-                out.write(made)
-        if reader.truncated is not None:
-            raise InputError(f"{source}: {reader.truncated}", "run the rollout again")
-    return out.entries
+            kind = entry.WhichOneof("log_entry")
+            message = entry if kind is None else getattr(entry, kind)
+            owner = message.session_metadata if kind == "rollout_metadata" else message
+            if session_uuid and "session_uuid" in owner.DESCRIPTOR.fields_by_name:
+                owner.session_uuid = session_uuid
+            if renderer and kind == "rollout_metadata":
+                message.version_ids.sensorsim_version.version_id = renderer
+            for holder, name in _names(kind, message):
+                old = getattr(holder, name)
+                if old in cameras:
+                    setattr(holder, name, cameras[old])
+            out.write(entry)
+        if reader.truncated:
+            raise InputError(reader.truncated, "run the rollout again")
 
 
-def _names(kind: str, message: Any) -> Iterator[tuple[Any, str]]:
+def _names(kind: str | None, message: Any) -> Iterator[tuple[Any, str]]:
     """Yield every place of a message that holds a camera's name, as its owner and field."""
     if kind == "available_cameras_return":
         yield from _cameras(message.available_cameras)

@@ -90,7 +90,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
                     image.logical_id, image.frame_start_us, image.frame_end_us, image.image_bytes
                 )
             )
-    warnings = [str(reader.truncated)] if reader.truncated else []
+    warnings = [reader.truncated] if reader.truncated else []
     if got.counts["unknown"]:
         warnings.append(
             f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_lines
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.reading import parsing, read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 
@@ -20,8 +20,8 @@ from alpasim_plugin.log.schema import EGO
 COMPONENTS = ("ego", "actors", "frames", "plans")
 
 Fact = str | int | float | bool | None
-Key = tuple[int, str]  # time in microseconds, part of the component, such as a camera
-Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
+Key = tuple[int, str, str]  # time in microseconds, component, and part of it, such as a camera
+Trace = dict[Key, str]  # key -> SHA-256
 
 
 def write_facts(path: Path | str, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -59,25 +59,7 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     return rows
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The first place where two rollouts are not the same."""
-
-    component: str
-    t_us: int
-    step: int | None  # control step; None before the first frame
-    what: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        at = f"step {self.step}" if self.step is not None else "before the first frame"
-        return f"{self.component} at {at} ({self.what}, t = {self.t_us} us)"
-
-
-def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str, dict[Key, str]]:
+def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> Trace:
     """Read the components of a rollout out of its log.
 
     Names of sessions and services are not part of any component: rollouts of different names can be
@@ -92,45 +74,35 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
     Raises:
         InputError: The log is missing or damaged.
     """
-    parts: dict[str, dict[Key, str]] = {name: {} for name in COMPONENTS}
+    trace: Trace = {}
     asked_us = 0
     for entry in AslReader(path):
         kind = entry.WhichOneof("log_entry")
         if kind == "actor_poses":
             poses = entry.actor_poses
-            parts["ego"][poses.timestamp_us, "pose"] = _joined(
-                p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO
-            )
-            parts["actors"][poses.timestamp_us, "poses"] = _joined(
-                p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO
-            )
+            ego = [p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO]
+            others = [p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO]
+            trace[poses.timestamp_us, "ego", "pose"] = _joined(ego)
+            trace[poses.timestamp_us, "actors", "poses"] = _joined(others)
         elif kind == "controller_return":
             states = entry.controller_return.states
-            parts["ego"][states[-1].timestamp_us, "motion"] = _joined(
-                state.SerializeToString() for state in states
-            )
+            motion = _joined(state.SerializeToString() for state in states)
+            trace[states[-1].timestamp_us, "ego", "motion"] = motion
         elif kind == "driver_camera_image":
             image = entry.driver_camera_image.camera_image
-            parts["frames"][image.frame_end_us, f"camera {image.logical_id} as logged"] = sha256(
-                image.image_bytes
-            )
+            part = f"camera {image.logical_id} as logged"
+            trace[image.frame_end_us, "frames", part] = _sha256(image.image_bytes)
         elif kind == "driver_request":
             asked_us = entry.driver_request.time_now_us
         elif kind == "driver_return":
-            parts["plans"][asked_us, "plan"] = sha256(entry.driver_return.SerializeToString())
-    for fact in facts:
-        text = json.dumps(
-            {name: value for name, value in fact.items() if not name.endswith("_ms")},
-            sort_keys=True,
-        )
-        t_us, camera = fact.get("t_us"), fact.get("camera")
-        if not isinstance(t_us, int) or not isinstance(camera, str):
-            raise InputError(
-                f"{path}: frame facts of camera {camera!r} at t_us {t_us!r}",
-                "run the rollout again: its facts are damaged",
-            )
-        parts["frames"][t_us, f"camera {camera}"] = sha256(text.encode())
-    return parts
+            trace[asked_us, "plans", "plan"] = _sha256(entry.driver_return.SerializeToString())
+    with parsing(path, "run the rollout again", "its frame facts are damaged"):
+        for fact in facts:
+            lasting = {name: value for name, value in fact.items() if not name.endswith("_ms")}
+            text = json.dumps(lasting, sort_keys=True)
+            key = int(str(fact["t_us"])), "frames", f"camera {fact['camera']}"
+            trace[key] = _sha256(text.encode())
+    return trace
 
 
 def first_difference(
@@ -139,7 +111,7 @@ def first_difference(
     start_us: int,
     control_us: int,
     until_us: Mapping[str, int] | None = None,
-) -> Difference | None:
+) -> JsonObject | None:
     """Return the earliest difference of two rollouts, or None.
 
     An entry that only one of them has is a difference too. At equal times the component that the
@@ -151,28 +123,27 @@ def first_difference(
         start_us: Time of the first frame, from which steps are counted.
         control_us: Length of a step.
         until_us: Component -> first time that is not compared. None compares everything.
+
+    Returns:
+        ``component``, ``t_us``, ``step`` (None before the first frame) and ``what``.
     """
     differences = []
-    for rank, component in enumerate(COMPONENTS):
-        a = one.get(component, {})
-        b = other.get(component, {})
-        for t_us, part in {**a, **b}:
-            compared = until_us is None or t_us < until_us[component]
-            if compared and a.get((t_us, part)) != b.get((t_us, part)):
-                in_both = (t_us, part) in a and (t_us, part) in b
-                text = part if in_both else f"{part}, in one only"
-                differences.append((t_us, rank, text))
+    for key in one | other:
+        t_us, component, part = key
+        is_compared = until_us is None or t_us < until_us[component]
+        if is_compared and one.get(key) != other.get(key):
+            text = part if key in one and key in other else f"{part}, in one only"
+            differences.append((t_us, COMPONENTS.index(component), text))
     if not differences:
         return None
     t_us, rank, text = min(differences)
     step = (t_us - start_us) // control_us if t_us >= start_us else None
-    return Difference(COMPONENTS[rank], t_us, step, text)
+    return {"component": COMPONENTS[rank], "t_us": t_us, "step": step, "what": text}
 
 
-def sha256(data: bytes) -> str:
-    """Return the hexadecimal SHA-256 of some bytes."""
+def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
 def _joined(parts: Iterable[bytes]) -> str:
-    return sha256(b"".join(len(part).to_bytes(4, "big") + part for part in parts))
+    return _sha256(b"".join(len(part).to_bytes(4, "big") + part for part in parts))

@@ -81,16 +81,12 @@ class AslWriter:
 
     # --- start
 
-    def begin(
-        self, cameras: Sequence[CameraSpec], context: Mapping[str, F64] | None = None
-    ) -> None:
-        """Write everything that precedes the first step.
+    def begin(self, cameras: Sequence[CameraSpec]) -> None:
+        """Write everything that precedes the first step; ``cameras`` are those that the policy
+        receives.
 
-        Args:
-            cameras: Cameras the policy receives.
-            context: ``T_world_box`` of the actors present at the first recorded ego pose. AlpaSim
-                logs the poses of that instant too when it lies before the first frame; None takes
-                them from the recorded tracks.
+        AlpaSim logs the poses at the first recorded ego pose too when it lies before the first
+        frame; the road users' are those of their tracks.
         """
         header = self.header
         listed = [wire_camera(camera) for camera in cameras]
@@ -116,7 +112,11 @@ class AslWriter:
         self._write(traffic_session_request=wire_traffic_session(header))
         first_us = int(header.ego_log.t_us[0])
         if first_us < header.render_start_us:
-            present = self._recorded(first_us) if context is None else context
+            present = {
+                actor.actor_id: interpolate(actor.track, first_us)
+                for actor in header.actors
+                if len(actor.track) and actor.track.t_us[0] <= first_us <= actor.track.t_us[-1]
+            }
             self.actor_poses(first_us, se3(header.ego_log.xyz[0], header.ego_log.quat[0]), present)
 
     # --- each step
@@ -147,33 +147,21 @@ class AslWriter:
         ]
         self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
 
-    def render_request(
-        self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png"
-    ) -> None:
-        """Write the render requests of one instant, bundled as AlpaSim sends them by default."""
-        items = [
-            sensorsim_pb2.BatchRGBRenderRequestItem(
-                camera_name=r.camera.name,
-                request=wire_render_request(self.header.scene_id, r, encoding),
-            )
-            for r in requests
-        ]
-        self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=items))
+    def render_request(self, request: RenderRequest, encoding: ImageEncoding = "png") -> None:
+        """Write a render request, as a batch of one: AlpaSim sends batches by default."""
+        item = sensorsim_pb2.BatchRGBRenderRequestItem(
+            camera_name=request.camera.name,
+            request=wire_render_request(self.header.scene_id, request, encoding),
+        )
+        self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=[item]))
 
     def camera_image(
         self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0
     ) -> None:
         """Write one frame as the driver received it."""
-        self.encoded_image(
-            frame.camera,
-            frame.t_us - shutter_us,
-            frame.t_us,
-            encode_image(frame.rgb, encoding),
-        )
-
-    def encoded_image(self, camera: str, start_us: int, end_us: int, data: bytes) -> None:
-        """Write one frame that is already encoded; ``end_us`` is its time stamp."""
-        self._write(driver_camera_image=wire_image(self._uuid, camera, start_us, end_us, data))
+        start_us, data = frame.t_us - shutter_us, encode_image(frame.rgb, encoding)
+        image = wire_image(self._uuid, frame.camera, start_us, frame.t_us, data)
+        self._write(driver_camera_image=image)
 
     def ego_trajectory(self, states: Sequence[EgoState]) -> None:
         """Write the ego states the driver learned since the last call; the first call carries the
@@ -332,14 +320,3 @@ class AslWriter:
         return common_pb2.VersionId(
             version_id=given, git_hash=git_hash, grpc_api_version=api_version()
         )
-
-    def _recorded(self, t_us: int) -> dict[str, F64]:
-        """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or
-        around it.
-        """
-        tracks = ((a.actor_id, a.track) for a in self.header.actors if len(a.track))
-        return {
-            i: interpolate(track, t_us)
-            for i, track in tracks
-            if track.t_us[0] <= t_us <= track.t_us[-1]
-        }

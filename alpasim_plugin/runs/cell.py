@@ -24,7 +24,7 @@ from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
-from alpasim_plugin.log.asl import Renaming, copy_log
+from alpasim_plugin.log.asl import copy_log
 from alpasim_plugin.log.run_folder.manifests import (
     Action,
     RolloutState,
@@ -176,11 +176,11 @@ def copy_cell(
     with _writing_manifest(cell, options, folder) as manifest:
         announce(f"copying {cell.scene}")
         session = session_uuid(cell.seed, cell.rollout_key)
-        renaming = Renaming(session_uuid=session, renderer=_service_name(cell.renderer))
-        copy_log(source / LOG_NAME, folder / LOG_NAME, renaming)
-        for name in (FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME):
-            if os.path.exists(source / name):
-                shutil.copyfile(source / name, folder / name)
+        name = _service_name(cell.renderer)
+        copy_log(source / LOG_NAME, folder / LOG_NAME, session, name)
+        for file in (FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME):
+            if os.path.exists(source / file):
+                shutil.copyfile(source / file, folder / file)
         copy_steps(source, folder, cell.renderer.name)
         manifest |= original | manifest
         manifest |= {"copied_from": original["path"], "session_uuid": session, "stage_ms": {}}

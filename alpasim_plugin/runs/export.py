@@ -35,7 +35,7 @@ from alpasim_plugin.core.types import (
     Scenario,
 )
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.asl import Renaming, copy_log
+from alpasim_plugin.log.asl import copy_log
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
@@ -299,7 +299,7 @@ def _export_rollout(
         )
     target = folder / "rollouts" / manifest["scene"] / rollout.session_uuid
     target.mkdir(parents=True)
-    copy_log(source, target / LOG_NAME, Renaming(cameras=names))
+    copy_log(source, target / LOG_NAME, cameras=names)
     (target / COMPLETE).touch()
     # Note what AlpaSim's minADE will lack.
     reach_us = [

@@ -321,11 +321,7 @@ def _check_replay(past: LoggedRollout, at_us: int, folder: Path) -> None:
     one, other = log_trace(past.folder), log_trace(folder)
     # Another policy may have more cameras; their frames before the instant have no logged
     # counterpart.
-    other["frames"] = {
-        key: value
-        for key, value in other["frames"].items()
-        if key in one["frames"] or key[0] >= at_us
-    }
+    other = {key: value for key, value in other.items() if key in one or key[1] != "frames"}
     # The pose at the instant follows from the original parts; its frames and its plan come from the
     # new ones.
     until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
@@ -334,6 +330,7 @@ def _check_replay(past: LoggedRollout, at_us: int, folder: Path) -> None:
     if difference is not None:
         (folder / MANIFEST).unlink()
         raise InfrastructureError(
-            f"{past.name}: its replay differs from the log before the change: {difference}",
+            f"{past.name}: its replay differs from the log before the change: "
+            f"{difference['component']} at step {difference['step']}, {difference['what']}",
             "use the machine and the versions in run.json, or run the rollout again",
         )

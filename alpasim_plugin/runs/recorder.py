@@ -184,7 +184,7 @@ class Recorder:
         """Log one camera frame."""
         with self.stage("log"):
             if self._images != "none":
-                self._log.render_request([request], self._images)
+                self._log.render_request(request, self._images)
                 self._log.camera_image(frame, self._images, request.camera.shutter_us)
             opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
             facts = {

@@ -10,12 +10,12 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
-from alpasim_plugin.log.trace import Key, first_difference, trace_log
+from alpasim_plugin.log.trace import Trace, first_difference, trace_log
 from alpasim_plugin.runs.cell import run_cell
 from alpasim_plugin.runs.plan import Cell, RunPlan
 
 
-def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
+def log_trace(folder: Path) -> Trace:
     """Read the components of a finished rollout from its log and its per-frame facts."""
     return trace_log(folder / LOG_NAME, read_facts(folder / FRAMES_NAME))
 
@@ -76,7 +76,7 @@ def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonOb
         "repeatable": difference is None and digests[0] == digests[1],
         "cell": dict(cell.names),
         "digests": digests,
-        "first_difference": None if difference is None else difference.as_dict(),
+        "first_difference": difference,
     }
 
 

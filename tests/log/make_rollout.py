@@ -129,8 +129,7 @@ def write_rollout(path: Path, encoding: str = "png") -> Path:
 def _frame(log: AslWriter, state: EgoState, encoding: str) -> None:
     T = state.T_world_rig @ CAMERA.T_rig_camera
     T_start = state.T_world_rig @ se2(-0.3, 0, 0) @ CAMERA.T_rig_camera
-    log.render_request(
-        [RenderRequest(state.t_us, CAMERA, np.stack([T_start, T]), present(state.t_us))], encoding
-    )
+    poses = np.stack([T_start, T])
+    log.render_request(RenderRequest(state.t_us, CAMERA, poses, present(state.t_us)), encoding)
     step = int((state.t_us - T0_US) // STEP_US)
     log.camera_image(Frame(state.t_us, CAMERA.name, picture(step)), encoding, CAMERA.shutter_us)

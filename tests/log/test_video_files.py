@@ -23,7 +23,7 @@ def frames(n, height=144, width=256):
 
 @pytest.mark.parametrize("fps", [10, 30, 7.5, 29.97, Fraction(30000, 1001), Fraction(10, 3), 1])
 def test_frame_times_are_exact(tmp_path, fps):
-    assert write_mp4(tmp_path / "a.mp4", frames(25), fps) == 25
+    write_mp4(tmp_path / "a.mp4", frames(25), fps)
     video = read_mp4(tmp_path / "a.mp4")
     rate = Fraction(fps).limit_denominator(1001)
     assert video.fps == rate
@@ -55,7 +55,8 @@ def test_single_frame_is_a_video(tmp_path):
 
 
 def test_frames_may_come_from_a_generator(tmp_path):
-    assert write_mp4(tmp_path / "a.mp4", iter(frames(4)), 10) == 4
+    write_mp4(tmp_path / "a.mp4", iter(frames(4)), 10)
+    assert len(read_mp4(tmp_path / "a.mp4").frames) == 4
 
 
 @pytest.mark.parametrize(

@@ -70,22 +70,6 @@ def test_brightness_does_not_drift_over_generations(tmp_path):
     )  # the default scaler loses a grey level each time
 
 
-def test_a_rotated_video_is_read_upright(tmp_path):
-    image = picture(0)
-    image[:8] = 255
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-        stream.set_display_rotation(90)  # counter-clockwise: the bright top goes to the left
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
-        container.mux(stream.encode())
-    with VideoReader(tmp_path / "a.mp4") as video:
-        upright = next(iter(video)).image
-        assert (video.format.width, video.format.height) == (32, 48) == upright.shape[1::-1]
-    assert upright[:, :8].min() > 200
-    assert upright[:, 8:].max() < 60
-
-
 def test_pixel_aspect_is_kept(tmp_path):
     with VideoWriter(
         tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), pixel_aspect=Fraction(4, 3)

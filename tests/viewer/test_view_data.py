@@ -187,9 +187,7 @@ def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_pat
         assert "--video all" in drive["no_frames"]
     run = read_run(root)
     for rollout in run.rollouts:
-        write_mp4(
-            root / rollout.path / "front.mp4", [picture(k) for k in range(SMALL.steps)], 10, crf=12
-        )
+        write_mp4(root / rollout.path / "front.mp4", [picture(k) for k in range(SMALL.steps)], 10)
     for drive in only_cell(root)["drives"]:
         assert [number_of(jpeg) for jpeg in drive["cameras"][0]["jpeg"]] == list(range(SMALL.steps))
         assert drive["cameras"][0]["t"] == [100 * k for k in range(SMALL.steps)]
