@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from alpasim_plugin.core.json_types import JsonView
 from evaluators.numbers import decimals, fixed
-from evaluators.report.charts import MUTED, VARIANT, Axes, Chart
+from evaluators.report.charts import MUTED, VARIANT, Chart, chart_of, new_axes
 
 
 def sentence_of(record: JsonView) -> str:
@@ -62,26 +60,25 @@ def boundary_section(record: JsonView | None) -> dict[str, Any] | None:
 
 def chart(record: JsonView) -> Chart:
     """Draw every driven point, a row for each variant and seed, with boundaries and intervals."""
-    axes, names = Axes(), names_of(record)
+    names = names_of(record)
     unit = f", {record['unit']}" if record["unit"] else ""
-    listed = ", ".join(f"{i} {name}" for i, name in enumerate(names.values()))
-    axes.labels = [f"{record['parameter']}{unit}", listed]
-    for number_, (_, facts) in enumerate(record["variants"].items()):
-        colour = VARIANT[number_ % len(VARIANT)]
+    axes = new_axes(f"{record['parameter']}{unit}", "")
+    axes.set_yticks(range(len(names)), list(names.values()), parse_math=False)
+    for row, facts in enumerate(record["variants"].values()):
+        colour = VARIANT[row % len(VARIANT)]
         seeds = list(facts["outcomes"].values())
-        for row, outcomes in enumerate(seeds):
-            y = number_ + 0.6 * (row + 1) / (len(seeds) + 1) - 0.3
-            for has_failed, size in ((False, 3.0), (True, 6.0)):
-                at = [value for value, failed in outcomes if failed == has_failed]
-                shade = colour if has_failed else MUTED
-                axes.points(at, np.full(len(at), y), shade, size)
+        for seed, outcomes in enumerate(seeds):
+            y = row + 0.6 * (seed + 1) / (len(seeds) + 1) - 0.3
+            for value, has_failed in outcomes:
+                shade, size = (colour, 6.0) if has_failed else (MUTED, 3.0)
+                axes.plot(value, y, "o", color=shade, markersize=size)
         if "value" in facts:
-            level = np.array([number_ - 0.35, number_ + 0.35])
-            axes.band([facts["low"], facts["high"]], level[[0, 0]], level[[1, 1]], colour)
-            axes.line([facts["value"]] * 2, level, colour)
-    axes.limits = [None, (-0.6, len(names) - 0.4)]
+            ends = [row - 0.35, row + 0.35]
+            axes.fill_betweenx(ends, facts["low"], facts["high"], color=colour, alpha=0.16)
+            axes.plot([facts["value"]] * 2, ends, color=colour)
+    axes.set_ylim(-0.6, len(names) - 0.4)
     note = (
-        f"Rows: {listed}. Large dots: the drive failed; small ones: it did not. "
+        "Large dots: the rollout failed; small ones: it did not. "
         "Line and band: the boundary and its interval of 95 %."
     )
-    return axes.chart("Boundary", note)
+    return chart_of(axes, "Boundary", note)

@@ -10,7 +10,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.numbers import decimals, fixed, labelled, scale_and_unit
 from evaluators.opening import Run
-from evaluators.report.charts import INK, MUTED, VARIANT, Axes, Chart
+from evaluators.report.charts import INK, MUTED, VARIANT, Chart, chart_of, new_axes
 from evaluators.report.gate import tone_of_cause
 from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.verdicts import WORDS
@@ -121,27 +121,23 @@ def chart(decision: Decision, metric: MetricInfo) -> Chart:
     worse = -1.0 if metric.direction == "higher" else 1.0
     margin = scale * worse * decision["question"]["metrics"][metric.name]["margin"]
     limits = [margin, -margin] if metric.direction == "none" else [margin]
-    axes = Axes()
-    axes.band(scenes, low, high, VARIANT[1], 0.2)
-    axes.line(scenes, diff, VARIANT[1])
-    axes.points(scenes, diff, VARIANT[1], size=3.0)
-    axes.across(0.0, MUTED, 0.8)
+    difference = f"{decision['candidate']} minus {decision['baseline']}"
+    axes = new_axes("scenes", ", ".join(filter(None, (unit.strip(), difference))))
+    axes.fill_between(scenes, low, high, color=VARIANT[1], alpha=0.2, linewidth=0)
+    axes.plot(scenes, diff, "o-", color=VARIANT[1], markersize=3.0)
+    axes.axhline(0.0, color=MUTED, linewidth=0.8)
     for limit in limits:
-        axes.across(limit, INK, 1.0, "5 2")
+        axes.axhline(limit, color=INK, linewidth=1.0, linestyle="dashed")
     late = len(looks) // 2  # the bounds of the first analyses would make the rest flat
     known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
     known = known[np.isfinite(known)]
     room = 0.15 * max(float(np.ptp(known)), 1e-9)
-    axes.limits = [
-        (0.0, float(scenes[-1]) * 1.02),
-        (float(known.min()) - room, float(known.max()) + room),
-    ]
-    difference = f"{decision['candidate']} minus {decision['baseline']}"
-    axes.labels = ["scenes", ", ".join(filter(None, (unit.strip(), difference)))]
+    axes.set_xlim(0.0, float(scenes[-1]) * 1.02)
+    axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
     note = (
         "Line: mean difference. Band: what is not refuted, at every analysis. Dashed: the margin."
     )
-    return axes.chart(metric.name, note)
+    return chart_of(axes, metric.name, note)
 
 
 def _scale(metric: MetricInfo) -> tuple[float, str]:

@@ -20,7 +20,7 @@ from alpasim_plugin.log import encode_image
 from evaluators.metrics import METRICS
 from evaluators.numbers import DASH
 from evaluators.opening import read_run
-from evaluators.report.ci import overview_md
+from evaluators.report.ci import write_summary_md
 from evaluators.report.html import write_report
 from evaluators.report.overview import decided, overview_of, tone_of
 from evaluators.report.terminal import overview_lines
@@ -73,7 +73,7 @@ def test_every_rollout_is_counted_once_under_its_variant(usual_run):
 def test_terminal_markdown_and_page_print_the_same_cells(three):
     shown = overview_of(read_run(three))
     terminal = "\n".join(line.plain for line in overview_lines(shown, 100))
-    markdown = overview_md(shown)
+    markdown = write_summary_md(read_run(three)).read_text()
     page = re.sub(r"<[^>]*>", " ", write_report(three).read_text())
     for row in shown.rows:
         numbers = [cell.replace("\u00a0", " ") for cell in shown.cells(row)]

@@ -5,11 +5,9 @@ import re
 from html.parser import HTMLParser
 from urllib.parse import unquote
 
-import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from evaluators.report.charts import Axes, round_ticks
 from evaluators.report.html import write_report
 from tests.report.make_run import Plan, make_run
 
@@ -159,25 +157,3 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path,
     assert "No space left on device" in caught.value.message
     assert (folder / "report.html").read_bytes() == before
     assert not list(folder.glob(".*.tmp"))
-
-
-def test_a_gap_interrupts_a_line_and_a_band():
-    x, y = np.arange(5.0), np.array([1.0, 2.0, np.nan, 3.0, 2.0])
-    axes = Axes()
-    axes.band(x, y - 1, y + 1, "var(--variant-0)")
-    axes.line(x, y, "var(--variant-0)")
-    drawn = axes.chart("a", "b").picture
-    assert len(re.findall(r'd="[^"]*" style="fill:var', drawn)) == 2
-    (line,) = re.findall(r'd="([^"]*)" style="fill:none;stroke:var\(--variant-0', drawn)
-    assert [part.count("L") for part in line.split("M")[1:]] == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("low", "high"), [(0.0, 1.0), (-3e-7, 2e-7), (-1234.5, 99999.0), (0.98, 1.02)]
-)
-def test_ticks_are_round_few_and_inside(low, high):
-    ticks = round_ticks(low, high)
-    assert 2 <= len(ticks) <= 10
-    for value, text in ticks:
-        assert low - 1e-12 <= value <= high + 1e-12
-        assert float(text.replace("\u2212", "-")) == pytest.approx(value, abs=1e-12)

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART, markdown, terminal, xml
+from evaluators.opening import read_run
 from evaluators.report.ci import write_junit, write_summary_md
 from tests.report.make_run import Plan, make_run
 
@@ -57,11 +58,11 @@ def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path):
             failure=HOSTILE,
         ),
     )
-    text = write_summary_md(run).read_text()
+    text = write_summary_md(read_run(run)).read_text()
     assert "\x1b" not in text
     assert not any("<img" in part for part in text.split("```")[::2])  # blocks of code are text
     for line in text.splitlines():
         if line.startswith("|"):
             cells = line.replace("\\|", "").count("|")
             assert cells >= 3, line
-    ET.parse(write_junit(run))
+    ET.parse(write_junit(read_run(run)))
