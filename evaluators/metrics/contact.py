@@ -8,8 +8,7 @@ pairs of a rollout are handled at once: centre distances rule out nearly all of 
 exact predicates decide the rest.
 
 **Between steps** a body's centre moves straight and its heading turns at a constant rate the
-shorter way. Which actors can come near is found by an R-tree over x, y and t of stretches of their
-tracks; the rest is solved by `evaluators.metrics.sweep`, for all pairs at once. A contact has one
+shorter way. Distances of the centres rule out nearly all pairs; the rest is solved by `evaluators.metrics.sweep`, for all pairs at once. A contact has one
 side from its beginning to its end: the one that its normal leaves the ego through, front, rear or
 lateral. At a corner that is the side nearer to the normal's direction; a tie is front before rear
 before lateral. Contact that is there from the start, or from an actor's first logged time, has no
@@ -22,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from rtree import index
 
 from alpasim_plugin.core.geometry import rectangle_corners, wrap_angle
 from alpasim_plugin.core.types import F64, I64, Bool
@@ -36,7 +34,6 @@ LATERAL = 2
 # rules out a touching pair.
 _SLACK_M = 1e-6
 _SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
-_STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
 NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 # Where two bodies touch is read off their overlap when the ego is this much larger on every side.
 PLACE_M = 1e-6
@@ -230,9 +227,7 @@ def _onsets(
 
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:
     """Find the first contact of each actor in each interval at whose start it does not touch."""
-    actor, interval = near_in_time(ego, actors, t_us)
-    open_ = np.flatnonzero(~touch[actor, interval])
-    actor, interval = actor[open_], interval[open_]
+    actor, interval = np.nonzero(~touch[:, :-1])
     pair, t0, t1 = _pieces(actors, actor, t_us[interval], t_us[interval + 1])
     actor, interval = actor[pair], interval[pair]
     pairs = _motions(ego, actors, t_us, actor, interval, t0, t1)
@@ -245,43 +240,6 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     # Pieces of a pair run forward in time: the first hit is the earliest.
     _, first = np.unique(np.stack([actor[rows], interval[rows]], axis=1), axis=0, return_index=True)
     return _Found(actor[rows][first], interval[rows][first], t_s[first], side[first], xy[first])
-
-
-def near_in_time(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[I64, I64]:
-    """Return pairs ``(M,)`` of actor and interval (from step i to i + 1) in which the two could
-    touch, by stretches of their paths.
-    """
-    none = np.zeros(0, dtype=np.int64)
-    if len(t_us) < 2 or not len(actors):
-        return none, none
-    boxes = [
-        _stretches(actors.path_of(a), actors.times_of(a) - t_us[0], float(actors.radius_m[a]))
-        for a in range(len(actors))
-    ]
-    owner = np.repeat(np.arange(len(actors)), [len(low) for low, _ in boxes])
-    low, high = (np.concatenate([corners[k] for corners in boxes]) for k in (0, 1))
-    tree = index.Index((np.arange(len(owner)), low, high), properties=index.Property(dimension=3))
-    ego_low, ego_high = _stretches(ego.xy, t_us - t_us[0], float(ego.radius_m.max()) + _SLACK_M)
-    ids, counts = tree.intersection_v(ego_low, ego_high)
-    stretch = np.repeat(np.arange(len(ego_low)), counts.astype(np.int64))
-    met = np.unique(
-        np.stack([owner[ids], stretch], axis=1), axis=0
-    )  # an actor may meet a stretch with several of its own
-    actor = np.repeat(met[:, 0], _STRETCH)
-    interval = (met[:, 1:] * _STRETCH + np.arange(_STRETCH)).reshape(-1)
-    inside = interval < len(t_us) - 1
-    return actor[inside], interval[inside]
-
-
-def _stretches(path: F64, t: I64, radius_m: float) -> tuple[F64, F64]:
-    """Return the corners ``(N, 3)`` of boxes in x, y, t around stretches of a path ``(P, 2)``;
-    neighbours share a pose.
-    """
-    starts = np.arange(0, max(len(path) - 1, 1), _STRETCH)
-    ends = np.minimum(starts + _STRETCH, len(path) - 1)
-    low = np.minimum(np.minimum.reduceat(path, starts), path[ends]) - radius_m
-    high = np.maximum(np.maximum.reduceat(path, starts), path[ends]) + radius_m
-    return np.column_stack([low, t[starts]]), np.column_stack([high, t[ends]])
 
 
 def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, I64, I64]:

@@ -1,5 +1,4 @@
-"""Plan-view footprints: the ego's and all actors' rectangles at any set of times, as arrays; and
-rows of different lengths in one array.
+"""Plan-view footprints: the ego's and all actors' rectangles at any set of times, as arrays.
 
 Corners run front-left, front-right, rear-right, rear-left; the front bumper is the side between the
 first two, the rear bumper the one between the last two. All coordinates are metres relative to an
@@ -18,19 +17,6 @@ import shapely
 from alpasim_plugin.core.geometry import UNIT_CORNERS, rectangle_corners, slerp, yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.metrics.presets import Preset
-
-
-def spans(first: I64, last: I64) -> tuple[I64, I64]:
-    """Return for spans ``(N,)`` of an array, each from ``first`` to before ``last``, the span and
-    the place of all their members.
-
-    >>> [ends.tolist() for ends in spans(np.array([5, 0]), np.array([7, 3]))]
-    [[0, 0, 1, 1, 1], [5, 6, 0, 1, 2]]
-    """
-    n = last - first
-    span = np.repeat(np.arange(len(n)), n)
-    return span, np.arange(len(span)) - np.repeat(np.cumsum(n) - n - first, n)
-
 
 Geometries = npt.NDArray[Any]  # of shapely geometries
 
@@ -213,10 +199,6 @@ class ActorTable:
     def times_of(self, actor: int) -> I64:
         """Return the logged times of one actor."""
         return self._t[actor]
-
-    def path_of(self, actor: int) -> F64:
-        """Return the logged centres ``(N, 2)`` of one actor."""
-        return self._xy[self._start[actor] : self._start[actor + 1]]
 
     def _locate(self, actor: int, t_us: I64) -> tuple[I64, F64, Bool]:
         """Return per time ``(Q,)`` the logged row before or at it, the share of the way to the next

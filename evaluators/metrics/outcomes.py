@@ -35,14 +35,12 @@ class Outcome:
     Attributes:
         name: Its metric, or the failure class of a rollout that has no metrics.
         words: What sentences call it.
-        letter: What the chips of a scene table show.
         implied_by: Outcomes that say more, beside which this one is not named.
         ending: What tables of endings call it, where that is not its words.
     """
 
     name: str
     words: str
-    letter: str
     implied_by: tuple[str, ...] = ()
     ending: str = ""
 
@@ -51,14 +49,14 @@ POLICY_FAULT = "policy"  # the failure class of a rollout that the policy broke
 OUTCOMES = {  # the gravest first
     outcome.name: outcome
     for outcome in (
-        Outcome(POLICY_FAULT, "policy fault", "P"),
-        Outcome("collision_at_fault", "at-fault collision", "C", ending="collision"),
-        Outcome("collision_any", "collision", "C", ("collision_at_fault",)),
-        Outcome("offroad", "off-road", "O"),
-        Outcome("wrong_lane", "wrong lane", "W"),
-        Outcome("left_route", "left the route", "R"),
-        Outcome("stalled", "stalled", "S"),
-        Outcome("braked_without_cause", "braked without cause", "B", ("stalled",)),
+        Outcome(POLICY_FAULT, "policy fault"),
+        Outcome("collision_at_fault", "at-fault collision", ending="collision"),
+        Outcome("collision_any", "collision", ("collision_at_fault",)),
+        Outcome("offroad", "off-road"),
+        Outcome("wrong_lane", "wrong lane"),
+        Outcome("left_route", "left the route"),
+        Outcome("stalled", "stalled"),
+        Outcome("braked_without_cause", "braked without cause", ("stalled",)),
     )
 }
 NO_OUTCOME = "no event"

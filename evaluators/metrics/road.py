@@ -5,7 +5,7 @@ Areas and unions are built where a rollout comes, and kept for the next rollout.
 
 from __future__ import annotations
 
-import weakref
+from collections import deque
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -16,12 +16,11 @@ import shapely
 
 from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
-from evaluators.metrics.footprint import Geometries, spans
+from evaluators.metrics.footprint import Geometries
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.surface import Region, Surface, segment_distance
 
 LEVEL_RADIUS_M = 30.0  # AlpaSim's later rule looks no further for road edges
-_RUN = 8  # points in a row that are looked up together
 
 
 class Polylines:
@@ -36,14 +35,6 @@ class Polylines:
         follows = np.flatnonzero(self.vertex_owner[1:] == self.vertex_owner[:-1])
         self.start, self.end = self.vertices[follows], self.vertices[follows + 1]
         self.owner = self.vertex_owner[follows]
-        bounds = np.searchsorted(self.owner, np.arange(self.n_lines + 1))
-        self._first, self._last = bounds[:-1], bounds[1:]  # segments of each line
-
-    @cached_property
-    def _bounds(self) -> tuple[F64, F64]:
-        """Least and greatest coordinates ``(L, 3)`` of each line."""
-        first = np.searchsorted(self.vertex_owner, np.arange(self.n_lines))
-        return np.minimum.reduceat(self.vertices, first), np.maximum.reduceat(self.vertices, first)
 
     @cached_property
     def _segments(self) -> Geometries:
@@ -58,27 +49,9 @@ class Polylines:
     def line_within(self, xyz: F64, radius_m: float) -> Bool:
         """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
-        # Points in a row are near each other: lines, then segments are sorted out by the bounds of
-        # each run, and only then measured. The slack keeps rounding from hiding a segment.
-        run = np.arange(0, len(xyz), _RUN)
-        low, high = (
-            np.minimum.reduceat(xyz, run) - (radius_m + 1e-6),
-            np.maximum.reduceat(xyz, run) + (radius_m + 1e-6),
+        point, segment = self._tree.query(
+            shapely.points(xyz[:, :2]), predicate="dwithin", distance=radius_m + 1e-6
         )
-        least, most = self._bounds
-        meet = np.ones((len(run), self.n_lines), dtype=np.bool_)
-        for d in (0, 1):
-            meet &= (most[:, d] >= low[:, [d]]) & (least[:, d] <= high[:, [d]])
-        which, line = np.nonzero(meet)
-        pair, segment = spans(self._first[line], self._last[line])
-        which = which[pair]
-        least, most = np.minimum(self.start, self.end).T, np.maximum(self.start, self.end).T
-        for d in (0, 1):
-            keep = (most[d][segment] >= low[which, d]) & (least[d][segment] <= high[which, d])
-            which, segment = which[keep], segment[keep]
-        point = (run[which, None] + np.arange(_RUN)).reshape(-1)
-        segment = np.repeat(segment, _RUN)[point < len(xyz)]
-        point = point[point < len(xyz)]
         near = segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
         out[point[near], self.owner[segment[near]]] = True
         return out
@@ -146,7 +119,6 @@ class Road:
         self._centre = Polylines([lane.centre for lane in self._lanes], origin)
         self._edges = lane_map.road_edges
         self._areas: Geometries = np.full(len(self._lanes), None, dtype=object)
-        self._centres: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._unions: dict[bytes, Any] = {}
         self._rings = lane_map.drivable_areas
 
@@ -171,9 +143,12 @@ class Road:
     @cached_property
     def edges(self) -> Geometries:
         """Road edges in plan view, ``(E,)``."""
-        return np.array(
-            [_line(edge[:, :2] - self.origin[:2]) for edge in self._edges], dtype=object
-        )
+        return _lines(self._edges, self.origin)
+
+    @cached_property
+    def centre_lines(self) -> Geometries:
+        """Middles of the lanes in plan view, ``(L,)``."""
+        return _lines([lane.centre for lane in self._lanes], self.origin)
 
     @cached_property
     def _edge(self) -> Polylines:
@@ -242,10 +217,7 @@ class Road:
         """Return the direction of lanes ``(M,)`` beside points ``(M, 2)``: from 1 cm before to 1 cm
         after the centre's nearest point.
         """
-        for k in np.unique(lane).tolist():
-            if self._centres[k] is None:
-                self._centres[k] = _line(self._lanes[k].centre[:, :2] - self.origin[:2])
-        lines = self._centres[lane]
+        lines = self.centre_lines[lane]
         s = shapely.line_locate_point(lines, shapely.points(xy))
         before = shapely.get_coordinates(
             shapely.line_interpolate_point(lines, np.maximum(s - 0.01, 0.0))
@@ -270,25 +242,25 @@ def join(areas: Geometries, seam_m: float) -> Any:
     )
 
 
-def _line(xy: F64) -> Any:
-    return shapely.linestrings(np.repeat(xy, 2, axis=0) if len(xy) == 1 else xy)
+def _lines(lines: Sequence[F64], origin: F64) -> Geometries:
+    """Return lines ``(N, 3)`` in plan view, relative to an origin; one of a single point is a line
+    without length.
+    """
+    flat = [line[:, :2] - origin[:2] for line in lines]
+    shapes = [shapely.linestrings(np.repeat(xy, 2, axis=0) if len(xy) == 1 else xy) for xy in flat]
+    return np.array(shapes, dtype=object)
 
 
-_cache: dict[tuple[int, bytes, Preset], tuple[weakref.ref[LaneMap], Road]] = {}
-_CACHED_ROADS = 8
+_ROADS: deque[tuple[LaneMap, bytes, Preset, Road]] = deque(maxlen=8)
 
 
 def road_of(lane_map: LaneMap, origin: F64, preset: Preset) -> Road:
     """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a
     row.
     """
-    key = (id(lane_map), origin.tobytes(), preset)
-    held = _cache.get(key)
-    # An id can be reused after its object is gone; the weak reference shows that.
-    if held is not None and held[0]() is lane_map:
-        return held[1]
-    while len(_cache) >= _CACHED_ROADS:
-        del _cache[next(iter(_cache))]
+    for known_map, known_origin, known_preset, road in _ROADS:
+        if known_map is lane_map and known_origin == origin.tobytes() and known_preset == preset:
+            return road
     road = Road(lane_map, origin, preset)
-    _cache[key] = (weakref.ref(lane_map), road)
+    _ROADS.append((lane_map, origin.tobytes(), preset, road))
     return road

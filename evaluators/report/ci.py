@@ -293,7 +293,7 @@ def _append_job_summary(text: str) -> None:
     if not named:
         return
     path = Path(named)
-    before = read_text(path).rstrip("\n") + "\n\n" if path.exists() else ""
+    before = read_text(path).rstrip("\n") + "\n\n" if os.path.exists(path) else ""
     room = MAX_BYTES - len(before.encode())
     if room > len(CUT_NOTE):
         write_text(path, before + cut(text, room))

@@ -24,6 +24,7 @@ NO_LIMITS = "the speed limits of the lanes"
 SHORT = "more than three instants"
 NO_SIGNALS = "the states of the traffic lights"
 RED = ("red", "red_yellow")
+LANE_M, LANE_S = 0.5, 2.0
 
 
 class Judged:
@@ -190,18 +191,14 @@ class Judged:
             else float(not self.uncomfortable.any())
         )
 
-    def lane_keeping(self, off_m: float = 0.5, for_s: float = 2.0) -> Part:
-        """Return whether the ego never stays farther from the middle of its lane than this for so
-        long; at junctions it may.
+    def lane_keeping(self) -> Part:
+        """Return whether the ego never stays farther from the middle of its lane than `LANE_M` for
+        `LANE_S`; at junctions it may.
         """
         if not self.has_map:
             return NO_MAP
         step, lane = self._in_lanes
         free = np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)
-        centres = [
-            shapely.linestrings(self._lanes[k].centre[:, :2] - self.road.origin[:2])
-            for k in lane.tolist()
-        ]
         away = np.full(len(self._xyz), np.inf)
         np.minimum.at(
             away,
@@ -210,12 +207,12 @@ class Judged:
                 free,
                 0.0,
                 shapely.distance(
-                    np.array(centres, dtype=object), shapely.points(self.ego.centre[step])
+                    self.road.centre_lines[lane], shapely.points(self.ego.centre[step])
                 ),
             ),
         )
-        far = np.isfinite(away) & (away > off_m)
+        far = np.isfinite(away) & (away > LANE_M)
         began = np.maximum.accumulate(
             np.where(far, 0, self.ego.t_us)
         )  # the last instant at which it was not far
-        return float(not np.any(far & (self.ego.t_us - began > for_s * 1e6)))
+        return float(not np.any(far & (self.ego.t_us - began > LANE_S * 1e6)))

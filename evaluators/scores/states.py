@@ -7,11 +7,11 @@ axes of the vehicle; whoever has measured ones gives them instead.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
@@ -96,15 +96,9 @@ class Tracks:
         """Give the speeds ``(A, T)``, m/s."""
         return np.hypot(self.velocity[..., 0], self.velocity[..., 1])
 
-    def boxes(self, actor: I64, step: I64, after_s: float = 0.0) -> Footprints:
-        """Return the boxes of pairs ``(M,)`` of actor and step, moved on at their velocity for some
-        seconds.
-        """
-        return Footprints(
-            self.xy[actor, step] + after_s * self.velocity[actor, step],
-            self.yaw[actor, step],
-            self.size[actor],
-        )
+    def boxes(self, actor: I64, step: I64) -> Footprints:
+        """Return the boxes of pairs ``(M,)`` of actor and step."""
+        return Footprints(self.xy[actor, step], self.yaw[actor, step], self.size[actor])
 
 
 def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F64) -> EgoStates:
@@ -172,11 +166,11 @@ def in_axes(vectors: F64, yaw: F64) -> F64:
     )
 
 
-def smooth(values: F64, window: int = 8, order: int = 2) -> F64:
-    """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than
-    they are.
+def smooth(values: F64) -> F64:
+    """Return values ``(T,)`` through a Savitzky-Golay filter of order 2, whose window of 8 is never
+    longer than they are.
     """
-    return savitzky_golay(values, min(window, _enough(values, order)), order)
+    return np.asarray(scipy.signal.savgol_filter(values, min(8, _enough(values, 2)), 2))
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
@@ -184,36 +178,8 @@ def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: i
     per second to the power of ``times``.
     """
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
-    return savitzky_golay(values, min(window, _enough(values, order)), order, times, step_s)
-
-
-def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: float = 1.0) -> F64:
-    """Return values ``(T,)``, or a derivative of them, by polynomials fitted to a moving window
-    (Savitzky and Golay 1964).
-
-    The half window at either end is read off the polynomial of the outermost window, as
-    `scipy.signal.savgol_filter` does; its module takes longer to load than a drive takes to score.
-
-    Args:
-        values: ``(T,)``, T not below ``window``.
-        window: Values that a polynomial is fitted to; an even window looks half a step ahead.
-        order: Of the polynomial, below ``window``.
-        times: How often it is differentiated, at most ``order``.
-        step: Between two values.
-    """
-    half, before, n = window // 2, (window - 1) // 2, len(values)
-    powers = np.arange(order + 1)
-    offsets = np.arange(window) - (window - 1) / 2
-    coefficients = np.linalg.pinv(offsets[:, None] ** powers)
-    scales = np.array([math.perm(power, times) for power in powers]) / step**times
-    # Row k weighs a window's values for the polynomial at its k-th value, the last row at its middle.
-    evaluated = np.append(offsets, 0.0)[:, None] ** np.maximum(powers - times, 0)
-    weights = (scales * evaluated) @ coefficients
-    windows = np.lib.stride_tricks.sliding_window_view(values, window)
-    start = weights[:half] @ windows[0]
-    middle = windows[half - before : n - half - before] @ weights[-1]
-    end = weights[window - half : window] @ windows[-1]
-    return np.concatenate([start, middle, end])
+    window = min(window, _enough(values, order))
+    return np.asarray(scipy.signal.savgol_filter(values, window, order, times, step_s))
 
 
 def _enough(values: F64, order: int) -> int:
