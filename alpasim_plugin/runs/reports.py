@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from alpasim_plugin.core.atomic import write_bytes, write_json
@@ -21,7 +20,6 @@ from evaluators.report.ci import write_junit, write_summary_md
 from evaluators.report.flips import (
     FLIPS_NAME,
     Flip,
-    FlipKey,
     find_flips,
     flip_entries,
     key_of_entry,
@@ -29,11 +27,10 @@ from evaluators.report.flips import (
 from evaluators.report.html import write_report
 from evaluators.viewer.cause import cause_of, write_cause
 from evaluators.viewer.cells import read_log
-from evaluators.viewer.page import write_flips_page
 
 
 def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
-    """Write ``summary.md``, ``junit.xml``, ``flips.html`` and ``report.html`` of a run folder and
+    """Write ``summary.md``, ``junit.xml`` and ``report.html`` of a run folder and
     return the path of the last.
 
     Args:
@@ -44,16 +41,14 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
             earlier command are removed, and None is returned.
     """
     run = read_run(root)
-    replays: Mapping[FlipKey, str] = {}
     if flips and page:
         write_flips(run)
-        replays = write_flips_page(run)
         write_causes(run)
     write_summary_md(run)
     write_junit(run)
     report = None
     if page:
-        report = write_report(run, replays)
+        report = write_report(run)
     else:
         for name in PAGES:
             (root / name).unlink(missing_ok=True)

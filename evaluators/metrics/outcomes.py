@@ -87,6 +87,12 @@ def told(had: Iterable[str]) -> list[Outcome]:
     ]
 
 
+def gravity(rollout: Rollout) -> int:
+    """Return the rank of the gravest outcome of a rollout, 0 first; beyond all without one."""
+    had = outcomes_of(rollout)
+    return next((rank for rank, name in enumerate(OUTCOMES) if name in had), len(OUTCOMES))
+
+
 def in_words(had: Iterable[str]) -> str:
     """Name outcomes.
 

@@ -32,7 +32,7 @@ from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.boundary import boundary_section
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.flips import FlipKey, colours_of, flip_bases, flip_rows
+from evaluators.report.flips import colours_of, flip_bases, flip_rows
 from evaluators.report.gate import gate_section
 from evaluators.report.overview import TONES, overview_of
 from evaluators.report.provenance import (
@@ -50,17 +50,15 @@ OPEN_SCENE_PLOTS = 6
 LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
-NO_REPLAYS: Mapping[FlipKey, str] = {}
 STYLES = ("theme.css", "report.css")
 SCRIPTS = ("theme.js", "report.js", "rollouts.js")
 
 
-def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> Path:
+def write_report(run_dir: Path | str | Run) -> Path:
     """Write ``report.html`` into a run folder.
 
     Args:
         run_dir: A run folder (docs/architecture.md), or what was read of it. Nothing else is read.
-        replays: Key of a changed outcome -> where it is replayed, relative to the run folder.
 
     Returns:
         Path of the report.
@@ -71,13 +69,13 @@ def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_
     run = read_run(run_dir)
     path = run.folder / "report.html"
     with reporting(run):
-        text = render_report(run, replays)
+        text = render_report(run)
     write_text(path, text)
     return path
 
 
-def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
-    """Render the report as a string; ``replays`` as in `write_report`.
+def render_report(run: Run) -> str:
+    """Render the report as a string.
 
     Style sheets and scripts stand inside the page; the hash allows it to run this script and no
     other.
@@ -91,7 +89,6 @@ def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         plural=plural,
         dash=DASH,
-        replays=replays,
         **context(run),
     )
 

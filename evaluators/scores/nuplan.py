@@ -132,6 +132,8 @@ def time_to_collision(
     tracks: Tracks,
     collisions: list[Collision],
     beside: Bool | None = None,
+    step_s: float = TTC_STEP_S,
+    horizon_s: float = TTC_HORIZON_S,
 ) -> F64:
     """Return ``(T,)`` seconds until the ego touches a road user if all go on at their velocity;
     infinite where none is within the horizon.
@@ -142,6 +144,7 @@ def time_to_collision(
             counts no more.
         beside: ``(T,)`` where road users at the ego's side count as those ahead do: in several
             lanes, off the road, at a junction.
+        step_s, horizon_s: Times that are looked at: multiples of the step before the horizon.
     """
     out = np.full(len(ego.t_us), np.inf)
     counts = tracks.there & (ego.speed > STANDS_MPS)
@@ -154,8 +157,8 @@ def time_to_collision(
         near |= beside[step] & (angle <= BEHIND_RAD)
     actor, step = actor[near], step[near]
     first_s, last_s = touching_s(ego, tracks, actor, step)
-    after_s = TTC_STEP_S * np.maximum(np.ceil(first_s / TTC_STEP_S - 1e-9), 1.0)
-    hit = (after_s <= last_s) & (after_s < TTC_HORIZON_S - 1e-9)
+    after_s = step_s * np.maximum(np.ceil(first_s / step_s - 1e-9), 1.0)
+    hit = (after_s <= last_s) & (after_s < horizon_s - 1e-9)
     np.minimum.at(out, step[hit], after_s[hit])
     for collision in collisions:
         if collision.at_fault and ego.speed[collision.step] > STANDS_MPS:

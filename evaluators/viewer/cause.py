@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import base64
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
+from alpasim_plugin.core.geometry import interpolate, inverse, speeds, transform_points
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import inside, read_bytes, real
-from alpasim_plugin.core.types import F64, U8, RolloutLog
+from alpasim_plugin.core.reading import inside, parsing, read_bytes, real
+from alpasim_plugin.core.types import F64, CameraSpec, LoggedPlan, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
 from alpasim_plugin.log.images import smaller
@@ -39,6 +38,7 @@ from evaluators.metrics.outcomes import (
     SHORT_OF_END,
     ending_of,
     first_failure,
+    gravity,
     in_words,
     outcomes_of,
 )
@@ -46,10 +46,9 @@ from evaluators.opening import Run
 from evaluators.report.rollouts import clock_zero_us
 from evaluators.viewer.cells import lens_data, read_log
 from evaluators.viewer.drive_data import (
-    MAX_SAMPLES,
     Place,
-    half_seconds,
     map_data,
+    plan_lines,
     scene_of,
     user_data,
 )
@@ -62,29 +61,14 @@ BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
 MOST_QUERIES = 48
 SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
-Item = TypeVar("Item")
-
-
-@dataclass(frozen=True)
-class Query:
-    """One query of the policy.
-
-    Attributes:
-        T_world_rig: ``(4, 4)``: where the ego was.
-        speed_mps: Of the ego.
-        route: ``(N, 2)`` metres, rig frame, as the policy received it; empty where unknown.
-        lines: The plan and its samples, each ``(N, 2)`` metres, rig frame, every half second.
-        images: What each renderer showed of the first camera at that pose: time, encoded image.
-        debug: A row of `alpasim_plugin.log.debug.debug_row`.
-    """
-
-    t_us: int
-    T_world_rig: F64
-    speed_mps: float
-    route: F64
-    lines: Sequence[F64]
-    images: Mapping[str, tuple[int, bytes]]
-    debug: JsonView
+CHECK = "Check of the policy before the run: "
+# Notes of a check, and the outcomes beside which they are shown.
+TELLING = {
+    "lag": tuple(OUTCOMES),
+    "images": ("collision_any", "collision_at_fault", "offroad", "wrong_lane", "left_route"),
+    "route_rig": ("offroad", "wrong_lane", "left_route"),
+    "standstill": ("stalled",),
+}
 
 
 @dataclass(frozen=True)
@@ -94,17 +78,17 @@ class Parting:
     Attributes:
         name: The renderer or the policy.
         kind: ``renderer`` or ``policy``.
-        t_us: The first query at which they are apart.
+        at_s: Seconds from the first camera frame to the first query at which they are apart.
         gap_m: How far apart they are then.
-        images: The other's image and the own one at that query, ``(H, W, 3)`` each; none of a
-            policy, which sees the same.
+        images: The other's image and the own one at that query, JPEG in base64; none of a policy,
+            which sees the same.
     """
 
     name: str
     kind: str
-    t_us: int
+    at_s: float
     gap_m: float
-    images: Sequence[U8] = ()
+    images: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -116,9 +100,7 @@ class Cause:
         failed_us: When it failed first; None where it did not.
         start_us: The first camera frame.
         sentences: What the run shows, the most telling first.
-        queries: Those to show, in order of time.
         partings: When plans part from others'.
-        commands: What can be asked next: a key, what it shows, the command.
         log: As far as it was written; None where there is none.
     """
 
@@ -127,10 +109,13 @@ class Cause:
     failed_us: int | None
     start_us: int
     sentences: Sequence[str]
-    queries: Sequence[Query]
     partings: Sequence[Parting]
-    commands: Sequence[tuple[str, str, str]]
     log: RolloutLog | None
+
+    @property
+    def failed_s(self) -> float | None:
+        """Give when it failed, seconds from the first camera frame."""
+        return None if self.failed_us is None else (self.failed_us - self.start_us) * 1e-6
 
 
 def worst_failure(run: Run) -> Rollout:
@@ -139,20 +124,13 @@ def worst_failure(run: Run) -> Rollout:
     Raises:
         InputError: No rollout failed.
     """
-    gravity = {name: number for number, name in enumerate(OUTCOMES)}
-
-    def rank(rollout: Rollout) -> int:
-        if not rollout.ok:
-            return -1
-        return min((gravity[name] for name in outcomes_of(rollout)), default=len(gravity))
-
-    worst = min(run.rollouts, key=rank, default=None)
-    if worst is None or rank(worst) == len(gravity):
+    failed = [one for one in run.rollouts if not one.ok or outcomes_of(one)]
+    if not failed:
         raise InputError(
             f"{run.folder}: no rollout of this run failed",
             "Name a rollout: simrun why RUN/RENDERER/POLICY/SCENE/SEED.",
         )
-    return worst
+    return min(failed, key=lambda one: gravity(one) if one.ok else -1)
 
 
 def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
@@ -167,49 +145,43 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
         InputError: A file of the run is damaged.
     """
     log = _log_so_far(run, rollout)
-    start_us, failed_us = 0, failed_at(run.manifest(rollout))
-    queries: list[Query] = []
-    if log is not None:
-        start_us = log.render_start_us
-        if not rollout.ok:
-            failed_us = int(log.ego.t_us[-1])
-        queries = _queries(run, rollout, log, failed_us)
+    manifest = run.manifest(rollout)
+    first = first_failure(manifest)
+    failed_us = None if first is None else int(first["t_us"])
+    start_us = 0 if log is None else log.render_start_us
+    if log is not None and not rollout.ok:
+        failed_us = int(log.ego.t_us[-1])
     partings = [
-        _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
+        _parting_of(run, rollout, entry, start_us)
+        for entry in entries
+        if entry.get("t_us") is not None
     ]
     outcomes = outcomes_of(rollout)
     outcome = in_words(outcomes) if outcomes else ending_of(rollout)
-    breaches, notes = _checked(run, rollout)
-    sentences = list(breaches)
+    checks = (run.info.get("policy_checks") or {}).get(rollout.policy) or {}
+    sentences = [f"{CHECK}{text}." for _, text in checks.get("breaches") or ()]
     if not rollout.ok:
         outcome = f"{rollout.failure_class}: {rollout.failure}"
         said = last_output(run.folder / rollout.path / OUTPUT_NAME)
         sentences = [*(sentences or [rollout.failure]), *said]
-    sentences += [*behind_others(run, rollout), *notes]
+    sentences += behind_others(run, rollout)
+    for name, text in sorted(checks.get("notes") or (), key=lambda note: note[0] != "lag"):
+        if outcomes & {*TELLING.get(name, ())}:
+            sentences.append(f"{CHECK}{text}.")
     if log is not None and rollout.ok:
         ended_us = int(log.ego.t_us[-1]) if outcome == SHORT_OF_END else failed_us
+        contacts = manifest.get("contacts") or ()
+        met = str(contacts[0]["actor_id"]) if contacts else ""
         if ended_us is not None:
-            sentences += plan_facts(log, ended_us, outcomes, _met(run, rollout))
-    for one in partings:
-        at_s = (one.t_us - start_us) * 1e-6
-        sentences.append(
-            f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, "
-            f"by {one.gap_m:.2f} m."
-        )
-    if failed_us is not None:
-        made_up = seen_before(frame_rows(run, rollout), failed_us)
-        sentences += [f"{made_up}."] if made_up else []
-    return Cause(
-        rollout=rollout,
-        outcome=outcome,
-        failed_us=failed_us,
-        start_us=start_us,
-        sentences=sentences,
-        queries=queries,
-        partings=partings,
-        commands=commands(run, rollout, start_us, failed_us, partings),
-        log=log,
-    )
+            sentences += plan_facts(log, ended_us, outcomes, met)
+    sentences += [
+        f"Plans part from those of the {one.kind} {one.name} at {one.at_s:.1f} s, "
+        f"by {one.gap_m:.2f} m."
+        for one in partings
+    ]
+    made_up = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
+    sentences += [f"{made_up}."] if made_up else []
+    return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log)
 
 
 def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
@@ -225,94 +197,17 @@ def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
         return None  # it broke off before there was anything to show
 
 
-# Notes of a check, and the outcomes beside which they are shown.
-TELLING = {
-    "lag": tuple(OUTCOMES),
-    "images": ("collision_any", "collision_at_fault", "offroad", "wrong_lane", "left_route"),
-    "route_rig": ("offroad", "wrong_lane", "left_route"),
-    "standstill": ("stalled",),
-}
-
-
-def _checked(run: Run, rollout: Rollout) -> tuple[list[str], list[str]]:
-    """Return what the check of the policy found before the run: breaches, and the notes that are
-    telling beside the outcome.
-    """
-    checks = (run.info.get("policy_checks") or {}).get(rollout.policy) or {}
-    had = outcomes_of(rollout)
-    notes = sorted(checks.get("notes") or (), key=lambda note: note[0] != "lag")
-    telling = [note for note in notes if had & {*TELLING.get(note[0], ())}]
-    breaches, shown = (
-        [f"Check of the policy before the run: {text}." for _, text in found]
-        for found in (checks.get("breaches") or (), telling)
-    )
-    return breaches, shown
-
-
-def _met(run: Run, rollout: Rollout) -> str:
-    """Return the road user of the first contact; empty where there is none."""
-    contacts = run.manifest(rollout).get("contacts") or ()
-    return str(contacts[0]["actor_id"]) if contacts else ""
-
-
-def failed_at(manifest: JsonView) -> int | None:
-    """Return when a rollout failed first, microseconds; None where it did not."""
-    first = first_failure(manifest)
-    return None if first is None else int(first["t_us"])
-
-
-def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
-    """Return at most `MOST_QUERIES` of what has these times: what lies before the failure, or an
-    even choice.
+def shown_plans(log: RolloutLog, failed_us: int | None) -> list[LoggedPlan]:
+    """Return at most `MOST_QUERIES` plans: of those that lie before the failure, or of all, an even
+    choice that holds the last one.
     """
     near = [
-        one
-        for one, t in zip(all_of, times_us, strict=True)
-        if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US
+        plan
+        for plan in log.plans
+        if len(plan.trajectory) > 1
+        and (failed_us is None or failed_us - BEFORE_US <= plan.now_us <= failed_us + AFTER_US)
     ]
     return near[::-1][:: -(-len(near) // MOST_QUERIES) or 1][::-1]
-
-
-def _queries(run: Run, rollout: Rollout, log: RolloutLog, failed_us: int | None) -> list[Query]:
-    """Return the queries of a log that the page shows, with what the run stored of them."""
-    camera = next(iter(log.info["cameras"]), None)
-    images = [image for image in log.images if camera is not None and image.camera == camera.name]
-    ends_us = np.array([image.end_us for image in images])
-    speeds = np.zeros(len(log.ego))
-    if len(log.ego) > 1:
-        seconds = (log.ego.t_us - log.ego.t_us[0]) * 1e-6
-        speeds = np.linalg.norm(np.gradient(log.ego.xyz[:, :2], seconds, axis=0), axis=1)
-    said = run.file_of(rollout, DEBUG_NAME)
-    debug: dict[Any, Any] = {}
-    if said is not None:
-        debug = {row["t_us"]: row for row in read_facts(said)}
-    others = same_poses(run, rollout)
-    plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
-    queries = []
-    for plan in chosen(plans, failed_us, [plan.now_us for plan in plans]):
-        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
-        lines = [
-            half_seconds(line.t_us, transform_points(inverse(pose), line.xyz))
-            for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
-        ]
-        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
-        shown: dict[str, tuple[int, bytes]] = {}
-        if newest >= 0:
-            t_us = images[newest].end_us
-            shown[rollout.renderer] = t_us, images[newest].data
-            shown |= {name: (t_us, at[t_us]) for name, at in others.items() if t_us in at}
-        queries.append(
-            Query(
-                t_us=plan.now_us,
-                T_world_rig=pose,
-                speed_mps=float(np.interp(plan.now_us, log.ego.t_us, speeds)),
-                route=plan.route,
-                lines=lines,
-                images=shown,
-                debug=debug.get(plan.now_us) or debug_row({}),
-            )
-        )
-    return queries
 
 
 def same_poses(run: Run, rollout: Rollout) -> dict[str, dict[int, bytes]]:
@@ -322,15 +217,11 @@ def same_poses(run: Run, rollout: Rollout) -> dict[str, dict[int, bytes]]:
     path = run.file_of(rollout, SAME_POSES)
     if path is None:
         return {}
-    try:
+    with parsing(path, "Delete the file; the page is made without it.", "no images of renderers"):
         return {
             name: {int(t_us): base64.b64decode(image) for t_us, image in images}
             for name, images in read_json(path).items()
         }
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: {error}", "Delete the file; the page is made without it."
-        ) from error
 
 
 def write_cause(run: Run, cause: Cause) -> Path:
@@ -342,96 +233,114 @@ def write_cause(run: Run, cause: Cause) -> Path:
     """
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
-    report = "../" * len(Path(rollout.path).parts) + "report.html"
-    names = dict.fromkeys(name for query in cause.queries for name in query.images)
+    document = {"queries": [], "lens": None, "failed": None}
+    if cause.log is not None:
+        document = _document(run, cause, cause.log)
+    names = dict.fromkeys(name for query in document["queries"] for name in query["seen"])
     html = fill(
         "cause.html.j2",
         SCRIPTS,
         STYLES,
         cause=cause,
-        document=Markup(as_json(_document(run, cause))),
+        commands=commands(run, cause),
+        document=Markup(as_json(document)),
         renderers=[name for name in names if name != rollout.renderer],
         has_images=bool(names),
-        partings=[_parting(one, cause.start_us) for one in cause.partings],
         run=real(run.folder).name,
-        report=report,
-        failed_s=None if cause.failed_us is None else (cause.failed_us - cause.start_us) * 1e-6,
+        report="../" * len(Path(rollout.path).parts) + "report.html",
     )
     write_text(path, html)
     return path
 
 
-def _document(run: Run, cause: Cause) -> JsonObject:
-    """Return what the script of the page draws; without a log, no query."""
-    rollout, log = cause.rollout, cause.log
-    if log is None:
-        return {"queries": [], "lens": None, "failed": None}
-    content, recorded = scene_of(run, rollout.scene)
+def _document(run: Run, cause: Cause, log: RolloutLog) -> JsonObject:
+    """Return what the script of the page draws."""
+    content, recorded = scene_of(run, cause.rollout.scene)
     place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
-    lens, scale = None, 1.0
-    if log.info["cameras"]:
-        camera = log.info["cameras"][0]
-        scale = min(1.0, WIDTH_PX / camera.width)
-        lens = lens_data(camera, WIDTH_PX)
+    camera = next(iter(log.info["cameras"]), None)
     return {
-        "own": rollout.renderer,
+        "own": cause.rollout.renderer,
         "map": map_data(content, recorded, place),
         "users": [user_data(actor, place) for actor in log.actors.values()],
         "ego": place.track(log.ego),
         "rear": round(100 * float(log.T_rig_box[0, 3])),
-        "lens": lens,
+        "lens": None if camera is None else lens_data(camera, WIDTH_PX),
         "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
-        "queries": [_query(query, place, scale) for query in cause.queries],
+        "queries": _queries(run, cause, log, camera, place),
     }
 
 
-def _query(query: Query, place: Place, scale: float) -> JsonObject:
-    """Return a query for the page: times in milliseconds, lines in world centimetres, boxes in
-    pixels of the page's image.
+def _queries(
+    run: Run, cause: Cause, log: RolloutLog, camera: CameraSpec | None, place: Place
+) -> list[JsonObject]:
+    """Return the queries of a log that the page shows, with what the run stored of them: times in
+    milliseconds, lines in world centimetres, boxes in pixels of the page's image.
     """
+    rollout = cause.rollout
+    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
+    images = [image for image in log.images if camera is not None and image.camera == camera.name]
+    ends_us = np.array([image.end_us for image in images])
+    driven = speeds(log.ego)
+    said = run.file_of(rollout, DEBUG_NAME)
+    debug = {} if said is None else {row["t_us"]: row for row in read_facts(said)}
+    others = same_poses(run, rollout)
 
-    def line(xy: F64) -> list[list[int]]:
-        """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
-        known = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
-        known = known[np.isfinite(known).all(axis=1)]
-        rig = np.column_stack([known, np.zeros(len(known))])
-        return place.cm(transform_points(query.T_world_rig, rig)[:, :2])
-
-    def image(data: bytes) -> str:
+    def jpeg_of(data: bytes) -> str:
         if scale == 1.0 and data.startswith(JPEG_START):
             return base64.b64encode(data).decode()
         return jpeg(smaller(decode_image(data, "a camera frame"), WIDTH_PX))
 
-    debug = dict(query.debug)
-    debug["lines"] = [[name, line(xy)] for name, xy in debug["lines"]]
-    debug["boxes"] = [
-        [name, *(round(scale * side, 1) for side in box)]
-        for name, boxes in debug["boxes"]
-        for box in boxes
-    ]
-    return {
-        "t": place.ms([query.t_us])[0],
-        "speed": round(query.speed_mps, 2),
-        "route": line(query.route),
-        "plan": [line(one) for one in query.lines],
-        "seen": {
-            name: {"jpeg": image(data), "t": place.ms([t_us])[0]}
-            for name, (t_us, data) in query.images.items()
-        },
-        "said": debug,
-    }
+    queries: list[JsonObject] = []
+    for plan in shown_plans(log, cause.failed_us):
+        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
+        own = dict(debug.get(plan.now_us) or debug_row({}))
+        own["lines"] = [[name, _in_world(pose, xy, place)] for name, xy in own["lines"]]
+        own["boxes"] = [
+            [name, *(round(scale * side, 1) for side in box)]
+            for name, boxes in own["boxes"]
+            for box in boxes
+        ]
+        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
+        seen: dict[str, JsonObject] = {}
+        if newest >= 0:
+            t_us = images[newest].end_us
+            shown = {rollout.renderer: images[newest].data}
+            shown |= {name: at[t_us] for name, at in others.items() if t_us in at}
+            t_ms = place.ms([t_us])[0]
+            seen = {name: {"jpeg": jpeg_of(data), "t": t_ms} for name, data in shown.items()}
+        queries.append(
+            {
+                "t": place.ms([plan.now_us])[0],
+                "speed": round(float(np.interp(plan.now_us, log.ego.t_us, driven)), 2),
+                "route": _in_world(pose, plan.route, place),
+                "plan": plan_lines(plan, place),
+                "seen": seen,
+                "said": own,
+            }
+        )
+    return queries
 
 
-def _parting_of(run: Run, rollout: Rollout, entry: JsonView) -> Parting:
+def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:
+    """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
+    known = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+    known = known[np.isfinite(known).all(axis=1)]
+    rig = np.column_stack([known, np.zeros(len(known))])
+    return place.cm(transform_points(T_world_rig, rig)[:, :2])
+
+
+def _parting_of(run: Run, rollout: Rollout, entry: JsonView, start_us: int) -> Parting:
     """Return where plans part by an entry of ``flips.json``; a policy sees the same images."""
-    t_us, gap_m = int(entry["t_us"]), float(entry["gap_m"])
+    at_s, gap_m = (int(entry["t_us"]) - start_us) * 1e-6, float(entry["gap_m"])
     if entry["baseline"] == rollout.renderer:
         name = str(entry["against"]).removeprefix(rollout.renderer + "/")
-        return Parting(name, "policy", t_us, gap_m)
+        return Parting(name, "policy", at_s, gap_m)
     paths = [inside(run.folder, name) for name in (entry.get("frames") or {}).values()]
     images = [decode_image(read_bytes(path), str(path)) for path in paths if path is not None]
-    is_pair = len(images) == 2 and images[0].shape == images[1].shape
-    return Parting(str(entry["baseline"]), "renderer", t_us, gap_m, images if is_pair else ())
+    if len(images) != 2 or images[0].shape != images[1].shape:
+        images = []
+    encoded = [jpeg(smaller(image, WIDTH_PX)) for image in images]
+    return Parting(str(entry["baseline"]), "renderer", at_s, gap_m, encoded)
 
 
 def behind_others(run: Run, rollout: Rollout) -> list[str]:
@@ -446,26 +355,16 @@ def behind_others(run: Run, rollout: Rollout) -> list[str]:
     return [f"Behind {' and '.join(better)} the same rollout ends without an event."]
 
 
-def commands(
-    run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]
-) -> list[tuple[str, str, str]]:
+def commands(run: Run, cause: Cause) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
+    rollout = cause.rollout
     if not rollout.ok:
-        return [
-            ("c", "test the policy alone", f"simrun check policy {shlex.quote(rollout.policy)}")
-        ]
+        check = f"simrun check policy {shlex.quote(rollout.policy)}"
+        return [("c", "test the policy alone", check)]
     cell = shlex.quote(f"{run.folder}/{cell_name(*rollout.cell)}")
-    parted_us = partings[0].t_us if partings else failed_us or start_us
-    at_s = max(0.0, (parted_us - start_us) * 1e-6)
-    others = [one.name for one in partings if one.kind == "renderer"]
+    at_s = cause.partings[0].at_s if cause.partings else cause.failed_s or 0.0
+    others = [one.name for one in cause.partings if one.kind == "renderer"]
     other = [*others, "3dgs" if rollout.renderer == "clean" else "clean"][0]
-    fork = f"simrun fork {cell} --at {at_s:.1f} --renderer {other}"
+    fork = f"simrun fork {cell} --at {max(0.0, at_s):.1f} --renderer {other}"
     view = f"simrun view {shlex.quote(str(run.folder / rollout.path))}"
     return [("f", f"drive on from there behind {other}", fork), ("v", "watch the rollout", view)]
-
-
-def _parting(one: Parting, start_us: int) -> JsonObject:
-    """Return a parting for the template, with the other's image and the own one."""
-    images = [jpeg(smaller(image, WIDTH_PX)) for image in one.images]
-    at_s = (one.t_us - start_us) * 1e-6
-    return {"name": one.name, "at_s": at_s, "gap_m": one.gap_m, "images": images}

@@ -37,7 +37,6 @@ from evaluators.viewer.drive_data import (
 )
 from evaluators.viewer.pictures import (
     NO_FRAMES,
-    Fineness,
     Rows,
     encoded,
     frame_rows,
@@ -137,30 +136,41 @@ class Wanted:
     ] = ()
 
     @property
-    def is_all(self) -> bool:
-        """Tell whether nothing was asked for."""
-        return not (self.scenes or self.policies or self.seeds or self.renderers)
+    def axes(self) -> dict[str, tuple[str, ...] | tuple[int, ...]]:
+        """Give what was asked for of each axis of a run."""
+        asked = {
+            "scene": self.scenes,
+            "policy": self.policies,
+            "seed": self.seeds,
+            "renderer": self.renderers,
+        }
+        return {axis: names for axis, names in asked.items() if names}
+
+    def takes(self, rollout: Rollout) -> bool:
+        """Tell whether a rollout was asked for."""
+        return all(
+            any(_is_called(getattr(rollout, axis), name) for name in names)
+            for axis, names in self.axes.items()
+        )
+
+
+def _is_called(value: object, name: object) -> bool:
+    return value == name or value == str(name).replace("/", "-")
 
 
 def check_wanted(run: Run, wanted: Wanted) -> None:
-    """Refuse what the run neither has nor plans.
+    """Refuse what no rollout of the run has.
 
     Raises:
         InputError: Something of that kind was asked for.
     """
-    seeds = sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})
-    choices: dict[str, tuple[Sequence[object], Sequence[object]]] = {
-        "--scene": (wanted.scenes, run.scenes),
-        "--policy": (wanted.policies, run.policies),
-        "--renderer": (wanted.renderers, run.renderers),
-        "--seed": (wanted.seeds, seeds),
-    }
-    for option, (names, known) in choices.items():
+    for axis, names in wanted.axes.items():
+        known = list(dict.fromkeys(getattr(rollout, axis) for rollout in run.rollouts))
         for name in names:
-            if not _spellings(name) & {*known}:
+            if not any(_is_called(value, name) for value in known):
                 some = ", ".join(map(str, known[:8]))
                 raise InputError(
-                    f"{option} {name}: the run has none; it has {some}", "Name one of these."
+                    f"--{axis} {name}: the run has none; it has {some}", "Name one of these."
                 )
 
 
@@ -189,7 +199,7 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     takes: Counter[tuple[str, str, str, int]] = Counter()
     for rollout in sorted(run.rollouts, key=place):
-        if _is_wanted(rollout, wanted):
+        if wanted.takes(rollout):
             key = (rollout.scene, split(rollout)[0], rollout.seed, takes[rollout.cell])
             takes[rollout.cell] += 1
             grouped.setdefault(key, []).append(rollout)
@@ -197,7 +207,7 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
     for flip in find_flips(run)[0]:
         fixed = split(flip.other)[0]
         # a cell shows one policy behind all renderers, or the other way round
-        if split(flip.base)[0] == fixed and _is_wanted(flip.other, wanted):
+        if split(flip.base)[0] == fixed and wanted.takes(flip.other):
             flips.setdefault((flip.other.scene, fixed, flip.other.seed), []).append(flip)
     cells = [
         WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
@@ -216,28 +226,11 @@ def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted) -> list[Watch
         wanted: What was asked for.
     """
     watchable = [cell for cell in cells if cell.watchable]
-    if not wanted.is_all:
+    if wanted.axes:
         return watchable
     quiet = [cell for cell in watchable if cell.interest == "quiet"]
     left_out = {cell.id for cell in quiet[QUIET_CELLS:]}
     return [cell for cell in watchable if cell.id not in left_out]
-
-
-def _is_wanted(rollout: Rollout, wanted: Wanted) -> bool:
-    choices: tuple[tuple[object, Sequence[object]], ...] = (
-        (rollout.scene, wanted.scenes),
-        (rollout.policy, wanted.policies),
-        (rollout.seed, wanted.seeds),
-        (rollout.renderer, wanted.renderers),
-    )
-    return all(
-        not names or any(value in _spellings(name) for name in names) for value, names in choices
-    )
-
-
-def _spellings(name: object) -> set[object]:
-    """Return what a name that was asked for may be in the tables."""
-    return {name, name.replace("/", "-")} if isinstance(name, str) else {name}
 
 
 Logs = Mapping[
@@ -277,14 +270,13 @@ def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
     return read_asl(path)
 
 
-def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) -> JsonObject:
+def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
     """Return everything that a page shows of a cell.
 
     Args:
         run: The run.
         cell: One of its cells.
         logs: Its logs.
-        fine: How finely camera frames are kept; None for none.
 
     Raises:
         InputError: A file is damaged, or the run has no map of the scene.
@@ -300,22 +292,26 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
         if not rollout.ok:
             drives.append(name | {"failed": f"{rollout.failure_class}: {rollout.failure}"})
         elif not isinstance(log, RolloutLog):
-            why = missing_log(run.manifest(rollout)) if log is None else log.message
+            why = (
+                log.message
+                if log is not None
+                else f"{run.manifest(rollout).get('log') or LOG_NAME} is missing"
+            )
             drives.append(name | {"failed": f"its log cannot be read: {why}"})
         else:
             facts = frame_rows(run, rollout)
             drive = drive_data(run, rollout, log, place, tracks, facts)
             drive["why"] = run.href(rollout, WHY_NAME) or ""
-            if fine is not None:
-                drive |= _camera_data(run, rollout, log, facts, fine, place)
-            drives.append(name | drive)
+            drives.append(name | drive | _camera_data(run, rollout, log, facts, place))
+    keys = {flip.key for flip in cell.flips}
+    entries = [entry for entry in flip_entries(run) if key_of_entry(entry) in keys]
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
     return {
         "id": cell.id,
         "map": map_data(content, recorded, place),
         "users": tracks.all,
         "drives": drives,
-        "parts": plans_part(_flip_entries(run, cell), place, cell.by_policy),
+        "parts": plans_part(entries, place, cell.by_policy),
         "end": max([*ends, 1]),
         "warmup": round(int(content.get("warmup_us") or 0) / 1000),
         "origin": place.origin.tolist(),
@@ -324,12 +320,12 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
 
 
 def _camera_data(
-    run: Run, rollout: Rollout, log: RolloutLog, facts: Rows, fine: Fineness, place: Place
+    run: Run, rollout: Rollout, log: RolloutLog, facts: Rows, place: Place
 ) -> JsonObject:
     """Return a rollout's camera frames for a page, with lenses and trust maps where known, or why
     there are none.
     """
-    cameras = [encoded(one, fine, place.zero_us) for one in sources(run, rollout, log)]
+    cameras = [encoded(one, place.zero_us) for one in sources(run, rollout, log)]
     lenses = {camera.name: camera for camera in log.info["cameras"]}
     for camera in cameras:
         trust = trust_by_time(facts, camera["name"])
@@ -348,13 +344,6 @@ def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
     scale = min(1.0, width_px / camera.width)
     k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
-
-
-def missing_log(manifest: JsonView) -> str:
-    """Say that a rollout has no log, and where it should be."""
-    if not manifest.get("log"):
-        return f"{LOG_NAME} is missing"
-    return f"{manifest['log']} is missing; run simrun view where simrun score was run"
 
 
 def index_data(
@@ -413,8 +402,3 @@ def index_data(
         "notes": list(notes),
         "report": report,
     }
-
-
-def _flip_entries(run: Run, cell: WatchedCell) -> list[JsonView]:
-    keys = {flip.key for flip in cell.flips}
-    return [entry for entry in flip_entries(run) if key_of_entry(entry) in keys] if keys else []

@@ -173,7 +173,10 @@ def drive_data(
         "size": [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)],
         "rear": round(100 * float(log.T_rig_box[0, 3])),
         "users": [tracks.add(user_data(actor, place)) for actor in log.actors.values()],
-        "plans": [_plan(plan, place) for plan in log.plans],
+        "plans": [
+            {"t": place.ms([plan.now_us])[0], "lines": plan_lines(plan, place)}
+            for plan in log.plans
+        ],
         "curves": curves(steps, place),
         "moments": moments(rollout, steps, run.manifest(rollout), place, frames),
     }
@@ -189,13 +192,12 @@ def user_data(actor: Actor, place: Place) -> JsonObject:
     return {"id": actor.actor_id, "label": actor.label or "other", "size": size, **way}
 
 
-def _plan(plan: LoggedPlan, place: Place) -> JsonObject:
-    """Return a plan and its samples, every half second: points from now on."""
-    lines = [
+def plan_lines(plan: LoggedPlan, place: Place) -> list[list[list[int]]]:
+    """Return a plan and its samples: points every half second from now on."""
+    return [
         place.cm(half_seconds(line.t_us, line.xyz) if len(line) else np.empty((0, 2)))
         for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
     ]
-    return {"t": place.ms([plan.now_us])[0], "lines": lines}
 
 
 def half_seconds(times_us: I64, xy: F64) -> F64:

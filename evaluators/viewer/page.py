@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
 
+import numpy as np
 from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
@@ -22,8 +22,7 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.reader import reporting
 from evaluators.numbers import plural
-from evaluators.opening import Run, read_run
-from evaluators.report.flips import FlipKey
+from evaluators.opening import Run
 from evaluators.report.html import asset, environment_of
 from evaluators.viewer.cells import (
     Wanted,
@@ -35,18 +34,14 @@ from evaluators.viewer.cells import (
     read_logs,
     shown_by_default,
 )
-from evaluators.viewer.pictures import Fineness
 
 MB = 1_000_000
-DEFAULT_MB = 15.0  # megabytes, not mebibytes
-MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
+MAX_BYTES = 15 * MB  # of a page; megabytes, not mebibytes
+STRIDES = (1, 2, 3, 4)  # every how manieth frame is kept: coarser is worse than fewer cells
 NOTES_BYTES = 600  # what notes of what was left out may add to a page
 NAMED = 12  # cells that a note names
-FLIPS_PAGE, REPORT = "flips.html", "report.html"
-FLIPS_BYTES = 6 * MB
-FLIPS_FRAMES = Fineness(stride=2, width_px=384)
-MAX_FLIP_CELLS = 8  # a run must not wait for its page
-ORDINALS = {2: "second", 3: "third"}
+REPORT = "report.html"
+ORDINALS = {2: "second", 3: "third", 4: "fourth"}
 SCRIPTS = (
     "theme.js",
     "timeline.js",
@@ -62,15 +57,6 @@ STYLES = ("theme.css", "viewer.css")
 
 @dataclass(frozen=True)
 class Page:
-    """A page, the cells that it replays, and what it leaves out, a sentence each."""
-
-    html: str
-    cells: tuple[WatchedCell, ...]
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Written:
     """A page on the disk.
 
     Attributes:
@@ -78,20 +64,21 @@ class Written:
         size: Bytes.
         shown: Cells that it replays.
         known: All cells that were asked for.
-        notes: What it leaves out.
+        notes: What it leaves out, a sentence each.
     """
 
     path: Path
     size: int
-    shown: tuple[WatchedCell, ...]
-    known: tuple[WatchedCell, ...]
-    notes: tuple[str, ...]
+    shown: Sequence[WatchedCell]
+    known: Sequence[WatchedCell]
+    notes: Sequence[str]
 
 
-def write_page(
-    run: Run, path: Path, wanted: Wanted, max_bytes: int = int(DEFAULT_MB * MB)
-) -> Written:
+def write_page(run: Run, path: Path, wanted: Wanted, max_bytes: int = MAX_BYTES) -> Page:
     """Write an offline page.
+
+    Frames are thinned out evenly before cells are left out from the end; the first cell is always
+    kept.
 
     Args:
         run: The run.
@@ -111,87 +98,29 @@ def write_page(
             "Ask for others; simrun report lists failures.",
         )
     is_beside = real(path).parent == real(run.folder) and os.path.isfile(run.folder / REPORT)
+    report = REPORT if is_beside else ""
+    asked = shown_by_default(cells, wanted)
     with reporting(run):
-        shown = shown_by_default(cells, wanted)
-        page = make_page(run, cells, shown, max_bytes, report=REPORT if is_beside else "")
-    write_text(path, page.html)
-    return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
-
-
-def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
-    """Write ``flips.html`` of a run folder: its changed outcomes alone, small. Without any, one of
-    an earlier command is removed.
-
-    Returns:
-        Key of a changed rollout -> its address in the page, for those for which there was room.
-
-    Raises:
-        InputError: The run folder is not complete enough to be read.
-    """
-    run = read_run(run_dir)
-    path = run.folder / FLIPS_PAGE
-    flipped = [cell for cell in cells_of(run, arms=True) if cell.flips and cell.watchable]
-    if not flipped:
-        path.unlink(missing_ok=True)
-        return {}
-    with reporting(run):
-        shown = flipped[:MAX_FLIP_CELLS]
-        page = make_page(run, flipped, shown, FLIPS_BYTES, FLIPS_FRAMES, REPORT)
-    write_text(path, page.html)
-    addresses = {}
-    for cell in page.cells:
-        for flip in cell.flips:
-            place = {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed}
-            place["renderer"] = cell.side(flip.other)
-            addresses[flip.key] = f"{FLIPS_PAGE}#{urlencode(place)}"
-    return addresses
-
-
-def make_page(
-    run: Run,
-    cells: Sequence[WatchedCell],
-    shown: Sequence[WatchedCell],
-    max_bytes: int = int(DEFAULT_MB * MB),
-    fine: Fineness = Fineness(),
-    report: str = "",
-) -> Page:
-    """Return an offline page.
-
-    Frames are thinned out evenly, down to every `MOST_STRIDE`-th, before cells are left out from
-    the end; the first cell is always kept.
-
-    Args:
-        run: The run.
-        cells: All that were asked for, the most telling first.
-        shown: Those that the page holds as far as its size allows.
-        max_bytes: Size of the file.
-        fine: The finest camera frames that are kept.
-        report: Address of the run's report, relative to the page.
-
-    Raises:
-        InputError: A rollout's files are damaged.
-    """
-    shell = len(render(as_json(index_data(run, cells, (), [], report)), {}))
-    room = max_bytes - shell - NOTES_BYTES
-    factors = range(1, max(1, MOST_STRIDE // fine.stride) + 1)
-    used = dict.fromkeys(factors, 0)  # bytes of the documents, by how much they are thinned
-    documents: list[JsonObject] = []
-    for cell in shown:
-        document = cell_data(run, cell, read_logs(run, cell), fine)
-        sizes = {factor: len(as_json(thinned(document, factor))) for factor in factors}
-        if documents and used[factors[-1]] + sizes[factors[-1]] > room:
-            break
-        documents.append(document)
-        used = {factor: used[factor] + sizes[factor] for factor in factors}
-    factor = next((factor for factor in factors if used[factor] <= room), factors[-1])
-    kept = tuple(shown[: len(documents)])
-    notes = _notes(cells, shown, shown[len(kept) :], fine.stride * factor)
-    index = as_json(index_data(run, cells, kept, notes, report))
-    texts = {
-        cell.id: as_json(thinned(document, factor))
-        for cell, document in zip(kept, documents, strict=True)
-    }
-    return Page(render(index, texts), kept, tuple(notes))
+        shell = len(_render(index_data(run, cells, (), [], report), {}))
+        room = max_bytes - shell - NOTES_BYTES
+        used = np.zeros(len(STRIDES))  # bytes of the documents, by how much they are thinned
+        documents: dict[str, JsonObject] = {}
+        for cell in asked:
+            document = cell_data(run, cell, read_logs(run, cell))
+            sizes = [len(as_json(thinned(document, stride))) for stride in STRIDES]
+            if documents and used[-1] + sizes[-1] > room:
+                break
+            documents[cell.id] = document
+            used += sizes
+        stride = next(
+            (n for n, size in zip(STRIDES, used, strict=True) if size <= room), STRIDES[-1]
+        )
+        shown = asked[: len(documents)]
+        notes = _notes(cells, asked, asked[len(shown) :], stride)
+        texts = {name: as_json(thinned(one, stride)) for name, one in documents.items()}
+        html = _render(index_data(run, cells, shown, notes, report), texts)
+    write_text(path, html)
+    return Page(path, path.stat().st_size, shown, cells, notes)
 
 
 def thinned(document: JsonView, factor: int) -> JsonObject:
@@ -219,15 +148,10 @@ def as_json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def render(index: str, documents: Mapping[str, str]) -> str:
-    """Fill the template.
-
-    Args:
-        index: JSON of `index_data`.
-        documents: Cell id -> JSON of `cell_data`.
-    """
+def _render(index: JsonObject, documents: Mapping[str, str]) -> str:
+    """Fill the template with the index of the run and the JSON of its cells, by their ids."""
     texts = {name: Markup(text) for name, text in documents.items()}
-    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=texts)
+    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(as_json(index)), documents=texts)
 
 
 def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
@@ -261,8 +185,9 @@ def _notes(
     if failed:
         notes.append(f"Every rollout failed, so that nothing is shown: {_named(failed)}.")
     if stride > 1:
-        ordinal = ORDINALS.get(stride, f"{stride}th")
-        notes.append(f"Every {ordinal} camera frame is kept. Poses, plans and metrics are whole.")
+        notes.append(
+            f"Every {ORDINALS[stride]} camera frame is kept. Poses, plans and metrics are whole."
+        )
     return notes
 
 

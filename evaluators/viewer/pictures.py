@@ -30,24 +30,12 @@ from alpasim_plugin.log.video import VideoReader
 from evaluators.opening import Run
 
 JPEG_QUALITY = 76
+FRAME_PX = 512  # wider frames are made smaller
 BEFORE_US = 1_000_000  # of an event: the pictures that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
 Rows = Sequence[Mapping[str, Any]]  # facts of the frames, as `frames.jsonl` has them
-
-
-@dataclass(frozen=True)
-class Fineness:
-    """How finely frames are kept.
-
-    Attributes:
-        stride: Every how manieth frame is kept.
-        width_px: Frames wider than this are made smaller.
-    """
-
-    stride: int = 1
-    width_px: int = 512
 
 
 @dataclass(frozen=True)
@@ -71,9 +59,9 @@ class Source:
         """
         return decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
 
-    def filmed(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
-        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the
-        video; nothing where there is none.
+    def filmed(self) -> Iterator[tuple[int, U8]]:
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every frame of the video;
+        nothing where there is none.
 
         Raises:
             InputError: A frame cannot be decoded.
@@ -82,12 +70,9 @@ class Source:
             return
         path, start_us = self.video
         with VideoReader(path) as video:
-            for index, frame in enumerate(video):
-                if index % stride == 0:
-                    yield (
-                        start_us + round(frame.time * video.format.time_base * 1_000_000),
-                        frame.image,
-                    )
+            for frame in video:
+                after_us = round(frame.time * video.format.time_base * 1_000_000)
+                yield start_us + after_us, frame.image
 
 
 def sources(run: Run, rollout: Rollout, log: RolloutLog) -> list[Source]:
@@ -103,27 +88,23 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog) -> list[Source]:
     return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us))]
 
 
-def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
+def encoded(source: Source, zero_us: int) -> dict[str, Any]:
     """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in
     base64.
     """
 
-    def made(t_us: int, rgb: U8) -> tuple[int, tuple[int, ...], str]:
-        picture = smaller(rgb, fine.width_px)
-        return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
+    def small(image: LoggedImage) -> U8:
+        return smaller(source.decoded(image), FRAME_PX)
 
-    with ThreadPoolExecutor(
-        thread_name_prefix="pictures"
-    ) as threads:  # OpenCV does not hold Python's lock
-        frames = list(
-            threads.map(
-                lambda image: made(image.end_us, source.decoded(image)),
-                source.images[:: fine.stride],
-            )
-        )
-    frames += [made(t_us, rgb) for t_us, rgb in source.filmed(fine.stride)]
-    height, width = frames[-1][1][:2] if frames else (0, 0)
-    t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
+    with ThreadPoolExecutor() as threads:  # OpenCV does not hold Python's lock
+        frames = list(threads.map(small, source.images))
+        times_us = [image.end_us for image in source.images]
+        for t_us, rgb in source.filmed():
+            frames.append(smaller(rgb, FRAME_PX))
+            times_us.append(t_us)
+        data = list(threads.map(jpeg, frames))
+    height, width = frames[-1].shape[:2] if frames else (0, 0)
+    t_ms = [round((t_us - zero_us) / 1000) for t_us in times_us]
     return {"name": source.camera, "width": width, "height": height, "t": t_ms, "jpeg": data}
 
 

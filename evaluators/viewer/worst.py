@@ -11,7 +11,7 @@ from alpasim_plugin.core.types import U8, RolloutLog
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME
-from evaluators.metrics.outcomes import OUTCOMES, first_failure, in_words, outcomes_of
+from evaluators.metrics.outcomes import first_failure, gravity, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.flips import find_flips
 from evaluators.report.overview import variant_name
@@ -53,7 +53,11 @@ def worst_change(run: Run) -> list[Shot]:
     """
     flips, _ = find_flips(run)
     flip = next((flip for flip in flips if flip.tone != "better"), None)
-    worst = _gravest(run) if flip is None else flip.other
+    worst = (
+        min((one for one in run.rollouts if one.ok), key=_rank, default=None)
+        if flip is None
+        else flip.other
+    )
     log = None if worst is None else _log_of(run, worst)
     if worst is None or log is None:
         return []
@@ -73,17 +77,9 @@ def worst_change(run: Run) -> list[Shot]:
     return [shot for shot in found if shot is not None]
 
 
-def _gravest(run: Run) -> Rollout | None:
-    """Return the rollout with the gravest outcome, or else the one farthest from the logged path."""
-    order = list(OUTCOMES)
-
-    def rank(rollout: Rollout) -> tuple[int, float]:
-        outcomes = [order.index(name) for name in outcomes_of(rollout)]
-        return min(outcomes, default=len(order)), -(
-            rollout.metrics.get("lateral_distance_m") or 0.0
-        )
-
-    return min((one for one in run.rollouts if one.ok), key=rank, default=None)
+def _rank(rollout: Rollout) -> tuple[int, float]:
+    """Return the order of rollouts: the gravest outcome, or else the farthest from its path first."""
+    return gravity(rollout), -(rollout.metrics.get("lateral_distance_m") or 0.0)
 
 
 def _log_of(run: Run, rollout: Rollout) -> RolloutLog | None:

@@ -20,7 +20,7 @@ from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.run import execute_run
 from evaluators.metrics.outcomes import SHORT_OF_END
 from evaluators.opening import read_run
-from evaluators.viewer.cause import cause_of, failed_at
+from evaluators.viewer.cause import cause_of
 from scenarios.suite import expand
 from tests.runs.faulty_policies import CAUSES, FAULTS
 from tests.runs.grey_renderer import GREY
@@ -201,39 +201,6 @@ def test_a_drive_that_ended_short_says_so_and_that_its_plans_stand(tmp_path, cap
     found = json.loads(capsys.readouterr().out)
     assert found["outcome"] == SHORT_OF_END
     assert any("before the end stands" in line for line in found["found"])
-
-
-def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
-    tmp_path, capsys
-):
-    (tmp_path / "bend.yaml").write_text(BEND)
-    plan = make_plan(
-        expand(str(tmp_path / "bend.yaml")),
-        (GREY, "clean"),
-        (f"{HERE}:ByContrast",),
-        (0,),
-        RunOptions(),
-    )
-    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
-    failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
-    words = "Behind clean the same rollout ends without an event."
-    page = (failed / "why.html").read_text()
-    assert words in page
-    assert set(queries_of(page)[-20]["seen"]) == {GREY, "clean"}
-    assert run_command(["why", str(failed), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["found"]
-    assert found[0] == words
-
-
-@pytest.mark.parametrize("side", ["front", "lateral", "rear"])
-def test_a_contact_at_any_side_is_when_a_drive_failed(side):
-    events = [
-        {"metric": "offroad", "t_us": 7},
-        {"metric": f"collision_{side}", "t_us": 5},
-        {"metric": "img_is_black", "t_us": 1},
-    ]
-    assert failed_at({"events": events}) == 5
-    assert failed_at({"events": events[2:]}) is None
 
 
 def test_what_a_policy_says_is_sorted_by_what_it_is():

@@ -13,8 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
@@ -31,8 +29,7 @@ from evaluators.viewer.cells import (
     read_logs,
     shown_by_default,
 )
-from evaluators.viewer.page import FLIPS_PAGE, make_page, write_flips_page, write_page
-from evaluators.viewer.pictures import Fineness
+from evaluators.viewer.page import write_page
 from tests.report.make_run import DT_US, Plan
 from tests.viewer.make_watched import BARS, WATCHED, make_watched, picture
 
@@ -61,16 +58,16 @@ def small_run(tmp_path_factory):
     return make_watched(tmp_path_factory.mktemp("small"), SMALL)
 
 
-def only_cell(root, fine=Fineness()):
+def only_cell(root):
     run = read_run(root)
     (cell,) = cells_of(run)
-    return cell_data(run, cell, read_logs(run, cell), fine)
+    return cell_data(run, cell, read_logs(run, cell))
 
 
 def test_poses_are_those_of_the_log(watched_run):
     run = read_run(watched_run)
     cell = cells_of(run)[0]
-    data = cell_data(run, cell, read_logs(run, cell), None)
+    data = cell_data(run, cell, read_logs(run, cell))
     content = run.scene_data(cell.scene)
     origin = np.array([content["ego_log"][key][0] for key in ("x_m", "y_m")])
     for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
@@ -94,9 +91,6 @@ def test_every_frame_comes_with_its_own_time(small_run):
             == [t // (DT_US // 1000) for t in camera["t"]]
             == list(range(SMALL.steps))
         )
-    thinned = only_cell(small_run, Fineness(stride=3))["drives"][1]["cameras"][0]
-    assert [number_of(jpeg) for jpeg in thinned["jpeg"]] == [0, 3, 6, 9]
-    assert thinned["t"] == [0, 300, 600, 900]
 
 
 def test_two_logs_of_one_cell_are_two_cells(small_run):
@@ -112,7 +106,7 @@ def test_two_logs_of_one_cell_are_two_cells(small_run):
 
 
 def test_a_road_user_that_goes_the_same_way_everywhere_is_kept_once(small_run):
-    data = only_cell(small_run, None)
+    data = only_cell(small_run)
     base, other = (set(drive["users"]) for drive in data["drives"])
     assert len(base) == len(other) == 6
     assert len(base & other) == 5  # of every third one, the first moves and the second stands
@@ -126,7 +120,7 @@ def test_events_are_at_the_times_that_the_report_states(watched_run):
     run = read_run(watched_run)
     seen = 0
     for cell in cells_of(run):
-        data = cell_data(run, cell, read_logs(run, cell), None)
+        data = cell_data(run, cell, read_logs(run, cell))
         series = series_by_cell(run.steps(SERIES, [cell.scene]))
         for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
             stated = [
@@ -160,7 +154,7 @@ def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run,
             ],
         )
         told.append(cells)
-    drives = cell_data(run, cell, read_logs(run, cell), Fineness())["drives"]
+    drives = cell_data(run, cell, read_logs(run, cell))["drives"]
     assert [drive["cameras"][0]["trust"] for drive in drives] == told
     words = [one["text"] for drive in drives for one in drive["moments"] if one["kind"] != "frame"]
     assert words
@@ -172,7 +166,7 @@ def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run,
 
 
 def test_what_is_not_valid_has_no_value_and_a_reason(small_run):
-    curves = only_cell(small_run, None)["drives"][0]["curves"]
+    curves = only_cell(small_run)["drives"][0]["curves"]
     assert curves["min_distance_to_obstacle_m"]["v"] == [None]
     assert curves["min_distance_to_obstacle_m"]["why"] == "no other road user within 50 m"
     assert len(curves["lateral_bias_m"]["v"]) == SMALL.steps
@@ -196,7 +190,7 @@ def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_pat
 def test_a_missing_log_is_told_in_its_place(small_run, tmp_path):
     root = Path(shutil.copytree(small_run, tmp_path / "run"))
     (root / read_run(root).rollouts[0].path / "rollout.asl").unlink()
-    bare, whole = only_cell(root, None)["drives"]
+    bare, whole = only_cell(root)["drives"]
     assert "is missing" in bare["failed"]
     assert "ego" in whole
 
@@ -248,21 +242,22 @@ def test_a_page_is_one_file_that_asks_for_nothing(watched_run, tmp_path):
     assert index["notes"] == []
 
 
-def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run):
+def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run, tmp_path):
     run = read_run(watched_run)
-    cells = cells_of(run)[2:]  # a changed outcome and a quiet one
-    size = len(make_page(run, cells, cells).html)
-    smaller = make_page(run, cells, cells, size - 15_000)
-    assert size - 200_000 < len(smaller.html) <= size - 15_000
-    assert len(smaller.cells) == 2
+    asked = Wanted(renderers=("clean", "3dgs"), seeds=(0,))
+    size = write_page(run, tmp_path / "whole.html", asked).size
+    smaller = write_page(run, tmp_path / "smaller.html", asked, size - 15_000)
+    assert size - 400_000 < smaller.size <= size - 15_000
+    assert len(smaller.shown) == 2
     assert any(re.match(r"Every \w+ camera frame is kept", note) for note in smaller.notes)
-    least = make_page(run, cells, cells, size // 2 + 30_000)
-    assert len(least.html) <= size // 2 + 30_000
-    assert len(least.cells) == 1
+    least = write_page(run, tmp_path / "least.html", asked, size // 5)
+    assert len(least.shown) == 1
     assert least.notes[0].startswith("No room for 1\u00a0cell")
-    index = documents(least.html)["index"]
-    assert sum(cell["here"] for cell in index["cells"]) == len(least.cells)
-    assert {f"cell-{cell.id}" for cell in least.cells} == set(documents(least.html)) - {"index"}
+    index = documents(least.path.read_text())["index"]
+    assert sum(cell["here"] for cell in index["cells"]) == 1
+    assert {f"cell-{cell.id}" for cell in least.shown} == set(documents(least.path.read_text())) - {
+        "index"
+    }
 
 
 def test_names_cannot_leave_their_place(tmp_path):
@@ -277,30 +272,12 @@ def test_names_cannot_leave_their_place(tmp_path):
     assert documents(html)["index"]["cells"][0]["scene"] == hostile
 
 
-def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run, tmp_path):
-    root = Path(shutil.copytree(watched_run, tmp_path / "run"))
-    links = write_flips_page(root)
-    assert len(links) == 3
-    for (renderer, policy, scene, seed, _), link in links.items():
-        assert link == f"{FLIPS_PAGE}#scene={scene}&policy={policy}&seed={seed}&renderer={renderer}"
-    index = documents((root / FLIPS_PAGE).read_text())["index"]
-    assert [cell["interest"] for cell in index["cells"]] == ["flip"] * 3
-    table = pq.read_table(root / "rollouts.parquet")
-    rows = [
-        row | {"offroad": 0.0, "collision_any": 0.0, "collision_at_fault": 0.0}
-        for row in table.to_pylist()
-    ]
-    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), root / "rollouts.parquet")
-    assert write_flips_page(root) == {}
-    assert not (root / FLIPS_PAGE).exists()
-
-
 def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run):
     run = read_run(small_run)
     cell = cells_of(run)[0]
-    drive = cell_data(run, cell, read_logs(run, cell), Fineness(width_px=32))["drives"][0]
+    drive = cell_data(run, cell, read_logs(run, cell))["drives"][0]
     assert drive["cameras"][0]["lens"] == {
-        "k": [20.0, 20.0, 16.0, 9.0],
+        "k": [40.0, 40.0, 32.0, 18.0],
         "T": np.eye(4)[:3].ravel().tolist(),
     }
     assert drive["rear"] == round(100 * Vehicle().rear_axle_to_centre_m)
