@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
 from evaluators.numbers import plural
-from evaluators.report.runs import Choice, RunEntry, as_day, find_runs, runs_table, variants_of
+from evaluators.report.runs import RunEntry, as_day, find_runs, runs_table
 
 VALUES = ("mean", "ci95_clustered", "n_rollouts")
 
@@ -36,14 +37,20 @@ def list_runs(
     Raises:
         InputError: A root is no folder, or no run has the metric.
     """
-    started = None if since is None else as_day(since, "--since", datetime.now(UTC))
-    choice = Choice(renderers, policies, started)
-    entries = find_runs(roots, with_summary=True)
-    chosen = [entry for entry in entries if choice.takes(entry)]
+    started = datetime.min.replace(tzinfo=UTC)
+    if since is not None:
+        started = as_day(since, "--since", datetime.now(UTC))
+    entries = find_runs(roots)
+    chosen = [
+        entry
+        for entry in entries
+        if _each_is_named(renderers, entry.info.get("renderers") or ())
+        and _each_is_named(policies, entry.info.get("policies") or ())
+        and entry.started_at >= started
+    ]
     stored = {
         name
         for entry in chosen
-        if entry.state != "damaged"
         for table in (entry.summary.get("metrics") or {}).values()
         for name in table
     }
@@ -51,7 +58,7 @@ def list_runs(
         if name not in METRICS and name not in stored:
             raise InputError(f"--metric {name}: no such metric", "simrun list metrics names them.")
     rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
-    lines: list[Any] = [runs_table(chosen, roots, metrics)] if chosen else []
+    lines: list[Any] = [runs_table(chosen, roots[0], metrics)] if chosen else []
     count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
     show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
     for entry in entries:
@@ -59,9 +66,13 @@ def list_runs(
             warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
 
 
+def _each_is_named(patterns: Sequence[str], names: Sequence[str]) -> bool:
+    return all(any(fnmatchcase(name, pattern) for name in names) for pattern in patterns)
+
+
 def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
     rows = []
-    for renderer, policy in variants_of(entry):
+    for renderer, policy in entry.variants:
         for name in metrics:
             values = entry.metric(name, renderer, policy)
             row = {"renderer": renderer, "policy": policy, "metric": name}
