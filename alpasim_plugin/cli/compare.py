@@ -71,7 +71,7 @@ def compare(
             warn(note)
     opened = [read_run(run) for run in folders]
     if len(folders) == 2 and {*opened[0].scenes} & {*opened[1].scenes}:
-        result = compare_runs(opened[0], opened[1], baseline, {}, EVERY_MISSING)
+        result = compare_runs(opened[0], opened[1], baseline, EVERY_MISSING)
         means = None
     elif len(folders) > 1:
         joined = aggregate_runs(folders, baseline)
@@ -91,7 +91,7 @@ def compare(
         summary = joined | _endings(opened, whole, joined["metrics"])
         shown = replace(opened[0], summary=summary, rollouts=whole, info=info)
     else:
-        result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
+        result = compare_within(opened[0], baseline, EVERY_MISSING)
         means = dict(opened[0].summary)
         shown = opened[0]
     facts: dict[str, Any] = {

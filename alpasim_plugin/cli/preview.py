@@ -18,14 +18,14 @@ from matplotlib.transforms import Affine2D
 from alpasim_plugin.cli.output import varied_numbers
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, yaw_of
+from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.core.types import Actor, Box, Scenario, Trajectory
 from alpasim_plugin.log.run_folder.writer import scene_as_json
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
-from evaluators.report.birdseye import chord_angle, corners, drawn_map
+from evaluators.report.birdseye import chord_angle, drawn_map
 
 MOMENTS = 5  # that are shown, evenly from the first frame to the end
 MARGIN_M = 15.0
@@ -159,5 +159,6 @@ def _draw_user(
         if track.t_us[0] <= t_us <= track.t_us[-1]:
             pose = interpolate(track, t_us)
             centre = pose[:2, 3] + pose[:2, 0] * ahead_m
-            body = corners(centre, yaw_of(pose), box.length_m, box.width_m)
-            axes.fill(*body.T, color=colour, alpha=shade, transform=world, zorder=6)
+            size_m = np.array([[box.length_m, box.width_m]])
+            body = rectangle_corners(centre[None], np.array([yaw_of(pose)]), size_m)
+            axes.fill(*body[0].T, color=colour, alpha=shade, transform=world, zorder=6)

@@ -9,13 +9,14 @@ the logged drive runs from left to right.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.geometry import rectangle_corners
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.rows import Rollout, Series
@@ -64,7 +65,6 @@ class SceneView:
     source: str
     width: int
     height: int
-    unit_per_m: float
     lanes: str
     lines: str
     edges: str
@@ -92,25 +92,28 @@ def chord_angle(log: F64) -> float:
     return math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
 
 
-class _Frame:
-    """The turn, shift and scale from world metres to drawing units."""
+class Drawing:
+    """The turn, shift and scale from world metres to drawing units, and what of it is seen.
+
+    Args:
+        log: ``(N, 2)`` the logged drive, metres, world.
+        paths: Other lines that the drawing shows, as far as they stay near the log.
+    """
 
     def __init__(self, log: F64, paths: Sequence[F64]) -> None:
         self.log_at = log[0]
         angle = chord_angle(log)
         c, s = math.cos(angle), math.sin(angle)
         self.turn = np.array([[c, s], [-s, c]])  # world to drawing, still metres and y up
-        self.north_deg = math.degrees(angle)
+        self.north_deg = round(math.degrees(angle), 1)
         on_log = self._turned(log)
         low, high = on_log.min(0) - STRAY_M, on_log.max(0) + STRAY_M
         all_xy = np.concatenate([on_log, *(np.clip(self._turned(p), low, high) for p in paths)])
         low, high = all_xy.min(0) - MARGIN_M, all_xy.max(0) + MARGIN_M
-        lacking = MIN_ASPECT * (high[0] - low[0]) - (high[1] - low[1])
-        if lacking > 0:
-            low[1], high[1] = low[1] - lacking / 2, high[1] + lacking / 2
-        self.low, self.high = low, high
+        lacking = max(MIN_ASPECT * (high[0] - low[0]) - (high[1] - low[1]), 0.0)
+        self.corner = np.array([low[0], high[1] + lacking / 2])  # upper left
         self.scale = UNITS_ACROSS / float(high[0] - low[0])
-        self.height = math.ceil(float(high[1] - low[1]) * self.scale)
+        self.height = math.ceil(float(high[1] - low[1] + lacking) * self.scale)
 
     def _turned(self, xy: F64) -> F64:
         turned: F64 = (xy - self.log_at) @ self.turn.T
@@ -118,16 +121,21 @@ class _Frame:
 
     def units(self, xy: F64) -> F64:
         """Map ``(N, 2)`` world metres to drawing units, y down."""
-        metres = self._turned(xy)
-        return np.stack(
-            [(metres[:, 0] - self.low[0]) * self.scale, (self.high[1] - metres[:, 1]) * self.scale],
-            1,
-        )
+        return (self._turned(xy) - self.corner) * (self.scale, -self.scale)
 
-    def sees(self, units: F64) -> bool:
-        """Return whether the bounds of a line touch the drawing."""
+    def path(self, xy: F64, closed: bool = False, tolerance: float = 1.5) -> str:
+        """Return the SVG path data of a line ``(N, 2)`` in world metres; empty where its bounds do
+        not touch the drawing.
+        """
+        units = self.units(xy)
         (x0, y0), (x1, y1) = units.min(0), units.max(0)
-        return bool(x1 >= 0 and y1 >= 0 and x0 <= UNITS_ACROSS and y0 <= self.height)
+        is_seen = x1 >= 0 and y1 >= 0 and x0 <= UNITS_ACROSS and y0 <= self.height
+        return path_data(units, closed, tolerance) if is_seen else ""
+
+    def box(self, centre: F64, yaw_rad: float, size_m: tuple[float, float]) -> str:
+        """Return the outline of a box of some length and width."""
+        corners = rectangle_corners(centre[None], np.array([yaw_rad]), np.array([size_m]))
+        return self.path(corners[0], True, 0.0)
 
 
 def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
@@ -173,69 +181,70 @@ def scene_view(
     if len(log) < 2:
         return None
     driven: list[tuple[Rollout, F64]] = []
+    times_us: list[int] = []
     for rollout in rollouts:
         own = series.get(rollout.cell, {})
         if "ego_x_m" in own and "ego_y_m" in own:
-            (t_us, x), (ty_us, y) = own["ego_x_m"], own["ego_y_m"]
-            if len(x) > 1 and np.array_equal(t_us, ty_us):
-                driven.append((rollout, np.column_stack([x, y])))
-    frame = _Frame(log, [path for _, path in driven])
-    several = len({rollout.policy for rollout in rollouts}) > 1
+            (t_us, x), (_, y) = own["ego_x_m"], own["ego_y_m"]
+            driven.append((rollout, np.column_stack([x, y])))
+            times_us += [int(t_us[0]), int(t_us[-1])]
+    drawing = Drawing(log, [path for _, path in driven])
+    names_policy = len({rollout.policy for rollout in rollouts}) > 1
 
     def label(rollout: Rollout) -> str:
-        names = [rollout.renderer, rollout.policy] if several else [rollout.renderer]
+        names = [rollout.renderer, rollout.policy] if names_policy else [rollout.renderer]
         return " \u00b7 ".join([*names, f"seed {rollout.seed}"])
 
-    tracks = []
-    for rollout, path in driven:
-        variant = variant_of.get((rollout.renderer, rollout.policy))
-        if variant is not None:
-            tracks.append(Track(*variant, label(rollout), path_data(frame.units(path))))
-    times_us = [
-        series[rollout.cell]["ego_x_m"][0]
-        for rollout in rollouts
-        if "ego_x_m" in series.get(rollout.cell, {})
+    tracks = [
+        Track(
+            *variant_of[rollout.renderer, rollout.policy],
+            label(rollout),
+            path_data(drawing.units(path)),
+        )
+        for rollout, path in driven
     ]
-    first_us = min((int(t_us[0]) for t_us in times_us), default=0)
+    first_us, last_us = min(times_us, default=0), max(times_us, default=0)
     zero_us = clock_zero_us(content, first_us)
     events = [event for rollout in rollouts for event in events_of(rollout, series)]
-    known = [event for event in events if event.t_us is not None]
+    marks = []
+    for event in events:
+        colour, _ = variant_of[event.rollout.renderer, event.rollout.policy]
+        marks.append(_mark(event, drawing, content, colour, label(event.rollout), zero_us))
     # road users are drawn at the scene's first event, else half way through
-    if known and times_us:
-        first = min(known, key=lambda event: event.t_us or 0)
-        at_us, moment = int(first.t_us or 0), f"when the first {first.what} happens"
-    else:
-        last_us = max((int(t_us[-1]) for t_us in times_us), default=0)
-        at_us, moment = (first_us + last_us) // 2, "half way"
-    bar_m = next((b for b in BARS_M if b * frame.scale > 0.08 * UNITS_ACROSS), BARS_M[-1])
+    at_us, moment = (first_us + last_us) // 2, "half way"
+    known = [(event.t_us, event.what) for event in events if event.t_us is not None]
+    if known:
+        at_us, what = min(known)
+        moment = f"when the first {what} happens"
+    bar_m = next((b for b in BARS_M if b * drawing.scale > 0.08 * UNITS_ACROSS), BARS_M[-1])
     shapes = drawn_map(content)
-    vehicle = content.get("vehicle") or {}
-
-    def draw(xy: F64, closed: bool) -> str:
-        units = frame.units(xy)
-        tolerance = 0.0 if closed else 1.5
-        return path_data(units, closed, tolerance) if frame.sees(units) else ""
-
+    # rings all turn the same way, so that overlapping ones add up instead of cutting holes
+    lanes, crosswalks = (
+        "".join(
+            drawing.path(xy if shapely.is_ccw(shapely.linearrings(xy)) else xy[::-1], True)
+            for xy in shapes[kind]
+        )
+        for kind in ("lanes", "crosswalks")
+    )
+    lines, edges = (  # a line that two lanes share is drawn once
+        "".join(dict.fromkeys(map(drawing.path, shapes[kind]))) for kind in ("paint", "edges")
+    )
     return SceneView(
         scene=scene,
         source=str(content.get("source") or ""),
         width=UNITS_ACROSS,
-        height=frame.height,
-        unit_per_m=frame.scale,
-        lanes=_areas(shapes["lanes"], frame),
-        lines=_lines(shapes["paint"], frame),
-        edges=_lines(shapes["edges"], frame),
-        crosswalks=_areas(shapes["crosswalks"], frame),
-        log=path_data(frame.units(log)),
+        height=drawing.height,
+        lanes=lanes,
+        lines=lines,
+        edges=edges,
+        crosswalks=crosswalks,
+        log=drawing.path(log),
         tracks=tuple(tracks),
-        marks=tuple(
-            _mark(event, frame, vehicle, variant_of, label(event.rollout), zero_us)
-            for event in events
-        ),
-        bar_units=round(bar_m * frame.scale),
+        marks=tuple(marks),
+        bar_units=round(bar_m * drawing.scale),
         bar_label=f"{bar_m}\u00a0m",
-        north_deg=round(frame.north_deg, 1),
-        road_users=road_users(content, at_us, log, draw),
+        north_deg=drawing.north_deg,
+        road_users=road_users(content, at_us, log, drawing),
         road_users_at=f"at {fixed((at_us - zero_us) * 1e-6, 1)}\u00a0s, {moment}",
     )
 
@@ -274,89 +283,52 @@ def drawn_map(content: JsonView) -> dict[str, list[F64]]:
     }
 
 
-def _lines(lines: Sequence[F64], frame: _Frame) -> str:
-    seen = [units for units in map(frame.units, lines) if frame.sees(units)]
-    return "".join(dict.fromkeys(map(path_data, seen)))  # shared by two lanes: drawn once
-
-
-def _areas(rings: Sequence[F64], frame: _Frame) -> str:
-    """Write rings into one path, all turning the same way, so that overlapping rings add up instead
-    of cutting holes.
-    """
-    seen = [units for units in map(frame.units, rings) if frame.sees(units)]
-    turned = [ring if shapely.is_ccw(shapely.linearrings(ring)) else ring[::-1] for ring in seen]
-    return "".join(path_data(ring, closed=True) for ring in turned)
-
-
 def _mark(
-    event: Event,
-    frame: _Frame,
-    vehicle: JsonView,
-    variant_of: Variants,
-    label: str,
-    zero_us: int,
+    event: Event, drawing: Drawing, content: JsonView, colour: int, label: str, zero_us: int
 ) -> Mark:
-    variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
+    """Return the mark of an event; at the middle of the ego's box where its heading is logged."""
     text, folder = f"{label}: {event.what}", event.rollout.path
     if event.t_us is None:
-        return Mark(variant, event.kind, f"{text} at a time that no step shows", folder)
+        return Mark(colour, event.kind, f"{text} at a time that no step shows", folder)
     text += f" at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s"
-    if event.x_m is None or event.y_m is None:
-        return Mark(variant, event.kind, text, folder)
-    centre = np.array([event.x_m, event.y_m])
-    footprint = ""
-    if event.yaw_rad is not None:
-        ahead = np.array([math.cos(event.yaw_rad), math.sin(event.yaw_rad)])
-        centre = centre + float(vehicle.get("rear_axle_to_centre_m") or 0.0) * ahead
-        if vehicle.get("length_m"):
-            box = corners(centre, event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
-            footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
+    if event.x_m is None or event.y_m is None or event.yaw_rad is None:
+        return Mark(colour, event.kind, text, folder)
+    vehicle = content["vehicle"]
+    ahead = np.array([math.cos(event.yaw_rad), math.sin(event.yaw_rad)])
+    centre = np.array([event.x_m, event.y_m]) + vehicle["rear_axle_to_centre_m"] * ahead
+    footprint = drawing.box(centre, event.yaw_rad, (vehicle["length_m"], vehicle["width_m"]))
     text += f", x {fixed(centre[0], 1)}, y {fixed(centre[1], 1)}\u00a0m"
-    x, y = np.rint(frame.units(centre[None])[0]).astype(int).tolist()
-    return Mark(variant, event.kind, text, folder, x, y, footprint)
+    x, y = np.rint(drawing.units(centre[None])[0]).astype(int).tolist()
+    return Mark(colour, event.kind, text, folder, x, y, footprint)
 
 
-def road_users(
-    content: JsonView, at_us: int, log: F64, draw: Callable[[F64, bool], str]
-) -> list[dict[str, str]]:
-    """Lay out the road users of a scene; empty for scene files of earlier versions, which have no
-    tracks.
+def road_users(content: JsonView, at_us: int, log: F64, drawing: Drawing) -> list[dict[str, str]]:
+    """Lay out the road users of a scene, the nearest to the logged drive first.
 
     Args:
         content: ``scenes/SCENE.json``.
         at_us: Time of the image; a road user that is not there then is drawn at its nearest time.
         log: ``(N, 2)`` the logged drive, metres, world.
-        draw: From ``(N, 2)`` world metres and whether the line is closed to SVG path data; empty
-            where nothing of it is in the image.
+        drawing: Where they are drawn.
 
     Returns:
-        Of each: ``text`` for the hover, ``body`` (its box at that time) and ``way`` (its path during
-        the scene; empty if it stands) as SVG path data.
+        Of each that is seen: ``text`` for the hover, ``body`` (its box at that time) and ``way``
+        (its path during the scene; empty if it stands) as SVG path data.
     """
     near: list[tuple[float, dict[str, str]]] = []
     for actor in content.get("actors") or []:
-        if not (actor.get("x_m") and actor.get("length_m")):
-            continue
+        if not actor["x_m"]:
+            continue  # it is never there while the scene runs
         xy = np.column_stack([actor["x_m"], actor["y_m"]]).astype(float)
         step = int(np.argmin(np.abs(np.asarray(actor["t_us"]) - at_us)))
-        yaw_rad = float(actor["yaw_rad"][step])
         how, way = "stands", ""
         if float(np.ptp(xy, axis=0).max()) > LEAST_PATH_M:
-            how = "as recorded or scripted"
-            if actor.get("reacts"):
-                how = "reacts once the policy drives"
-            way = draw(xy, False)
-        body = draw(corners(xy[step], yaw_rad, actor["length_m"], actor["width_m"]), True)
-        name = f"{actor.get('label') or 'road user'} {actor.get('id') or ''}".strip()
+            how = "reacts once the policy drives" if actor["reacts"] else "as recorded or scripted"
+            way = drawing.path(xy)
+        size_m = actor["length_m"], actor["width_m"]
+        body = drawing.box(xy[step], float(actor["yaw_rad"][step]), size_m)
+        text = f"{actor['label'] or 'road user'} {actor['id']}, {how}"
         distance_m = float(np.linalg.norm(xy[:, None] - log[None, ::10], axis=2).min())
-        near.append((distance_m, {"text": f"{name}, {how}", "body": body, "way": way}))
+        near.append((distance_m, {"text": text, "body": body, "way": way}))
     near.sort(key=lambda pair: pair[0])
     return [user for _, user in near[:MAX_ACTORS] if user["body"] or user["way"]]
-
-
-def corners(centre: F64 | Sequence[float], yaw_rad: float, length_m: float, width_m: float) -> F64:
-    """Return the corners ``(4, 2)`` of a box seen from above."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    half, wide = length_m / 2, width_m / 2
-    local = np.array([[-half, -wide], [half, -wide], [half, wide], [-half, wide]])
-    return np.asarray(local @ np.array([[c, s], [-s, c]]) + centre)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
-from evaluators.statistics.paired import LISTED, Pair, Table, compare_pairs, pairs_within
+from evaluators.statistics.paired import Pair, Table, compare_pairs, pairs_within
 from evaluators.statistics.variants import Variant, base_named, choices, variants_in
 
 
@@ -38,9 +37,8 @@ class Comparison:
 
 def compare_within(
     run: Run,
-    baseline: str | None = None,
-    margins: Mapping[str, float] | None = None,
-    listed: int = LISTED,
+    baseline: str | None,
+    listed: int,
 ) -> Comparison:
     """Compare the variants of one run with one of them, by default with the run's own baseline, or
     with the first.
@@ -49,7 +47,7 @@ def compare_within(
         run: The run.
         baseline: RENDERER, POLICY or RENDERER/POLICY; None: renderers with the run's own, and
             policies too where there are several.
-        margins, listed: As for `evaluators.statistics.paired.paired`.
+        listed: As for `evaluators.statistics.paired.paired`.
 
     Raises:
         InputError: Only one variant, or an unknown baseline.
@@ -77,7 +75,7 @@ def compare_within(
                     f"choose one of {', '.join(choices(variants))}",
                 )
     paired, with_base, policies = (
-        compare_pairs(table, pairs, run.table, margins=margins, listed=listed) for pairs in blocks
+        compare_pairs(table, pairs, run.table, listed=listed) for pairs in blocks
     )
     return Comparison(paired, (), with_base, run.table, policies)
 
@@ -85,9 +83,8 @@ def compare_within(
 def compare_runs(
     first: Run,
     second: Run,
-    baseline: str | None = None,
-    margins: Mapping[str, float] | None = None,
-    listed: int = LISTED,
+    baseline: str | None,
+    listed: int,
 ) -> Comparison:
     """Compare the second run with the first: each variant with the one of the same name, or all with
     ``baseline`` of the first run.
@@ -113,7 +110,10 @@ def compare_runs(
     table, base = table_of_run(second), table_of_run(first)
     base_variants = variants_in(base)
     named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
-    notes = weights_note(first, second)
+    before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
+    changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
+    # what differs in their weights are other variants, whatever their names
+    notes = (f"other weights: {', '.join(changed)}",) if changed else ()
     pairs = []
     if named is not None and named.policy is not None:
         for variant in variants_in(table):
@@ -155,14 +155,5 @@ def compare_runs(
                 key = variant.name if several else variant.renderer
                 pairs.append(Pair(key, variant, other, f"{first.folder}: {renderer}"))
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
-    paired = compare_pairs(table, pairs, metrics, base, margins, listed)
+    paired = compare_pairs(table, pairs, metrics, base, listed)
     return Comparison(paired, notes, metrics=metrics)
-
-
-def weights_note(first: Run, second: Run) -> tuple[str, ...]:
-    """Say which files of weights are not the same in two runs: their variants differ in these,
-    whatever their names.
-    """
-    before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
-    changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
-    return (f"other weights: {', '.join(changed)}",) if changed else ()

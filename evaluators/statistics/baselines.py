@@ -10,13 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pyarrow as pa
-from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import read_json_object
-from alpasim_plugin.core.reading.files import as_shape, kind_of
+from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
@@ -25,19 +23,8 @@ from evaluators.metrics import MetricTable
 from evaluators.opening import Run, read_run
 
 SCHEMA_VERSION = 2
-MADE_WITH = tuple(
-    [
-        "key",
-        "command",
-        "version",
-        "started_at",
-        "versions",
-        "hardware",
-        "renderers",
-        "policies",
-        "seeds",
-    ]
-)
+MADE_WITH = ("key", "command", "version", "started_at", "versions", "hardware")
+MADE_WITH += ("renderers", "policies", "seeds")
 APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
 
 
@@ -70,31 +57,6 @@ def rows_of_run(run: Run) -> list[JsonObject]:
             row[name], row[f"{name}_valid"] = value, value is not None
         rows.append(row)
     return rows
-
-
-class StoredBaseline(TypedDict):
-    """A stored baseline of the gate."""
-
-    preset: str
-    scenes: dict[str, str]
-    weights: JsonObject
-    rows: list[JsonObject]
-    made_with: JsonObject
-    metrics: JsonObject
-    repeatable: bool | None
-    schema_version: int
-
-
-class BaselineRow(TypedDict):
-    """The key and the status of a row of a stored baseline; its metrics are numbers or null, with
-    flags NAME_valid.
-    """
-
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
-    status: str
 
 
 @dataclass(frozen=True)
@@ -161,22 +123,15 @@ def read_baseline(path: Path) -> Baseline:
     if os.path.isdir(path):
         return baseline_of(read_run(path))
     content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
-    check_seal(content, path, APPROVE)
-    names = {*Baseline.__dataclass_fields__, DIGEST}
-    if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
+    if content.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: not a baseline of version {SCHEMA_VERSION} with its digest",
+            f"{path}: not a baseline of version {SCHEMA_VERSION}",
             "Write one with simrun gate RUN --write-baseline FILE, or name the earlier run's folder.",
         )
-    do = "restore the file or write it again"
+    check_seal({DIGEST: None} | content, path, APPROVE)
     del content[DIGEST]
-    as_shape(StoredBaseline, content, path, do)
-    for i, row in enumerate(content["rows"]):
-        as_shape(BaselineRow, row, f"{path}, row {i}", do)
-        for name, value in row.items():
-            if f"{name}_valid" in row and not isinstance(value, float | int | None):
-                raise InputError(f"{path}, row {i}: {name}: {kind_of(value)}, wanted a number", do)
-    return Baseline(**content)
+    with parsing(path, "restore the file or write it again", "not a baseline"):
+        return Baseline(**content)
 
 
 def check_matches(baseline: Baseline, run: Run, path: Path) -> None:

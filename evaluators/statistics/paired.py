@@ -74,8 +74,6 @@ class Pair(NamedTuple):
 def paired(
     rows: Sequence[Row],
     baseline: str,
-    metrics: Sequence[str] | None = None,
-    margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
     known: MetricTable = METRICS,
 ) -> Table:
@@ -84,9 +82,6 @@ def paired(
     Args:
         rows: As for `aggregate`.
         baseline: Renderer that the others are compared with.
-        metrics: Which metrics; all that any row has by default.
-        margins: How much worse is accepted, by metric, in its unit; the metric's own margin for the
-            others.
         listed: How many missing cells to name per metric.
         known: What the metrics are.
 
@@ -102,13 +97,10 @@ def paired(
             f"baseline {baseline!r}: no rollout has it",
             f"choose one of {', '.join(sides)}",
         )
-    names = metric_names(rows) if metrics is None else metrics
     return {
         renderer: {
-            name: compare(
-                side, sides[baseline], known.info(name), baseline, (margins or {}).get(name), listed
-            )
-            for name in names
+            name: compare(side, sides[baseline], known.info(name), baseline, listed=listed)
+            for name in metric_names(rows)
         }
         for renderer, side in sides.items()
         if renderer != baseline
@@ -161,7 +153,6 @@ def compare_pairs(
     pairs: Sequence[Pair],
     known: MetricTable,
     base: RolloutTable | None = None,
-    margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
 ) -> Table:
     """Compare variants with variants, scene by scene and seed by seed; their policies may differ.
@@ -171,7 +162,7 @@ def compare_pairs(
         pairs: What is compared.
         known: What the metrics are.
         base: The rollouts of the second variant of each pair; None: the same table.
-        margins, listed: As for `paired`.
+        listed: How many missing cells to name per metric.
 
     Returns:
         The pair's key -> METRIC -> what `compare` gives.
@@ -184,9 +175,7 @@ def compare_pairs(
         side = sides(variant.policy, variant.policy)[variant.renderer]
         base_side = base_sides(other.policy, variant.policy)[other.renderer]
         out[key] = {
-            name: compare(
-                side, base_side, known.info(name), baseline, (margins or {}).get(name), listed
-            )
+            name: compare(side, base_side, known.info(name), baseline, listed=listed)
             for name in names
         }
     return out

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evaluators import paired
+from alpasim_plugin.log.run_folder.sides import Side
+from evaluators import METRICS, paired
+from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import holm, sign_flip, verdict
 from tests.evaluators.test_tables_over_rollouts import rows_of
 
 
-def pair(base, other, metric="route_distance_m", **options):
-    return paired(
-        rows_of(base, metric, "clean") + rows_of(other, metric, "3dgs"), "clean", **options
-    )["3dgs"][metric]
+def pair(base, other, metric="route_distance_m", margin=None):
+    side, base_side = Side.of(rows_of(other, metric)), Side.of(rows_of(base, metric))
+    return compare(side, base_side, METRICS.info(metric), "clean", margin)
 
 
 @pytest.mark.parametrize(
@@ -52,14 +53,14 @@ def test_a_metric_without_a_better_side_is_worse_on_either_side_of_its_margin():
 def test_margins_are_given_or_the_documented_defaults():
     base, other = [[float(i)] for i in range(8)], [[i + 0.3 + 0.01 * (i % 3)] for i in range(8)]
     assert pair(base, other)["margin"] == 0.1
-    assert pair(base, other, margins={"route_distance_m": 0.2})["margin"] == 0.2
+    assert pair(base, other, margin=0.2)["margin"] == 0.2
     assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad")["margin"] == 0.02
     many = [[float(i)] for i in range(400)]
     assert (
         pair(
             many,
             [[v[0] + 0.3 + 0.01 * (v[0] % 3)] for v in many],
-            margins={"route_distance_m": 0.5},
+            margin=0.5,
         )["verdict"]
         == "non-inferior"
     )
@@ -154,9 +155,7 @@ def test_every_cell_without_a_pair_is_named_with_its_side_and_cause():
 
 def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn():
     def gained(k):
-        return pair(
-            [[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margins={"offroad": 0.05}
-        )
+        return pair([[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margin=0.05)
 
     assert [gained(k)["verdict"] for k in (6, 7)] == ["undecided", "worse"]
     assert gained(6)["ci95"][0] > 0.05 > gained(6)["guarded"][0]
