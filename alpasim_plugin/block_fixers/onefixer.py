@@ -223,8 +223,9 @@ class OneFixer(Fixer):
                 if history.last_fixed is None or history.last_raw is None
                 else (history.last_fixed[b], history.last_raw[b])
             )
-            measured = guard.measures(video[b].transpose(0, 1)).cpu().numpy()
-            events.append(tuple(guard.check_frames(measured, images[b], view.rgb[b], before)))
+            events.append(
+                tuple(guard.check_frames(video[b].transpose(0, 1), images[b], view.rgb[b], before))
+            )
         return PendingBlock(view, images, tuple(events), state)
 
     def _keep(self, block: PendingBlock) -> ViewsHistory:

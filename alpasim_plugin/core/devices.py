@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def check_device_name(name: str) -> str:
@@ -40,3 +44,22 @@ def require_device(name: str) -> str:
     torch.backends.cuda.matmul.allow_tf32 = False
     torch.backends.cudnn.allow_tf32 = False
     return f"cuda:{number}"
+
+
+def download(*parts: Tensor) -> list[Any]:
+    """Return tensors as arrays, brought to the host in one copy: each copy waits for the device."""
+    import torch
+
+    data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
+    pieces = torch.split(data.cpu(), [part.nbytes for part in parts])
+    return [
+        piece.clone().view(part.dtype).view(part.shape).numpy()
+        for piece, part in zip(pieces, parts, strict=True)
+    ]
+
+
+def known_false(mask: Tensor) -> bool:
+    """Return whether a mask is false everywhere, where that is known without waiting for a
+    device.
+    """
+    return mask.device.type == "cpu" and not bool(mask.any())

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -178,27 +178,69 @@ class RenderRequest:
 RECORDED_SHARE = "recorded_share"
 GUESSED_SHARE = "guessed_share"
 TRUST_CELLS = "trust_cells"
+OPACITY_MEAN = "opacity_mean"  # of a frame whose opacity stayed on a device
+
+
+class DevicePlanes(Protocol):
+    """The planes of a frame as tensors of a device."""
+
+    rgb: Any  # (H, W, 3) uint8
+    alpha: Any  # (H, W) float32
+    depth: Any  # (H, W) float32
+    pairs: Any  # () int32, downloaded with what is made of the planes, and given to `had_room`
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        ...
+
+    @property
+    def arrays(self) -> Mapping[str, Any]:
+        """All planes by name, brought to the host in one copy when they are first read."""
+        ...
+
+    @property
+    def had_room(self) -> Callable[[int], bool]:
+        """Whether the device had room for all pairs; otherwise splats are missing."""
+        ...
+
+    @property
+    def again(self) -> Callable[[], DevicePlanes]:
+        """Draw the planes once more, with more room."""
+        ...
+
+
+class _Plane:
+    """A plane of a frame: an array, or, where that is None, the plane of the frame's device."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, frame: Frame | None, owner: type) -> Any:
+        if frame is None:  # the class is asked for the default
+            return None
+        plane = frame.__dict__[self.name]
+        if plane is None and frame.on_device is not None:
+            return frame.on_device.arrays[self.name]
+        return plane
+
+    def __set__(self, frame: Frame, plane: Any) -> None:
+        frame.__dict__[self.name] = plane
 
 
 @dataclass(frozen=True)
 class Frame:
     """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote,
-    video).
+    video). A frame that was drawn on a device downloads its planes when one is first read.
     """
 
     t_us: int
     camera: str
-    rgb: U8  # (H, W, 3) sRGB
-    alpha: F32 | None = (
-        # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as
-        # opaque
-        None
-    )
-    depth: F32 | None = (
-        # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half
-        # opaque
-        None
-    )
+    rgb: U8 = cast(U8, _Plane())  # (H, W, 3) sRGB
+    # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
+    alpha: F32 | None = cast(F32 | None, _Plane())
+    # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
+    depth: F32 | None = cast(F32 | None, _Plane())
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
     facts: Mapping[str, float | str] = field(
         default_factory=dict
@@ -206,6 +248,28 @@ class Frame:
     references: tuple[
         U8, ...
     ] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
+    on_device: DevicePlanes | None = None  # of a frame that a device drew
+
+    @property
+    def pending(self) -> DevicePlanes | None:
+        """The planes of a device, if the frame's image is theirs."""
+        return self.on_device if self.is_pending("rgb") else None
+
+    def is_pending(self, plane: str) -> bool:
+        """Return whether a plane is that of a device, downloaded or not."""
+        return self.on_device is not None and self.__dict__[plane] is None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width; nothing is downloaded."""
+        height, width = self.pending.size if self.pending else self.rgb.shape[:2]
+        return height, width
+
+    def changed(self, **values: Any) -> Self:
+        """Return a copy with other values; planes of a device stay there."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__ | values)
+        return copy
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.image_metrics import is_black
+from alpasim_plugin.core.devices import known_false
+from alpasim_plugin.core.image_metrics import BLACK_MAX
 from alpasim_plugin.core.types import F32, U8
 
 NAN = "fixer-nan"
 RANGE = "fixer-range"
 BLACK = "fixer-black"
 FROZEN = "fixer-frozen"
+RENDER_BLACK = "black"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
 # grey levels of mean change in the raw frames above which an unchanged output counts as frozen
@@ -37,52 +39,11 @@ AROUND = 2 * REACH + 1
 MAPPED = 0.02  # share of a cell's range that drawn map covers
 
 
-def measures(video: Tensor) -> Tensor:
-    """Measure decoded frames before they are clipped.
-
-    Args:
-        video: ``(T, ...)`` in any layout, meant to lie in [-1, 1].
-
-    Returns:
-        ``(T, 3)`` float32: lowest and highest value, NaN where one is anywhere in the frame, and
-        the share of values beyond `LIMIT`.
-    """
-    values = video.flatten(1)
-    counts = [torch.count_nonzero(frame.abs() > LIMIT) for frame in values]
-    beyond = torch.stack(counts) / values.shape[1]
-    return torch.stack([values.amin(1).float(), values.amax(1).float(), beyond], dim=1)
-
-
-def failures(measured: F32) -> list[str]:
-    """Return the failure of frames as `measures` gave them, "" where a frame is fine."""
-    events = []
-    for low, high, beyond in measured:
-        if not (np.isfinite(low) and np.isfinite(high)):
-            events.append(NAN)
-        else:
-            events.append(RANGE if beyond > SHARE else "")
-    return events
-
-
-def black(fixed: U8, raw: U8) -> bool:
-    """Return whether the fixed image is black and the raw one is not."""
-    return is_black(fixed) and not is_black(raw)
-
-
-def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:
-    """Return whether an output repeats the previous one bit for bit although the raw frame
-    changed.
-    """
-    if not np.array_equal(fixed, before):
-        return False
-    return float(np.abs(raw.astype(np.int16) - raw_before).mean()) > MOVED
-
-
-def check_frames(measured: F32, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
+def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
     """Return the failure of each frame of one view.
 
     Args:
-        measured: ``(T, 3)``, the frames as decoded; see `measures`.
+        video: ``(T, ...)`` the frames as decoded, meant to lie in [-1, 1].
         fixed: ``(T, H, W, 3)`` the same as images.
         raw: ``(T, H, W, 3)`` what the fixer received.
         before: Last fixed and raw frame of the previous block, if there was one.
@@ -90,14 +51,78 @@ def check_frames(measured: F32, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     Returns:
         T events, "" where a frame is fine.
     """
-    events = failures(measured)
-    for t, event in enumerate(events):
-        last = (fixed[t - 1], raw[t - 1]) if t else before
-        if not event and black(fixed[t], raw[t]):
-            events[t] = BLACK
-        elif not event and last is not None and frozen(fixed[t], last[0], raw[t], last[1]):
-            events[t] = FROZEN
+    first = (fixed[0], raw[0]) if before is None else before
+    images, pasts = (
+        [torch.from_numpy(np.ascontiguousarray(part)).to(video.device) for part in parts]
+        for parts in (
+            (fixed, raw),
+            (
+                np.concatenate([start[None], part[:-1]])
+                for start, part in zip(first, (fixed, raw), strict=True)
+            ),
+        )
+    )
+    return failures(measures(video, *images, *pasts).cpu().numpy())
+
+
+def measures(
+    video: Tensor, fixed: Tensor, raw: Tensor, fixed_before: Tensor, raw_before: Tensor
+) -> Tensor:
+    """Measure decoded frames before they are clipped.
+
+    Args:
+        video: ``(T, ...)`` in any layout, meant to lie in [-1, 1].
+        fixed: ``(T, H, W, 3)`` uint8, the same as images.
+        raw: Like ``fixed``, what the fixer received.
+        fixed_before, raw_before: Those of the frame before each.
+
+    Returns:
+        ``(T, 6)`` float32: lowest and highest value, NaN where one is anywhere in the frame, the
+        share of values beyond `LIMIT`, the brightest value of the image and of the render, and 1
+        where the image is that of the frame before although the render moved.
+    """
+    values = video.flatten(1)
+    counts = [torch.count_nonzero(frame.abs() > LIMIT) for frame in values]
+    columns = [
+        values.amin(1),
+        values.amax(1),
+        torch.stack(counts) / values.shape[1],
+        fixed.flatten(1).amax(1),
+        raw.flatten(1).amax(1),
+        _frozen(fixed, raw, fixed_before, raw_before),
+    ]
+    return torch.stack([column.float() for column in columns], dim=1)
+
+
+def _frozen(fixed: Tensor, raw: Tensor, fixed_before: Tensor, raw_before: Tensor) -> Tensor:
+    """Return whether each output repeats the one before bit for bit although the raw frame
+    changed.
+    """
+    repeated = (fixed == fixed_before).flatten(1).all(1)
+    if known_false(repeated):
+        return repeated
+    moved = (raw.float() - raw_before.float()).abs_().flatten(1).mean(1)
+    return repeated & (moved > MOVED)
+
+
+def failures(measured: F32) -> list[str]:
+    """Return the failure of frames as `measures` gave them, "" where a frame is fine."""
+    events = []
+    for low, high, beyond, brightest, brightest_raw, frozen in measured:
+        if not (np.isfinite(low) and np.isfinite(high)):
+            events.append(NAN)
+        elif beyond > SHARE:
+            events.append(RANGE)
+        elif brightest <= BLACK_MAX < brightest_raw:
+            events.append(BLACK)
+        else:
+            events.append(FROZEN if frozen else "")
     return events
+
+
+def render_events(measured: F32) -> tuple[str, ...]:
+    """Return what is wrong with a render, as `measures` gave its frame."""
+    return (RENDER_BLACK,) if measured[4] <= BLACK_MAX else ()
 
 
 def render_share(
@@ -119,7 +144,7 @@ def render_share(
         before: The last output, like ``out``.
     """
     change = _cells((out - render).abs_()).mean(1, keepdim=True)
-    if not out.is_cuda and float(change.amax()) <= LARGE[0]:
+    if known_false(change > LARGE[0]):
         return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED

@@ -11,8 +11,10 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
@@ -69,7 +71,7 @@ class BlockRunner:
         frame = self.render_base(request)
         if self.references is not None:
             with self._timed("references"):
-                frame = replace(frame, references=self.references.of(request, frame))
+                frame = frame.changed(references=self.references.of(request, frame))
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
         with self._timed("map"):
@@ -109,7 +111,7 @@ class BlockRunner:
                 f"{name}: {problem}",
                 "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
             )
-        return [replace(frame, references=()) for frame in fixed]
+        return [frame.changed(references=()) for frame in fixed]
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -124,8 +126,8 @@ def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
     for before, after in zip(given, fixed, strict=True):
         if (before.t_us, before.camera) != (after.t_us, after.camera):
             return f"camera {before.camera!r} at {before.t_us} us came back as {after.camera!r} at {after.t_us} us"
-        if before.rgb.shape != after.rgb.shape or before.rgb.dtype != after.rgb.dtype:
-            return f"rgb came back as {after.rgb.dtype} {after.rgb.shape}, not {before.rgb.dtype} {before.rgb.shape}"
+        if after.rgb.shape != (*before.size, 3) or after.rgb.dtype != np.uint8:
+            return f"rgb came back as {after.rgb.dtype} {after.rgb.shape}, not of {before.size}"
     return ""
 
 

@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.core.devices import download
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
-from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.core.types import OPACITY_MEAN, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import (
@@ -33,7 +35,14 @@ from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.trust import trust_facts, trust_sums
-from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
+from alpasim_plugin.fixers.views import (
+    HALF,
+    Views,
+    check_continues,
+    group_views,
+    planes_of,
+    stacked,
+)
 
 
 @dataclass(frozen=True)
@@ -96,8 +105,8 @@ class CameraHistory:
     state: PixelState  # of one view
     frames: int  # fixed so far
     t_us: int  # of the last
-    raw: U8  # (H, W, 3) the last render
-    fixed: U8  # (H, W, 3) the last output as generated, also if the guard returned the raw frame
+    raw: Tensor  # (H, W, 3) uint8, the last render
+    fixed: Tensor  # like it, the last output as generated, also if the guard returned the raw frame
 
 
 class PixelFixer(Fixer):
@@ -189,7 +198,8 @@ class PixelFixer(Fixer):
     def _advance(
         self, block: Sequence[Frame], maps: Sequence[U8], pasts: Mapping[str, CameraHistory]
     ) -> tuple[tuple[Frame, ...], dict[str, CameraHistory]]:
-        views = group_views(block, maps if self.settings.uses_map else (), 1)
+        drawn = maps if self.settings.uses_map else ()
+        views = group_views(block, drawn, 1, on_device=True)
         for view in views:
             check_continues(view, pasts)
         out, after = list(block), dict(pasts)
@@ -207,7 +217,13 @@ class PixelFixer(Fixer):
     ) -> list[tuple[Frame, CameraHistory]]:
         """Fix the frame of each camera of a view; return it and the camera's past for the next."""
         start = self.generator.net.start
-        inputs = to_inputs(view, self.generator.device, self.settings.scale_of(*view.shape))
+        device = self.generator.device
+        frames = [block[index] for (index,) in view.index]
+        drawn = [] if isinstance(view.rgb, np.ndarray) else planes_of(frames)
+        raw = torch.as_tensor(view.rgb[:, 0]).to(device)
+        inputs = to_inputs(
+            replace(view, rgb=raw[:, None]), device, self.settings.scale_of(*view.shape)
+        )
         pasts = [histories.get(camera) for camera in view.cameras]
         states = [
             start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state
@@ -222,8 +238,8 @@ class PixelFixer(Fixer):
                 return inputs.render
             frames = counts
             if self.settings.noise == "content":
-                contents = zip(view.t_us, view.rgb, strict=True)
-                frames = [content_key(t_us[0], rgb[0]) for t_us, rgb in contents]
+                contents = zip(view.t_us, raw.cpu().numpy(), strict=True)
+                frames = [content_key(t_us[0], rgb) for t_us, rgb in contents]
             keys = [
                 noise_key(self.scene_id, self.seed, camera, draw, frame)
                 for camera, frame in zip(view.cameras, frames, strict=True)
@@ -235,27 +251,38 @@ class PixelFixer(Fixer):
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
         visible = slice(None), slice(height), slice(width)
         output = after.output[visible]
-        images, measured, sums = download(
-            _grey_levels(output),
-            guard.measures(video[visible]),
+        levels = _grey_levels(output)
+        before = [
+            (levels[b], raw[b]) if past is None else (past.fixed, past.raw)
+            for b, past in enumerate(pasts)
+        ]
+        fixed_before, raw_before = (torch.stack(parts) for parts in zip(*before, strict=True))
+        images, measured, sums, *rest = download(
+            levels,
+            guard.measures(video[visible], levels, raw, fixed_before, raw_before),
             trust_sums(output, after.render[visible], after.recorded[visible]),
+            *(planes.pairs for planes in drawn),
+            *(planes.alpha.mean() for planes in drawn),
         )
+        pairs, opacity = rest[: len(drawn)], rest[len(drawn) :]
+        if not all([planes.had_room(int(n)) for planes, n in zip(drawn, pairs, strict=True)]):
+            return self._fix(*_drawn_again(view, block), histories)
         fixed = []
-        for b, past in enumerate(pasts):
-            before = None if past is None else (past.fixed, past.raw)
-            raw = view.rgb[b, 0]
-            at = slice(b, b + 1)
-            event = guard.check_frames(measured[at], images[at], raw[None], before)[0]
-            state = PixelState(*(part[at] for part in after))
+        for b, (frame, event) in enumerate(zip(frames, guard.failures(measured), strict=True)):
+            state = PixelState(*(part[b : b + 1] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
-                state = start(inputs.render[at], inputs.scale)
-            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b])
-            frame = replace(block[view.index[b][0]], references=())
+                state = start(inputs.render[b : b + 1], inputs.scale)
+            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw[b], levels[b])
+            events, facts = frame.events, dict(frame.facts)
+            if frame.pending is not None:  # nobody has looked at the render yet
+                events += guard.render_events(measured[b])
+            if opacity:
+                facts[OPACITY_MEAN] = round(float(opacity[b]), 5)
             if event:  # the render is returned, and nothing of the network's
-                frame = replace(frame, events=(*frame.events, event))
+                frame = frame.changed(references=(), events=(*events, event), facts=facts)
             else:
-                facts = {**frame.facts, **trust_facts(sums[b], height, width)}
-                frame = replace(frame, rgb=images[b], facts=facts)
+                facts |= trust_facts(sums[b], height, width)
+                frame = frame.changed(references=(), events=events, facts=facts, rgb=images[b])
             fixed.append((frame, history))
         return fixed
 
@@ -266,14 +293,15 @@ def _grey_levels(images: Tensor) -> Tensor:
     return levels.nan_to_num_(0.0).to(torch.uint8)
 
 
-def download(*parts: Tensor) -> list[Any]:
-    """Return tensors as arrays, brought to the host in one copy: each copy waits for the device."""
-    data = torch.cat([part.contiguous().view(-1).view(torch.uint8) for part in parts])
-    pieces = torch.split(data.cpu(), [part.nbytes for part in parts])
-    return [
-        piece.clone().view(part.dtype).view(part.shape).numpy()
-        for piece, part in zip(pieces, parts, strict=True)
-    ]
+def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[Frame]]:
+    """Return a view that lacks splats, and its block, drawn again by the device."""
+    frames = list(block)
+    mine = [index for (index,) in view.index]
+    again = [planes.again() for planes in planes_of([frames[index] for index in mine])]
+    for index, planes in zip(mine, again, strict=True):
+        frames[index] = frames[index].changed(on_device=planes)
+    rgb, alpha = stacked(again)
+    return replace(view, rgb=rgb[:, None], alpha=alpha[:, None]), frames
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:
@@ -283,26 +311,25 @@ def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -
     height, width = view.shape
     right, below = -width % (GRID_PX * scale), -height % (GRID_PX * scale)
 
-    def image(x: np.ndarray) -> Tensor:
+    def image(plane: Any) -> Tensor:
+        x = torch.as_tensor(plane[:, 0]).to(device)
         if right or below:
-            x = np.pad(x, ((0, 0), (0, below), (0, right), (0, 0)), mode="edge")
-        return torch.from_numpy(x).to(device)
+            rows = torch.arange(height + below, device=device).clamp_(max=height - 1)
+            columns = torch.arange(width + right, device=device).clamp_(max=width - 1)
+            x = x[:, rows][:, :, columns]
+        return x
 
-    render = image(view.rgb[:, 0]).float().div_(HALF).sub_(1)
+    render = image(view.rgb).float().div_(HALF).sub_(1)
     opacity = (
-        torch.ones_like(render[..., :1])
-        if view.alpha is None
-        else image(view.alpha[:, 0, ..., None])
+        torch.ones_like(render[..., :1]) if view.alpha is None else image(view.alpha)[..., None]
     )
     sdmap = (
         torch.full_like(render, -1.0)
         if view.maps is None
-        else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
+        else image(view.maps).float().div_(HALF).sub_(1)
     )
     references = None
     if view.references is not None:
-        padded = view.references[:, 0]
-        if right or below:
-            padded = np.pad(padded, ((0, 0), (0, 0), (0, below), (0, right), (0, 0)))
-        references = torch.from_numpy(padded).to(device)
+        padding = (0, 0, 0, right, 0, below)
+        references = F.pad(torch.as_tensor(view.references[:, 0]).to(device), padding)
     return PixelInputs(render, opacity, sdmap, references, scale)

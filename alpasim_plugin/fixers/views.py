@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import F32, U8, Frame
+from alpasim_plugin.core.types import F32, U8, DevicePlanes, Frame
 
 SLACK = 1e-3  # opacity outside [0, 1] by rounding is clipped; more is an error
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
@@ -25,8 +25,8 @@ class Views:
     cameras: tuple[str, ...]  # B of them, sorted
     index: tuple[tuple[int, ...], ...]  # per camera, positions of its T frames in the block
     t_us: tuple[tuple[int, ...], ...]  # per camera
-    rgb: U8  # (B, T, H, W, 3)
-    alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque
+    rgb: Any  # (B, T, H, W, 3) uint8, of the host or of a device
+    alpha: Any  # (B, T, H, W) float32 beside it, 0 to 1; None where every pixel is opaque
     maps: U8 | None  # (B, T, H, W, 3)
     references: U8 | None = (
         # (B, T, K, H, W, 4) recorded frames, 0 where a frame has fewer than others; None: no frame
@@ -64,18 +64,21 @@ class Past(Protocol):
         ...
 
     @property
-    def raw(self) -> U8:
+    def raw(self) -> Any:
         """Its render ``(H, W, 3)``."""
         ...
 
 
-def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> tuple[Views, ...]:
+def group_views(
+    block: Sequence[Frame], maps: Sequence[U8], frames_due: int, on_device: bool = False
+) -> tuple[Views, ...]:
     """Sort a block by size, camera and time.
 
     Args:
         block: Frames of any cameras in any order.
         maps: Semantic maps of the same frames, or empty.
         frames_due: Most frames that a camera may have.
+        on_device: Whether planes that a device drew may stay there.
 
     Returns:
         One batch of views per image size; pixels are copied.
@@ -108,11 +111,11 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
             raise InputError(
                 f"camera {camera!r}: two frames at one time: {times}", "give every frame once"
             )
-        shape = block[mine[0]].rgb.shape
+        shape = (*block[mine[0]].size, 3)
         for i in mine:
             _check_frame(block[i], maps[i] if maps else None, shape)
         sizes.setdefault(shape, []).append(camera)
-    return tuple(_stack(block, maps, sizes[shape], index) for shape in sorted(sizes))
+    return tuple(_stack(block, maps, sizes[shape], index, on_device) for shape in sorted(sizes))
 
 
 def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
@@ -136,14 +139,15 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
 def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None:
     """Refuse a frame, its map and its references unless they have the size ``shape``."""
     what = f"camera {frame.camera!r} at {frame.t_us} us"
-    is_image = frame.rgb.ndim == 3 and frame.rgb.shape[2] == 3 and 0 not in frame.rgb.shape
-    if not is_image or frame.rgb.dtype != np.uint8:
+    if frame.pending is None:
+        rgb = frame.rgb
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape or rgb.dtype != np.uint8:
+            raise InputError(
+                f"{what}: rgb is {rgb.dtype} {rgb.shape}", "give (height, width, 3) uint8"
+            )
+    if frame.size != shape[:2]:
         raise InputError(
-            f"{what}: rgb is {frame.rgb.dtype} {frame.rgb.shape}", "give (height, width, 3) uint8"
-        )
-    if frame.rgb.shape != shape:
-        raise InputError(
-            f"{what}: rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)",
+            f"{what}: rgb of {frame.size} after {shape[:2]} (height, width)",
             "keep a camera's image size for the whole rollout",
         )
     given = [("a reference", image, (*shape[:2], 4)) for image in frame.references]
@@ -155,9 +159,9 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
                 f"{what}: {name} is {image.dtype} {image.shape}",
                 f"give uint8 {due}, the size of the frame",
             )
-    alpha = frame.alpha
-    if alpha is None:
+    if frame.pending is not None or frame.alpha is None:
         return
+    alpha = frame.alpha
     if alpha.shape != shape[:2]:
         raise InputError(
             f"{what}: alpha of {alpha.shape} with rgb of {shape[:2]} (height, width)",
@@ -173,21 +177,23 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
 
 
 def _stack(
-    block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], index: dict[str, list[int]]
+    block: Sequence[Frame],
+    maps: Sequence[U8],
+    cameras: Sequence[str],
+    index: dict[str, list[int]],
+    on_device: bool,
 ) -> Views:
     names = tuple(sorted(cameras))
     order = tuple(tuple(index[name]) for name in names)
-    shape = block[order[0][0]].rgb.shape
-    lead = (len(names), len(order[0]))
     flat = [i for mine in order for i in mine]
     frames = [block[i] for i in flat]
-    alpha = None
-    if any(frame.alpha is not None and frame.alpha.min() < 1 for frame in frames):
-        alpha = np.ones((len(frames), *shape[:2]), np.float32)
-        for i, frame in enumerate(frames):
-            if frame.alpha is not None:
-                alpha[i] = frame.alpha.clip(0, 1)
-        alpha = alpha.reshape(*lead, *shape[:2])
+    shape = (*frames[0].size, 3)
+    lead = (len(names), len(order[0]))
+    drawn = planes_of(frames) if on_device else []
+    if len(drawn) == len(frames):
+        rgb, alpha = stacked(drawn)
+    else:
+        rgb, alpha = np.stack([frame.rgb for frame in frames]), _opacity(frames)
     references = None
     count = max(len(frame.references) for frame in frames)
     if count:
@@ -200,11 +206,35 @@ def _stack(
         names,
         order,
         tuple(tuple(block[i].t_us for i in mine) for mine in order),
-        np.stack([frame.rgb for frame in frames]).reshape(*lead, *shape),
-        alpha,
+        rgb.reshape(*lead, *shape),
+        None if alpha is None else alpha.reshape(*lead, *shape[:2]),
         np.stack([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
         references,
     )
+
+
+def planes_of(frames: Sequence[Frame]) -> list[DevicePlanes]:
+    """Return the planes of the frames that a device drew."""
+    return [frame.pending for frame in frames if frame.pending is not None]
+
+
+def stacked(drawn: Sequence[DevicePlanes]) -> tuple[Any, Any]:
+    """Return images and opacities that a device drew as one tensor each."""
+    import torch
+
+    rgb = torch.stack([planes.rgb for planes in drawn])
+    return rgb, torch.stack([planes.alpha for planes in drawn])
+
+
+def _opacity(frames: Sequence[Frame]) -> F32 | None:
+    """Return the opacities of frames ``(N, H, W)``, None where every pixel is opaque."""
+    if all(frame.alpha is None or frame.alpha.min() >= 1 for frame in frames):
+        return None
+    alpha = np.ones((len(frames), *frames[0].size), np.float32)
+    for i, frame in enumerate(frames):
+        if frame.alpha is not None:
+            alpha[i] = frame.alpha.clip(0, 1)
+    return alpha
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
+import numpy as np
+
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
@@ -22,20 +24,18 @@ from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.background import read_background
-from alpasim_plugin.renderers.rolling import draw_request
+from alpasim_plugin.renderers.rolling import draw_frame
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
+ALL = np.ones((1, 1), np.float32)
 
 T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()
 
 
 class CleanRenderer(Renderer):
-    """Render the scene as built.
-
-    Attributes:
-        stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
+    """Render the scene as built; its sky counts as opaque.
 
     Raises:
         InputError: Nothing was built: the scenario is an imported drive.
@@ -52,22 +52,15 @@ class CleanRenderer(Renderer):
         self.scenario, self.seed, self.threads = scenario, seed, threads
         self.device = require_device(device)
         self.scene = scene_of(scenario)
-        self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
-        complete = self.scenario.background is None
+        return draw_frame(request, self._drawn, self.device)
 
-        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-            return self.scene.render(
-                camera, actors, self.threads, self.device, sky_in_alpha=complete
-            )
-
-        out = draw_request(request, draw, self.device)
-        self.stats = out.stats
-        return Frame(
-            request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth()
-        )
+    def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+        out = self.scene.render(camera, actors, self.threads, self.device)
+        is_complete = self.scenario.background is None
+        return (out.covered(ALL) if is_complete else out).surface()
 
 
 def scene_of(scenario: Scenario) -> SceneGraph:

@@ -13,7 +13,7 @@ that the recording's camera had near by: frames look as the drive's own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -61,11 +61,10 @@ from alpasim_plugin.renderers.reconstruction_key import (
     reconstruction_key,
 )
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
-from alpasim_plugin.renderers.rolling import camera_at, draw_request
+from alpasim_plugin.renderers.rolling import camera_at, draw_frame
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size
-OPAQUE = 0.5  # a frame that is less so above the horizon shows the sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +78,6 @@ class Model:
 class ReconstructionRenderer(Renderer):
     """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in
     the cache.
-
-    Attributes:
-        stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
     """
 
     has_history = False
@@ -90,22 +86,14 @@ class ReconstructionRenderer(Renderer):
         self.scenario, self.threads = scenario, threads
         self.device = require_device(device)
         self.model = model_of(scenario, threads)
-        self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
+        return draw_frame(request, self._drawn, self.device)
 
-        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-            out = self.model.graph.render(camera, actors, self.threads, self.device)
-            return replace(
-                out,
-                alpha=np.maximum(out.alpha, self.model.sky.share(camera)),
-                depth=out.surface_depth(),
-            )
-
-        out = draw_request(request, draw, self.device)
-        self.stats = out.stats
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
+    def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
+        out = self.model.graph.render(camera, actors, self.threads, self.device)
+        return out.surface().covered(self.model.sky.share(camera))
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return what the scenario's cameras saw along the log, at the believed poses; the drives
@@ -205,9 +193,6 @@ def _graph(model: Reconstruction, missing: Sequence[SceneNode]) -> SceneGraph:
 class ImportedRenderer(Renderer):
     """Render the reconstruction of an imported drive.
 
-    Attributes:
-        stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
-
     Raises:
         InputError: The scenario names no model, or its folder holds no finished reconstruction.
     """
@@ -219,16 +204,14 @@ class ImportedRenderer(Renderer):
         self.device = require_device(device)
         self.graph = graph_of(scenario)
         self.fitted = [one for one in scenario.recording if one.use == "fitted"]
-        self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
-        out = draw_request(request, self._drawn, self.device)
         place = camera_at(request, request.T_world_camera[1]).centre_world
-        rgb = np.clip(out.rgb * exposure_near(self.fitted, request.camera.name, place), 0.0, 1.0)
-        shown = replace(out, rgb=np.asarray(rgb, np.float32))
-        self.stats = out.stats
-        return Frame(request.t_us, request.camera.name, shown.to_uint8(), out.alpha, out.depth)
+        gain = exposure_near(self.fitted, request.camera.name, place)
+        return draw_frame(
+            request, lambda camera, actors: self._drawn(camera, actors).exposed(gain), self.device
+        )
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the photographs that the model was fitted to, with the depth that the model has
@@ -242,12 +225,7 @@ class ImportedRenderer(Renderer):
         """Render with the sky as an opaque layer without depth."""
         known = {name: T for name, T in actors.items() if name in self.graph.actors}
         out = self.graph.render(camera, known, self.threads, self.device)
-        sky = (out.alpha < OPAQUE) & camera.above_horizon()
-        return replace(
-            out,
-            alpha=np.where(sky, np.float32(1), out.alpha),
-            depth=np.where(sky, np.float32(0), out.depth),
-        )
+        return out.with_sky(camera.above_horizon())
 
 
 def graph_of(scenario: Scenario) -> SceneGraph:

@@ -71,7 +71,7 @@ def built_recording(
         """Return the built scene's image, and the model's depth from the believed pose."""
         true, believed, actors = shots[number]
         image = scene.render(true, actors, 1).to_uint8()
-        return image, model(believed, actors).surface_depth()
+        return image, model(believed, actors).surface().depth
 
     frames = []
     for t_us in times:

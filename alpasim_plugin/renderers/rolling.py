@@ -11,7 +11,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.shutter import at_share, bands, motion_px
-from alpasim_plugin.core.types import F64, RenderRequest
+from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 
@@ -19,11 +19,16 @@ NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still look
 Draw = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
 
 
+def draw_frame(request: RenderRequest, draw: Draw, device: str) -> Frame:
+    """Return the frame of a request; see `draw_request`. What a device drew stays there."""
+    return draw_request(request, draw, device).frame(request.t_us, request.camera.name)
+
+
 def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutput:
     """Draw a request's frame; without an exposure at the shutter's end.
 
     Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
-    time of its pixel. Otherwise the frame is drawn in `bands`.
+    time of its pixel. Otherwise the frame is drawn in `bands`, which are joined on the host.
 
     Args:
         request: What to draw.
@@ -32,7 +37,7 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
 
     Returns:
         The image; a pixel that nobody looks at is black and opaque. Depth is along the axis of
-        the pose at the pixel's time. ``stats`` are the largest of any band.
+        the pose at the pixel's time.
     """
     spec = request.camera
     if request.exposure is None:
@@ -43,14 +48,12 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
     out = RasterOutput(
         np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
     )
-    stats: dict[str, int] = {}
     for band in bands(request):
         camera = camera_at(request, band.T_world_camera)
-        part = draw(camera.window(band.rows, band.columns), band.actors)
+        part = draw(camera.window(band.rows, band.columns), band.actors).on_host()
         for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
             band.put(whole, drawn)
-        stats = {name: max(count, stats.get(name, 0)) for name, count in part.stats.items()}
-    return RasterOutput(out.rgb, out.alpha, out.depth, stats)
+    return out
 
 
 def _rolling(request: RenderRequest) -> tuple[PinholeCamera, Mapping[str, F64]]:

@@ -431,7 +431,7 @@ def _renderer_of_pinholes(
     assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
 
     def render(request: RenderRequest) -> Frame:
-        return checked_frames(base, [request])[0]
+        return checked_frames(base, [request], on_device=True)[0]
 
     recorded = base.recorded() if settings.references else ()
     return fixed_renderer(

@@ -28,9 +28,11 @@ ROUNDING = 1e-3
 CHECK = "simrun check policy finds all faults of a policy"
 
 
-def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
+def checked_frames(
+    renderer: Renderer, requests: Sequence[RenderRequest], on_device: bool = False
+) -> list[Frame]:
     """Render and check the frames of one instant, or of one block; an all-black frame passes but
-    carries the event ``black``.
+    carries the event ``black``, unless it may stay ``on_device``, which its fixer looks at.
 
     Raises:
         RendererError: The renderer raised, or its frames do not match the requests in number, size,
@@ -52,7 +54,7 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
         )
     return [
         replace(frame, events=(*frame.events, "black"))
-        if "black" not in frame.events and is_black(frame.rgb)
+        if "black" not in frame.events and not (on_device and frame.pending) and is_black(frame.rgb)
         else frame
         for frame in frames
     ]
@@ -63,7 +65,10 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
     if not isinstance(frame, Frame):
         return f"render returned {type(frame).__name__}, not a Frame"
     wanted = (request.camera.height, request.camera.width, 3)
-    shape, dtype = getattr(frame.rgb, "shape", None), getattr(frame.rgb, "dtype", None)
+    if frame.pending:
+        shape, dtype = (*frame.size, 3), np.dtype(np.uint8)
+    else:
+        shape, dtype = getattr(frame.rgb, "shape", None), getattr(frame.rgb, "dtype", None)
     if shape != wanted or dtype != np.uint8:
         guess = ""
         if shape == (3, *wanted[:2]):
@@ -75,7 +80,8 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
         )
     if (frame.t_us, frame.camera) != (request.t_us, request.camera.name):
         return f"the frame is stamped {frame.camera!r} at {frame.t_us} us"
-    for label, plane, high in (("alpha", frame.alpha, ALPHA), ("depth", frame.depth, DEPTH_M)):
+    for label, high in (("alpha", ALPHA), ("depth", DEPTH_M)):
+        plane = None if frame.is_pending(label) else getattr(frame, label)
         if plane is None:
             continue
         shape, dtype = getattr(plane, "shape", None), getattr(plane, "dtype", None)

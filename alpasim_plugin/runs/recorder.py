@@ -23,6 +23,7 @@ from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
+    OPACITY_MEAN,
     U8,
     CameraSpec,
     EgoState,
@@ -186,11 +187,13 @@ class Recorder:
             if self._images != "none":
                 self._log.render_request(request, self._images)
                 self._log.camera_image(frame, self._images, request.camera.shutter_us)
-            opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
+            opacity = frame.facts.get(OPACITY_MEAN)
+            if opacity is None and frame.alpha is not None:
+                opacity = round(float(frame.alpha.mean()), 5)
             facts = {
                 "t_us": frame.t_us,
                 "camera": frame.camera,
-                "opacity_mean": opacity,
+                OPACITY_MEAN: opacity,
                 "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
                 "events": " ".join(frame.events),
             }

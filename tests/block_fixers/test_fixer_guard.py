@@ -22,7 +22,9 @@ def video(*values: float):
 
 
 def failures(x):
-    return guard.failures(guard.measures(x).numpy())
+    grey = np.full((len(x), 10, 10, 3), 90, np.uint8)
+    grey += np.arange(len(x), dtype=np.uint8)[:, None, None, None]
+    return guard.check_frames(x, grey, grey, None)
 
 
 def test_a_single_nan_or_infinity_spoils_its_frame_alone():
@@ -40,16 +42,16 @@ def test_overshoot_at_a_few_pixels_is_not_out_of_range():
 
 
 def test_black_counts_only_where_the_render_is_not_black():
-    dark, grey = np.full((4, 4, 3), 10, np.uint8), np.full((4, 4, 3), 90, np.uint8)
-    assert guard.black(dark, grey)
-    assert not guard.black(dark, dark)
-    assert not guard.black(grey, grey)
+    dark, grey = np.full((1, 10, 10, 3), 10, np.uint8), np.full((1, 10, 10, 3), 90, np.uint8)
+    assert guard.check_frames(video(0.0), dark, grey, None) == ["fixer-black"]
+    assert guard.check_frames(video(0.0), dark, dark, None) == [""]
+    assert guard.check_frames(video(0.0), grey, grey, None) == [""]
 
 
 def test_frozen_counts_only_where_the_render_moves():
     raw = pixels(FRAMES[:3])
     out = np.stack([raw[0], raw[0], raw[1]])
-    fine = np.zeros((3, 3), np.float32)
+    fine = video(0.0, 0.0, 0.0)
     assert guard.check_frames(fine, out, raw, None) == ["", "fixer-frozen", ""]
     standing = np.stack([raw[0]] * 3)
     assert guard.check_frames(fine, standing, standing, (raw[0], raw[0])) == ["", "", ""]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.types import Frame
+from alpasim_plugin.core.types import OPACITY_MEAN, Frame
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from tests.gaussians.gaussian_scenes import LSB
@@ -21,6 +21,10 @@ from tests.pretended_device import pretended_device
 HEIGHT, WIDTH = 64, 96
 
 
+def camera_size():
+    return camera().height, camera().width
+
+
 def frames():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 255, (4, HEIGHT, WIDTH, 4), dtype=np.uint8)
@@ -31,23 +35,53 @@ def frames():
     ]
 
 
-def test_a_scene_is_uploaded_once_and_a_frame_waits_once(monkeypatch):
+def scene():
     background = [node(f"b{i}", blobs((8 + 4 * i, 3 - 2 * i, 1.0), n=12, seed=i)) for i in range(4)]
     car = node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")
-    poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
-    graph = SceneGraph(background, [car], SKY)
-    wanted = graph.render(camera(), poses)
+    return SceneGraph(background, [car], SKY), {"car": se2(9.0, -0.5, 0.7, 1.2)}
+
+
+def test_a_scene_is_uploaded_once_and_a_frame_waits_when_it_is_read(monkeypatch):
+    graph, poses = scene()
+    wanted = graph.render(camera(), poses).surface().frame(0, "front")
     with pretended_device(monkeypatch) as traffic:
         graph.render(camera(), poses, device="cuda:0")
         assert traffic.bytes_up > 60 * 100  # 60 Gaussians
         traffic.reset()
-        found = graph.render(camera(), poses, device="cuda:0")
-    assert np.abs(found.rgb - wanted.rgb).max() <= LSB
-    assert np.abs(found.alpha - wanted.alpha).max() <= LSB
+        found = graph.render(camera(), poses, device="cuda:0").surface().frame(0, "front")
+        assert not traffic.waits
+        assert found.size == wanted.size
+        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 1
+        assert np.abs(found.alpha - wanted.alpha).max() <= LSB
+        assert (np.abs(found.depth - wanted.depth) > 1e-3).mean() < 1e-3
     assert sum(traffic.waits.values()) == 1
-    assert traffic.bytes_up < 2_000
-    assert traffic.bytes_down == 20 * (found.alpha.size + 1)
-    assert traffic.launches <= 20
+    assert traffic.bytes_up < 3_000
+    assert traffic.bytes_down == 11 * found.alpha.size + 4
+    assert traffic.launches <= 40
+
+
+@pytest.mark.parametrize("capacity", [1 << 16, 10])
+def test_a_frame_stays_on_the_device_between_rasteriser_and_fixer(monkeypatch, capacity):
+    graph, poses = scene()
+    host = make_fixer("onefixer", scene_id="scene")
+    sdmap = np.zeros((*camera_size(), 3), np.uint8)
+
+    def drawn(t_us, device="cpu"):
+        return graph.render(camera(), poses, device=device).surface().frame(t_us, "front")
+
+    wanted = [host.step([drawn(t)], [sdmap])[0] for t in range(3)]
+    with pretended_device(monkeypatch) as traffic:
+        device = make_fixer("onefixer", scene_id="scene", device="cuda")
+        for t, due in enumerate(wanted):
+            graph._upload("cuda:0")[0].capacity = capacity
+            traffic.reset()
+            fixed = device.step([drawn(t, "cuda:0")], [sdmap])[0]
+            assert np.abs(fixed.rgb.astype(int) - due.rgb).max() <= 2  # of images that differ by 1
+            assert fixed.facts[OPACITY_MEAN] == pytest.approx(due.alpha.mean(), abs=1e-4)
+            assert sum(traffic.waits.values()) == (1 if capacity > 10 else 2)
+            if capacity > 10:
+                assert traffic.bytes_down < 3.1 * due.alpha.size + 200
+        assert np.abs(fixed.alpha - due.alpha).max() <= LSB
 
 
 def test_the_fixer_waits_once_a_frame_and_downloads_bytes(monkeypatch):

@@ -134,7 +134,7 @@ def test_sky_is_not_in_alpha_unless_asked_for():
     out = graph.render(camera(), {})
     assert out.alpha.max() == 0
     assert out.rgb.min() > 0.1
-    assert graph.render(camera(), {}, sky_in_alpha=True).alpha.min() == 1
+    assert graph.render(camera(), {}).covered(np.ones((1, 1), np.float32)).alpha.min() == 1
 
 
 def test_splitting_by_tile_loses_nothing():

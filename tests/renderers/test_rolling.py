@@ -54,7 +54,8 @@ def scenario():
 @pytest.fixture(scope="module")
 def draw(scenario):
     def drawn(camera, actors):
-        return scene_of(scenario).render(camera, actors, 1, sky_in_alpha=True)
+        out = scene_of(scenario).render(camera, actors, 1)
+        return out.covered(np.ones((1, 1), np.float32))
 
     return drawn
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F32, Bool, Frame
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
-F32 = npt.NDArray[np.float32]
+OPAQUE = 0.5  # opacity from which a pixel shows a surface
 Background = tuple[float, float, float] | npt.NDArray[np.floating]
 
 
@@ -36,11 +37,39 @@ class RasterOutput:
     depth: F32
     stats: Mapping[str, int] = field(default_factory=dict)
 
-    def surface_depth(self) -> F32:
-        """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the
+    def on_host(self) -> RasterOutput:
+        """Return the view with arrays: itself, unless a device drew it."""
+        return self
+
+    def surface(self) -> RasterOutput:
+        """Return the view with depth only where the splats are at least half opaque; 0 where the
         background shows through.
         """
-        return cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE))
+        shown = cv2.compare(self.alpha, OPAQUE, cv2.CMP_GE)
+        return replace(self, depth=cv2.copyTo(self.depth, shown))
+
+    def covered(self, share: F32) -> RasterOutput:
+        """Return the view with an opacity of at least ``share``, ``(H, W)`` or one number."""
+        return replace(self, alpha=np.maximum(self.alpha, share))
+
+    def with_sky(self, above: Bool) -> RasterOutput:
+        """Return the view with an opaque sky without depth where no surface is shown.
+
+        Args:
+            above: ``(H, W)`` the pixels above the horizon.
+        """
+        sky = (self.alpha < OPAQUE) & above
+        alpha = np.where(sky, np.float32(1), self.alpha)
+        return replace(self, alpha=alpha, depth=np.where(sky, np.float32(0), self.depth))
+
+    def frame(self, t_us: int, camera: str) -> Frame:
+        """Return the view as a camera's frame."""
+        return Frame(t_us, camera, self.to_uint8(), self.alpha, self.depth)
+
+    def exposed(self, gain: F32) -> RasterOutput:
+        """Return the view with another exposure, a factor ``(3,)`` for the channels."""
+        shown = np.clip(self.rgb * gain, 0.0, 1.0)
+        return replace(self, rgb=np.asarray(shown, np.float32))
 
     def to_uint8(self) -> npt.NDArray[np.uint8]:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""

@@ -1,4 +1,4 @@
-"""Render on a GPU: clouds are uploaded once, a frame sends poses and brings back one image.
+"""Render on a GPU: clouds are uploaded once, a frame sends poses, and its image stays there.
 
 State of testing: the kernels are interpreted on the CPU against the reference implementation, and
 compiled for GPUs of compute capability 8.0 and 9.0; they have not been run on a GPU.
@@ -26,6 +26,7 @@ from alpasim_plugin.gaussians.constants import (
     POSE_ANTIALIAS,
     TILE,
 )
+from alpasim_plugin.gaussians.raster.device_output import DeviceOutput
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.rasterize_cpu import node_poses
 
@@ -93,42 +94,51 @@ class UploadedClouds:
         self,
         nodes: Sequence[tuple[int, npt.NDArray[np.floating] | None]],
         camera: PinholeCamera,
-        background: Background = (0.0, 0.0, 0.0),
+        background: Background | Tensor = (0.0, 0.0, 0.0),
         near_m: float = NEAR_M,
-    ) -> RasterOutput:
-        """Render clouds at rigid poses in one image.
+    ) -> DeviceOutput:
+        """Render clouds at rigid poses in one image, which stays on the device.
 
         Args:
             nodes: Position of the cloud among those uploaded, and ``T_world_node`` or None for the
                 identity. Equal depths are drawn in the order of the nodes.
             camera: From where.
-            background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
+            background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything; a tensor is
+                the device's.
             near_m: Gaussians whose centre is nearer are left out.
 
         Raises:
             InputError: A transform is not rigid or the background does not fit.
         """
-        behind = background_image(background, camera)
+        behind = background
+        if not isinstance(behind, Tensor):
+            behind = self._upload(background_image(behind, camera), np.float32)
         spans = self._spans([cloud for cloud, _ in nodes])
         poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
         poses[:, POSE_ANTIALIAS] = [self.antialias_px2[cloud] for cloud, _ in nodes]
-        while True:
-            image, pairs, visible = self._image(spans, poses, camera, near_m)
-            if pairs <= self.capacity:
-                break
-            self.capacity = pairs + pairs // 4  # the lists were cut short: draw again with room
+        capacity = self.capacity
+        image, pairs = self._image(spans, poses, camera, near_m)
         alpha = image[..., 4]
-        rgb = np.clip(image[..., :3] + (1 - alpha[..., None]) * behind, 0, 1)
-        depth = np.divide(image[..., 3], alpha, out=np.zeros_like(alpha), where=alpha > 0)
-        gaussians = sum(self.sizes[cloud] for cloud, _ in nodes)
-        stats = {"gaussians": gaussians, "visible": visible, "pairs": pairs}
-        return RasterOutput(rgb.astype(np.float32), alpha.copy(), depth, stats)
+        rgb = (image[..., :3] + (1 - alpha[..., None]) * behind).clamp(0, 1)
+        depth = torch.where(alpha > 0, image[..., 3] / alpha, 0.0)
+
+        def had_room(count: int) -> bool:
+            if count > capacity:  # the lists were cut short
+                self.capacity = max(self.capacity, count + count // 4)
+            return count <= capacity
+
+        def again() -> DeviceOutput:
+            return self.draw(nodes, camera, background, near_m)
+
+        return DeviceOutput(
+            rgb=rgb, alpha=alpha, depth=depth, pairs=pairs, had_room=had_room, again=again
+        )
 
     def _image(
         self, spans: npt.NDArray[np.int32], poses: F64, camera: PinholeCamera, near_m: float
-    ) -> tuple[npt.NDArray[np.float32], int, int]:
-        """Return colour, weighted depth and opacity ``(H, W, 5)``, the number of pairs of splat
-        and tile, and of splats seen; the image is whole if the pairs are at most `capacity`.
+    ) -> tuple[Tensor, Tensor]:
+        """Return colour, weighted depth and opacity ``(H, W, 5)``, and the number of pairs of
+        splat and tile; the image is whole if the pairs are at most `capacity`.
         """
         kernels, width, height = self.kernels, camera.width, camera.height
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
@@ -181,8 +191,7 @@ class UploadedClouds:
         sorted_tiles, place = torch.sort(tiles, stable=True)
         every = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=self.device)
         starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
-        # A row more holds the counts of pairs and of splats, so that one copy brings back all.
-        image = torch.zeros((height * width + 1, 5), dtype=torch.float32, device=self.device)
+        image = self._empty((height, width, 5), torch.float32)
         kernels.composite[(tiles_x * tiles_y,)](
             records,
             splats[place],
@@ -194,11 +203,7 @@ class UploadedClouds:
             TILE=TILE,
             CHUNK=CHUNK,
         )
-        image[-1, 0] = counts.sum(dtype=torch.int32).view(torch.float32)
-        image[-1, 1] = (counts > 0).sum(dtype=torch.int32).view(torch.float32)
-        downloaded = image.cpu().numpy()
-        pairs, visible = downloaded[-1, :2].view(np.int32).tolist()
-        return downloaded[:-1].reshape(height, width, 5), pairs, visible
+        return image, counts.sum(dtype=torch.int32)
 
     def _spans(self, clouds: Sequence[int]) -> npt.NDArray[np.int32]:
         """Return the table of blocks ``(B, 3)``: node, first Gaussian, number of Gaussians."""
@@ -238,4 +243,5 @@ def rasterize_triton(
         RendererError: Triton is not installed.
         InfrastructureError: There is no such device.
     """
-    return UploadedClouds([cloud], device).draw([(0, None)], camera, background, near_m)
+    drawn = UploadedClouds([cloud], device).draw([(0, None)], camera, background, near_m)
+    return drawn.on_host()

@@ -93,7 +93,6 @@ class LongScene(SceneGraph):
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
         device: str = "cpu",
-        sky_in_alpha: bool = False,
     ) -> RasterOutput:
         """Render one view; see `SceneGraph.render`."""
         with self._lock:
@@ -102,7 +101,7 @@ class LongScene(SceneGraph):
             if near != tuple(self._sections):
                 self._sections = {i: self._sections.get(i) or self._built(i) for i in near}
                 self.set_background([node for i in near for node in self._sections[i]])
-            return super().render(camera, actor_poses, threads, device, sky_in_alpha)
+            return super().render(camera, actor_poses, threads, device)
 
     def _built(self, section: int) -> list[SceneNode]:
         """Build a section; its nodes get names of their own."""

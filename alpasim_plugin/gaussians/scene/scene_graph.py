@@ -9,8 +9,7 @@ by id.
 
 The sky is no Gaussian: its image stands behind everything and is blended with what transparency is
 left. ``alpha`` is therefore the accumulated opacity of the scene *without* the sky (0 in the open
-sky), which is what the paper's opacity-mixed source needs; with ``sky_in_alpha`` the sky counts as
-opaque.
+sky), which is what the paper's opacity-mixed source needs.
 """
 
 from __future__ import annotations
@@ -156,7 +155,6 @@ class SceneGraph:
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
         device: str = "cpu",
-        sky_in_alpha: bool = False,
     ) -> RasterOutput:
         """Render one view.
 
@@ -165,11 +163,10 @@ class SceneGraph:
             actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
             threads: Thread count on the CPU; None leaves it as it is.
             device: Where to draw. The first frame on a GPU uploads all nodes.
-            sky_in_alpha: Count the sky as opaque.
 
         Returns:
-            Colour with sky, alpha, depth, and ``stats`` with ``visible``, ``nodes`` (drawn) and
-            ``nodes_total``.
+            Colour with sky, alpha, depth, and ``stats`` with ``visible`` (on the CPU), ``nodes``
+            (drawn) and ``nodes_total``. A GPU's is a `DeviceOutput`.
 
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
@@ -178,7 +175,6 @@ class SceneGraph:
         chosen = self._choose(
             camera if rolling is None else camera.widened(rolling.reach_px), actor_poses
         )
-        behind = self.sky.image(camera)
         if device == "cpu":
             nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
             starts = (
@@ -186,18 +182,18 @@ class SceneGraph:
                 if rolling is None
                 else [rolling.actors_start.get(node.name) for node, _, _ in chosen]
             )
+            behind = self.sky.image(camera)
             out = rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
         else:
             clouds, place = self._upload(device)
-            out = clouds.draw([(place[n.name, i], T) for n, i, T in chosen], camera, behind)
+            placed = [(place[node.name, i], T) for node, i, T in chosen]
+            out = clouds.draw(placed, camera, self.sky.on_device(camera, device))
         stats = {
             **out.stats,
             "nodes": len(chosen),
             "nodes_total": len(self.background) + len(actor_poses),
         }
-        return replace(
-            out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats
-        )
+        return replace(out, stats=stats)
 
     def _choose(
         self, camera: PinholeCamera, actor_poses: Mapping[str, F64]

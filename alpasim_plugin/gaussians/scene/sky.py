@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import wrap_angle
-from alpasim_plugin.core.types import F32
+from alpasim_plugin.core.types import F32, F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Kind = Literal["clear", "overcast", "dusk"]
 WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
 LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
 BLOCK = 16  # rows that are painted at once
+PARTS = 32  # of a pixel, between which colours are interpolated
 STEP_PX = 8  # directions are computed this often and interpolated in between
 
 # zenith, middle, horizon, what shows below the horizon where the scene has a hole, cloud, hills
@@ -59,6 +63,7 @@ class Sky:
     def __init__(self, panorama: F32) -> None:
         # One column repeated at the seam: interpolation never leaves the image.
         self._panorama = np.ascontiguousarray(np.concatenate([panorama, panorama[:, :1]], axis=1))
+        self._uploaded: dict[str, Tensor] = {}
 
     @property
     def panorama(self) -> F32:
@@ -67,6 +72,43 @@ class Sky:
 
     def image(self, camera: PinholeCamera) -> F32:
         """Return the sky behind every pixel, ``(H, W, 3)`` float32, 0..1."""
+        h, w = camera.height, camera.width
+        columns, rows = (_upsample(grid, h, w) for grid in self._places(camera))
+        # All lie within a turn of column 0: what % would give, in a tenth of its time.
+        columns += np.float32(WIDTH) * (columns < 0)
+        return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
+
+    def on_device(self, camera: PinholeCamera, device: str) -> Tensor:
+        """Return `image` as a tensor of a device, which receives the panorama once."""
+        import torch
+        import torch.nn.functional as F
+
+        if device not in self._uploaded:
+            panorama = torch.from_numpy(self._panorama.transpose(2, 0, 1).copy())
+            self._uploaded[device] = panorama.to(device)[None]
+        coarse = torch.from_numpy(np.stack(self._places(camera)).astype(np.float32)).to(device)
+        finer = F.interpolate(
+            coarse[None], scale_factor=STEP_PX, mode="bilinear", align_corners=False
+        )
+        first = STEP_PX // 2
+        window = finer[0, :, first : first + camera.height, first : first + camera.width]
+        # OpenCV interpolates at the nearest 32nd of a pixel.
+        columns, rows = (window * PARTS).round_().div_(PARTS).unbind()
+        columns = columns + WIDTH * (columns < 0)
+        places = torch.stack([columns * (2 / WIDTH) - 1, rows * (2 / (HEIGHT - 1)) - 1], dim=-1)
+        image = F.grid_sample(
+            self._uploaded[device],
+            places[None],
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=True,
+        )
+        return image[0].permute(1, 2, 0)
+
+    def _places(self, camera: PinholeCamera) -> tuple[F64, F64]:
+        """Return columns and rows of the panorama at every `STEP_PX`-th pixel corner; columns may
+        be negative.
+        """
         h, w = camera.height, camera.width
         u = np.arange(-(-w // STEP_PX) + 1) * STEP_PX
         v = np.arange(-(-h // STEP_PX) + 1) * STEP_PX
@@ -85,11 +127,8 @@ class Sky:
         forward = camera.T_camera_world[2, :3]
         ahead = np.arctan2(forward[1], forward[0])
         azimuth = ahead + wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
-        columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w)
-        # All lie within a turn of column 0: what % would give, in a tenth of its time.
-        columns += np.float32(WIDTH) * (columns < 0)
-        rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
-        return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
+        rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
+        return azimuth * (WIDTH / (2 * np.pi)), rows
 
 
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:

@@ -140,8 +140,9 @@ class ImageFixer(MaplessFixer):
             for b, past in enumerate(pasts):
                 (i,), raw = view.index[b], view.rgb[b, 0]
                 before = None if past is None else (past.fixed, past.raw)
-                measured = guard.measures(video[b].transpose(0, 1)).cpu().numpy()
-                event = guard.check_frames(measured, images[b : b + 1], raw[None], before)[0]
+                event = guard.check_frames(
+                    video[b].transpose(0, 1), images[b : b + 1], raw[None], before
+                )[0]
                 out[i] = (
                     replace(block[i], events=(*block[i].events, event))
                     if event

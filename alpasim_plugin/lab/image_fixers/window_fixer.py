@@ -142,8 +142,7 @@ class WindowFixer(MaplessFixer):
             video = self._run(view)
             images = to_images(video, view.size)
             for b, mine in enumerate(view.index):
-                measured = guard.measures(video[b].transpose(0, 1)).cpu().numpy()
-                events = guard.check_frames(measured, images[b], view.rgb[b], None)
+                events = guard.check_frames(video[b].transpose(0, 1), images[b], view.rgb[b], None)
                 for t, event in enumerate(events):
                     i = mine[t]
                     out[i] = (

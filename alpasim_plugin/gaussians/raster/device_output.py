@@ -1,0 +1,95 @@
+"""A view that a device drew: its planes stay there until they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.devices import download
+from alpasim_plugin.core.types import F32, Bool, Frame
+from alpasim_plugin.gaussians.raster.output import OPAQUE, RasterOutput
+
+PLANES = ("rgb", "alpha", "depth")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeviceOutput(RasterOutput):
+    """One rendered view, its planes as tensors.
+
+    Attributes:
+        pairs: ``()`` int32, pairs of splat and tile; the planes are whole if the device had room
+            for them.
+        had_room: Whether there was room for a number of pairs; makes room for the next frame.
+        again: Draws the view once more.
+    """
+
+    rgb: Any
+    alpha: Any
+    depth: Any
+    pairs: Tensor
+    had_room: Callable[[int], bool]
+    again: Callable[[], DeviceOutput]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.alpha.shape[0], self.alpha.shape[1]
+
+    @cached_property
+    def arrays(self) -> Mapping[str, Any]:
+        """All planes by name, brought to the host in one copy when they are first read; a view
+        that lacks splats is drawn again.
+        """
+        *planes, pairs = download(self.rgb, self.alpha, self.depth, self.pairs)
+        if not self.had_room(int(pairs)):
+            return self.again().arrays
+        return dict(zip(PLANES, planes, strict=True))
+
+    def on_host(self) -> RasterOutput:
+        """Return the view with arrays."""
+        return RasterOutput(**self.arrays, stats=self.stats)
+
+    def surface(self) -> DeviceOutput:
+        """See `RasterOutput.surface`."""
+        return self.changed(lambda out: {"depth": out.depth * (out.alpha >= OPAQUE)})
+
+    def covered(self, share: F32) -> DeviceOutput:
+        """See `RasterOutput.covered`."""
+        cover = self._upload(share)
+        return self.changed(lambda out: {"alpha": torch.maximum(out.alpha, cover)})
+
+    def with_sky(self, above: Bool) -> DeviceOutput:
+        """See `RasterOutput.with_sky`."""
+        high = self._upload(above)
+
+        def change(out: DeviceOutput) -> Mapping[str, Tensor]:
+            sky = (out.alpha < OPAQUE) & high
+            return {
+                "alpha": out.alpha.masked_fill(sky, 1.0),
+                "depth": out.depth.masked_fill(sky, 0.0),
+            }
+
+        return self.changed(change)
+
+    def exposed(self, gain: F32) -> DeviceOutput:
+        """See `RasterOutput.exposed`."""
+        factor = self._upload(gain.astype(np.float32))
+        return self.changed(lambda out: {"rgb": (out.rgb * factor).clamp(0, 1)})
+
+    def frame(self, t_us: int, camera: str) -> Frame:
+        """Return the view as a camera's frame, whose planes stay on the device."""
+        shown = self.changed(lambda out: {"rgb": (out.rgb * 255 + 0.5).to(torch.uint8)})
+        return Frame(t_us, camera, on_device=shown)
+
+    def changed(self, change: Callable[[DeviceOutput], Mapping[str, Tensor]]) -> DeviceOutput:
+        """Return the view with other planes, which it also has when it is drawn again."""
+        return replace(self, **change(self), again=lambda: self.again().changed(change))
+
+    def _upload(self, array: Any) -> Tensor:
+        return torch.from_numpy(np.asarray(array, order="C")).to(self.alpha.device)
