@@ -12,11 +12,12 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.limits import ROAD_M
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import Road, build_road
-from scenarios.budget import check_specification
+from scenarios.budget import ACTORS
 from scenarios.ego_path import EgoPath, LaneChange, LateralShift, make_ego_path
 from scenarios.recorded import RecordedLog
 from scenarios.schema import ScenarioSpec
@@ -52,7 +53,10 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     """
     spec = drawn.spec
     assert spec.road is not None
-    check_specification(drawn)
+    written_m = sum(getattr(segment, "length_m", 0.0) for segment in spec.road.segments)
+    ROAD_M.check(written_m, drawn.document.mark(("road", "segments")))
+    n_actors = sum(getattr(actor, "count", 1) for actor in spec.actors)
+    ACTORS.check(n_actors, drawn.document.mark(("actors",)))
     with drawn.at("road", "segments"):
         road = build_road(
             elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg))

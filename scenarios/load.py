@@ -81,9 +81,9 @@ def load_scenario(
         drive = built_drive(drawn, _vehicle(default))
     elif drawn.spec.map is not None:
         drive = map_drive(drawn, _vehicle(default))
-        check_record(drive, drawn.document.path)
     else:
         drive = recorded_drive(drawn, source)
+    check_record(drive, drawn.document.path)
     scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))
     if cameras is not None:
         check_mounts(drawn, cameras, scenario.vehicle)

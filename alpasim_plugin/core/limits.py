@@ -143,7 +143,6 @@ LATERAL_OFFSET_M = Bound(
     "distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road"
 )
 BODY_M = Bound("side of a body", "m", 0.01, 200, "trains and buildings beside the road included")
-SIGN_M = Bound("side of a sign", "m", 0, 100, "gantries across a road")
 VEHICLE_M = Bound("side of the ego", "m", 0.3, 30, "from a wheelbarrow to a road train")
 AXLE_M = Bound("axle distance", "m", -30, 30, "axles lie inside the body")
 OFFSET_M = Bound("offset beside a lane", "m", -100, 100, "farther aside is no lane any more")
@@ -175,9 +174,6 @@ TIME_US = Bound(
     "ten minutes: the expert drives the whole scene when it is loaded",
 )
 LOG_S = Bound("length of a recording", "s", 0, 7200, "recorded drives are minutes long")
-EPOCH_US = Bound(
-    "time stamp", "us", -(2**62), 2**62, "microseconds that int64 holds with room for sums"
-)
 MOMENT_S = Bound("moment", "s", -86_400, 86_400, "a day before or after the log's start")
 PERIOD_US = Bound("period", "us", 1_000, 10_000_000, "1 ms to 10 s")
 SHUTTER_US = Bound("exposure", "us", 0, 1_000_000, "a second")

@@ -3,8 +3,7 @@ Read by their published layout, without COLMAP.
 
 The poses of ``images`` map the world to the camera, ``wxyz`` and a shift; pixels are counted from
 the corner of the first one. A frame (COLMAP 3.12) holds the images that the cameras of a rig took
-at one time; its pose maps the world to the rig, which is its reference camera, and the rig's poses
-lead from there to each camera. The unit is arbitrary.
+at one time. The unit is arbitrary.
 """
 
 from __future__ import annotations
@@ -12,12 +11,13 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se3
@@ -31,21 +31,16 @@ from alpasim_plugin.gaussians.fit.photographs import Picture
 
 DO_THIS = "give a whole model: cameras, images and points3D, all .txt or all .bin"
 PLACES = ("", "sparse", "colmap/sparse")  # of models below a folder, or of folders of models
-PICTURES = (
-    "images",
-    "",
-    "../images",
-    "../../images",
-)  # of the pictures, from the folder and from the model
-CAMERA = 0
-SENSORS = {"CAMERA": CAMERA, "IMU": 1}  # kinds of a sensor: names in text, numbers in binary files
-POSE = "d" * 7
+# Where images lie, from the folder and from the model.
+PICTURES = ("images", "", "../images", "../../images")
+CAMERA = 0  # the kind of a sensor that takes images
 T = TypeVar("T")
 SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
-# Numbers of lens models in a binary file; those without a name in `PARAMETERS` are refused.
+# Lens models in the order of their numbers; those without a count in `PARAMETERS` are refused.
 _NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
     SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"""
-MODELS = dict(enumerate(_NAMES.split()))
+MODELS = _NAMES.split()
+NUMBERS = {"CAMERA": CAMERA, "IMU": 1, **{name: i for i, name in enumerate(MODELS)}}
 PARAMETERS = {  # focal lengths and middle, then OpenCV's coefficients
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -65,34 +60,13 @@ class _Image:
     number: int
     name: str
     camera: int
-    T_camera_world: F64
-
-
-@dataclass(frozen=True)
-class _Rig:
-    """The cameras that are mounted together, the reference first, and their ``T_camera_rig``; None
-    where the file has no pose.
-    """
-
-    number: int
-    cameras: dict[int, F64 | None]
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What the cameras of a rig took at one time: images by camera."""
-
-    rig: int
-    T_rig_world: F64
-    images: dict[int, int]
+    T_world_camera: F64
 
 
 def models_in(folder: Path) -> list[Path]:
     """Return the folders in or below a folder that hold models, in natural order."""
     tops = [folder / place for place in PLACES]
-    below = [
-        one for top in tops if os.path.isdir(top) for one in top.iterdir() if os.path.isdir(one)
-    ]
+    below = [one for top in tops if os.path.isdir(top) for one in top.iterdir()]
     found = {real(one): one for one in (*tops, *below) if _ending(one) is not None}
     return sorted(found.values(), key=lambda one: natural_order(one.as_posix()))
 
@@ -102,8 +76,8 @@ def _ending(model: Path) -> str | None:
 
 
 def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
-    """Read a model. Pictures in folders of their own are cameras of their own; they are taken in
-    the natural order of their names.
+    """Read a model. Images in folders of their own are cameras of their own; they are taken in the
+    natural order of their names.
 
     Args:
         folder: Holds models, here or in ``sparse``; the one with most images is read.
@@ -111,11 +85,9 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
 
     Raises:
         InputError: A file is missing, damaged or of a lens that OpenCV does not have; or there are
-            no pictures.
+            no images.
     """
-    models = [(model, _images_of(model)) for model in models_in(folder)]
-    if not models:
-        raise InputError(f"{folder}: no cameras.bin or cameras.txt", DO_THIS)
+    models = [(model, _records(model, "images", _image)) for model in models_in(folder)]
     model, images = max(models, key=lambda one: len(one[1]))
     notes = []
     if len(models) > 1:
@@ -124,59 +96,43 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
             f"{len(models)} models, of which the one with most images is read: {model.relative_to(folder)} ({sizes} images)"
         )
     images.sort(key=lambda one: natural_order(one.name))
-    times_us, front_camera, more = _rig_times(model, images)
-    images = [one for one in images if not times_us or one.number in times_us]
-    notes += more
-    binary = _ending(model) == ".bin"
-    data = {name: _data(model, name) for name in ("cameras", "points3D")}
-    with parsing(model, DO_THIS, "a damaged model"):
-        cameras = dict(_cameras_bin(data["cameras"]) if binary else _cameras_txt(data["cameras"]))
-        xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
+    times_us, reference, rig_notes = _rig_times(model, images)
+    if times_us:
+        images = [one for one in images if one.number in times_us]
+    lenses = dict(_records(model, "cameras", _camera))
+    table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
-    unknown = sorted({one.camera for one in images} - set(cameras))
-    if unknown:
-        raise InputError(f"{model}: images of camera {unknown[0]}, which it does not have", DO_THIS)
-    root = _pictures_root(folder, model, images[0].name, photographs)
-    folders = {_camera(one.name) for one in images}
+    root = _images_root(folder, model, images[0].name, photographs)
+    folders = {_folder(one.name) for one in images}
     shared = times_us and len(folders) < len({one.camera for one in images})
-    names_of = {
-        one.number: f"camera-{one.camera}" if shared else _camera(one.name) for one in images
-    }
-    shots = [
-        Picture(
-            root / one.name,
-            cameras[one.camera],
-            inverse(one.T_camera_world),
-            f"{model}, image {one.name}",
-            times_us.get(one.number),
-            names_of[one.number],
-            {},
-        )
-        for one in images
-    ]
-    names = sorted({str(shot.camera) for shot in shots})
-    every = (
-        sorted(shots, key=lambda one: (str(one.camera), int(one.t_us or 0)))
-        if times_us
-        else timed([[one for one in shots if one.camera == name] for name in names])
-    )
-    reference = next((names_of[one.number] for one in images if one.camera == front_camera), None)
-    front = next((name for name in names if "front" in name), reference or names[0])
-    centres = np.array([shot.T_world_camera[:3, 3] for shot in every])
-    near = (
-        np.linalg.norm(xyz[:, None] - centres[None, :: max(1, len(centres) // 32)], axis=2).min(
-            axis=1
-        )
-        if len(xyz)
-        else np.zeros(0)
-    )
-    points = Points(xyz, rgb, np.eye(3) * ((SPREAD * near) ** 2)[:, None, None])
+    shots: dict[str, list[Picture]] = {}
+    front = ""
+    for one in images:
+        if one.camera not in lenses:
+            raise InputError(f"{model}: images of camera {one.camera}, which it lacks", DO_THIS)
+        name = f"camera-{one.camera}" if shared else _folder(one.name)
+        where = f"{model}, image {one.name}"
+        time_us, lens = times_us.get(one.number), lenses[one.camera]
+        shot = Picture(root / one.name, lens, one.T_world_camera, where, time_us, name, {})
+        shots.setdefault(name, []).append(shot)
+        if one.camera == reference:
+            front = front or name
+    names = sorted(shots)
+    front = next((name for name in names if "front" in name), front or names[0])
+    cameras = [shots[name] for name in names]
+    pictures = [one for camera in cameras for one in camera] if times_us else timed(cameras)
+    centres = np.array([one.T_world_camera[:3, 3] for one in pictures])
+    some = centres[:: max(1, len(centres) // 32)]
+    near = scipy.spatial.KDTree(some).query(table[:, :3])[0]
+    spread = np.eye(3) * ((SPREAD * near) ** 2)[:, None, None]
+    points = Points(table[:, :3], table[:, 3:] / 255.0, spread)
+    notes += rig_notes
     notes.append(
         f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
     )
     return SourceDrive(
-        "colmap", real(folder).name, tuple(every), front, points=points, notes=tuple(notes)
+        "colmap", real(folder).name, tuple(pictures), front, points=points, notes=tuple(notes)
     )
 
 
@@ -187,38 +143,24 @@ def _rig_times(
     reference camera and notes; nothing where there is no such rig.
 
     Frames are in the natural order of the names of the reference camera's images.
-
-    Raises:
-        InputError: An image does not stand where its frame and its rig say.
     """
-    rigs = {rig.number: rig for rig in _records(model, "rigs", _rig) if len(rig.cameras) > 1}
-    frames = [frame for frame in _records(model, "frames", _frame) if frame.rig in rigs]
+    rigs = {number: found for number, found in _records(model, "rigs", _rig) if len(found) > 1}
+    frames = [(rig, taken) for rig, taken in _records(model, "frames", _frame) if rig in rigs]
     if not frames:
         return {}, None, []
-    by_number = {one.number: one for one in images}
-    for frame in frames:
-        for camera, number in frame.images.items():
-            mount, image = rigs[frame.rig].cameras.get(camera), by_number.get(number)
-            if mount is None or image is None:
-                continue
-            stated = mount @ frame.T_rig_world
-            if not np.allclose(image.T_camera_world, stated, rtol=1e-3, atol=1e-3):
-                raise InputError(
-                    f"{model}, image {image.name}: it does not stand where its frame and its rig say",
-                    "write the model again with COLMAP, which moves images, frames and rigs together",
-                )
-    counts = Counter(frame.rig for frame in frames)
-    rig = max(sorted(counts), key=lambda number: counts[number])
-    reference = next(iter(rigs[rig].cameras))
+    counts = Counter(rig for rig, _ in frames)
+    largest = max(sorted(counts), key=lambda number: counts[number])
+    reference = rigs[largest][0]
+    names = {one.number: one.name for one in images}
     ordered = sorted(
-        (natural_order(by_number[frame.images[reference]].name), list(frame.images.values()))
-        for frame in frames
-        if frame.rig == rig and frame.images.get(reference) in by_number
+        (natural_order(names[taken[reference]]), list(taken.values()))
+        for rig, taken in frames
+        if rig == largest and taken.get(reference) in names
     )
     times_us = {
         number: rank * PERIOD_US for rank, (_, taken) in enumerate(ordered) for number in taken
     }
-    notes = [f"a rig of {len(rigs[rig].cameras)} cameras: the images of a frame have one time"]
+    notes = [f"a rig of {len(rigs[largest])} cameras: the images of a frame have one time"]
     left_out = sum(one.number not in times_us for one in images)
     if left_out:
         notes.append(
@@ -227,54 +169,12 @@ def _rig_times(
     return times_us, reference, notes
 
 
-def _records(model: Path, name: str, record: Callable[[_Reader | _Words], T]) -> list[T]:
-    """Return what stands in a file that a model may lack."""
-    if not os.path.isfile(model / f"{name}{_ending(model)}"):
-        return []
-    data = _data(model, name)
-    with parsing(model / f"{name}{_ending(model)}", DO_THIS, "a damaged model"):
-        if _ending(model) == ".txt":
-            return [record(_Words(words)) for words in _rows(data)]
-        reader = _Reader(data)
-        return [record(reader) for _ in range(int(reader.take("Q")[0]))]
-
-
-def _rig(reader: _Reader | _Words) -> _Rig:
-    number, count = reader.take("II")
-    cameras: dict[int, F64 | None] = {}
-    for i in range(int(count)):
-        kind, sensor = reader.take("iI")
-        mount: F64 | None = np.eye(4)
-        if i > 0:
-            mount = _pose(reader.take(POSE)) if reader.take("B")[0] else None
-        if kind == CAMERA:
-            cameras[int(sensor)] = mount
-    return _Rig(int(number), cameras)
-
-
-def _frame(reader: _Reader | _Words) -> _Frame:
-    _, rig, *pose, count = reader.take(f"II{POSE}I")
-    taken = [reader.take("iIQ") for _ in range(int(count))]
-    images = {int(sensor): int(image) for kind, sensor, image in taken if kind == CAMERA}
-    return _Frame(int(rig), _pose(pose), images)
-
-
-def _data(model: Path, name: str) -> bytes:
-    return read_bytes(model / f"{name}{_ending(model)}", SOURCE_BYTES, DO_THIS)
-
-
-def _images_of(model: Path) -> list[_Image]:
-    data = _data(model, "images")
-    with parsing(model, DO_THIS, "a damaged model"):
-        return list(_images_bin(data) if _ending(model) == ".bin" else _images_txt(data))
-
-
-def _camera(name: str) -> str:
+def _folder(name: str) -> str:
     folder = Path(name).parent.as_posix()
     return "front" if folder == "." else folder.replace("/", "-")
 
 
-def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
+def _images_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     for base in (folder, model):
         for place in PICTURES:
             if os.path.isfile(base / place / name):
@@ -282,95 +182,47 @@ def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     if not needed:
         return folder / PICTURES[0]
     raise InputError(
-        f"{folder}: no picture {name}",
-        "put the pictures into a folder 'images' beside the model",
+        f"{folder}: no image {name}", "put the images into a folder 'images' beside the model"
     )
 
 
-def _lens(name: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    if name not in PARAMETERS:
-        raise InputError(
-            f"camera model {name}: a lens that is not read, only {', '.join(PARAMETERS)}",
-            "undistort the images (colmap image_undistorter)",
-        )
-    if len(p) != PARAMETERS[name]:
-        raise ValueError(f"{len(p)} parameters of a {name}, which has {PARAMETERS[name]}")
-    fisheye = "FISHEYE" in name
-    if name in ONE_FOCAL:
-        p = (p[0], *p)
-    K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
-    bend = np.array([*p[4:], *[0.0] * 4])[: max(4, len(p) - 4)]
-    if fisheye:
-        bend = np.array([*p[4:], *[0.0] * 4])[:4]
-    return Lens(width, height, K, bend, "fisheye" if fisheye else "opencv").check(
-        f"a {name} camera", DO_THIS
-    )
+def _records(model: Path, name: str, record: Callable[[_Binary | _Words], T]) -> list[T]:
+    """Return the records of a file of a model; of ``rigs`` and ``frames``, which a model may lack,
+    none.
+    """
+    path = model / f"{name}{_ending(model)}"
+    if name in ("rigs", "frames") and not os.path.isfile(path):
+        return []
+    data = read_bytes(path, SOURCE_BYTES, DO_THIS)
+    with parsing(path, DO_THIS, "a damaged model"):
+        if path.suffix == ".txt":
+            lines = data.decode("utf-8-sig").splitlines()
+            lines = [line for line in lines if line.strip() and not line.startswith("#")]
+            if name == "images":  # below each stands a line of its points, unless they are left out
+                lines = [line for line in lines if not _are_points(line.split())]
+            most = 9 if name == "images" else -1  # a name may have spaces
+            return [record(_Words(line.split(maxsplit=most))) for line in lines]
+        reader = _Binary(data)
+        return [record(reader) for _ in range(reader.take("Q")[0])]
 
 
-def _rows(data: bytes) -> Iterator[list[str]]:
-    for line in data.decode("utf-8-sig").splitlines():
-        if line.strip() and not line.startswith("#"):
-            yield line.split()
-
-
-def _cameras_txt(data: bytes) -> Iterator[tuple[int, Lens]]:
-    for number, name, width, height, *p in _rows(data):
-        yield int(number), _lens(name, int(width), int(height), tuple(float(w) for w in p))
-
-
-def _images_txt(data: bytes) -> Iterator[_Image]:
-    """Yield the images. Below each stands a line of points, which may be empty or left out."""
-    for line in data.decode("utf-8-sig").splitlines():
-        words = line.split()
-        if line.startswith("#") or (len(words) % 3 == 0 and all(map(_is_number, words))):
-            continue
-        if len(words) < 10:
-            raise ValueError(f"a line that is neither an image nor its points: {line[:60]!r}")
-        name = line.split(maxsplit=9)[9].strip()
-        yield _image(int(words[0]), int(words[8]), name, [float(w) for w in words[1:8]])
-
-
-def _is_number(word: str) -> bool:
+def _are_points(words: Sequence[str]) -> bool:
     try:
-        float(word)
+        return len(words) % 3 == 0 and np.array(words, dtype=np.float64).size > 0
     except ValueError:
         return False
-    return True
 
 
-def _image(number: int, camera: int, name: str, pose: Sequence[float]) -> _Image:
-    with parsing(f"image {name}", "give unit quaternions and finite shifts", "its pose"):
-        return _Image(number, name, camera, _pose(pose))
-
-
-def _pose(pose: Sequence[float]) -> F64:
-    quat = np.array(pose[:4])
-    length = np.linalg.norm(quat)
-    if not np.isfinite(pose).all() or abs(length - 1) > 1e-2:
-        raise ValueError("not finite or no rotation")
-    return se3(pose[4:], quat / length)
-
-
-def _points_txt(data: bytes) -> tuple[F64, F64]:
-    table = np.array([[float(w) for w in words[1:7]] for words in _rows(data)]).reshape(-1, 6)
-    return table[:, :3], table[:, 3:] / 255.0
-
-
-class _Reader:
+class _Binary:
     """Take values off binary data, one after the other."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
 
-    def take(self, form: str) -> tuple[float, ...]:
+    def take(self, form: str) -> tuple[Any, ...]:
         values = struct.unpack_from("<" + form, self.data, self.at)
         self.at += struct.calcsize("<" + form)
         return values
-
-    def skip(self, count: int) -> None:
-        if count < 0 or self.at + count > len(self.data):
-            raise ValueError(f"it ends {self.at + count - len(self.data)} bytes too early")
-        self.at += count
 
     def name(self) -> str:
         end = self.data.index(b"\0", self.at)
@@ -378,44 +230,83 @@ class _Reader:
         self.at = end + 1
         return text
 
+    def skip(self, size: int) -> None:
+        """Skip a list of things of a size, which begins with their number."""
+        count = self.take("Q")[0]
+        self.at += size * count
+        if self.at > len(self.data):
+            raise ValueError("it ends too early")
+
 
 class _Words:
-    """Take values off the words of a line, as `_Reader` does off binary data."""
+    """Take values off the words of a line, as `_Binary` does off binary data."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        self.words, self.at = words, 0
+        self.words = iter(words)
 
-    def take(self, form: str) -> tuple[float, ...]:
-        words = self.words[self.at : self.at + len(form)]
-        if len(words) < len(form):
-            raise ValueError(f"a line that ends too early: {' '.join(self.words)[:60]!r}")
-        self.at += len(form)
-        return tuple(float(SENSORS.get(word, word)) for word in words)
+    def take(self, form: str) -> tuple[Any, ...]:
+        words = [next(self.words, "") for _ in form]
+        pairs = zip(form, words, strict=True)
+        return tuple(float(w) if kind == "d" else int(NUMBERS.get(w, w)) for kind, w in pairs)
 
+    def name(self) -> str:
+        return next(self.words).strip()
 
-def _cameras_bin(data: bytes) -> Iterator[tuple[int, Lens]]:
-    reader = _Reader(data)
-    for _ in range(int(reader.take("Q")[0])):
-        number, model, width, height = (int(v) for v in reader.take("iiQQ"))
-        name = MODELS.get(model, f"number {model}")
-        yield number, _lens(name, width, height, reader.take("d" * PARAMETERS.get(name, 0)))
+    def skip(self, size: int) -> None:
+        """Leave the rest of the line."""
 
 
-def _images_bin(data: bytes) -> Iterator[_Image]:
-    reader = _Reader(data)
-    for _ in range(int(reader.take("Q")[0])):
-        values = reader.take("i7di")
-        name = reader.name()
-        reader.skip(24 * int(reader.take("Q")[0]))
-        yield _image(int(values[0]), int(values[8]), name, values[1:8])
+def _camera(reader: _Binary | _Words) -> tuple[int, Lens]:
+    number, model, width, height = reader.take("iiQQ")
+    name = MODELS[model] if model < len(MODELS) else f"number {model}"
+    if name not in PARAMETERS:
+        raise InputError(
+            f"camera model {name}: a lens that is not read, only {', '.join(PARAMETERS)}",
+            "undistort the images (colmap image_undistorter)",
+        )
+    p = reader.take("d" * PARAMETERS[name])
+    if name in ONE_FOCAL:
+        p = (p[0], *p)
+    K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
+    fisheye = "FISHEYE" in name
+    bend = np.zeros(4 if fisheye else max(4, len(p) - 4))
+    bend[: len(p) - 4] = p[4:]
+    lens = Lens(width, height, K, bend, "fisheye" if fisheye else "opencv")
+    return number, lens.check(f"a {name} camera", DO_THIS)
 
 
-def _points_bin(data: bytes) -> tuple[F64, F64]:
-    reader = _Reader(data)
-    rows = []
-    for _ in range(int(reader.take("Q")[0])):
-        values = reader.take("Q3d3BdQ")
-        rows.append(values[1:7])
-        reader.skip(8 * int(values[8]))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return table[:, :3], table[:, 3:] / 255.0
+def _image(reader: _Binary | _Words) -> _Image:
+    number, *pose, camera = reader.take("idddddddi")
+    name = reader.name()
+    reader.skip(24)  # points: x, y and a number
+    length = np.linalg.norm(pose[:4])
+    if not np.isfinite(pose).all() or abs(length - 1) > 1e-2:
+        raise InputError(
+            f"image {name}: its pose is not finite or no rotation",
+            "give unit quaternions and finite shifts",
+        )
+    return _Image(number, name, camera, inverse(se3(pose[4:], pose[:4] / length)))
+
+
+def _point(reader: _Binary | _Words) -> tuple[float, ...]:
+    values = reader.take("QdddBBBd")
+    reader.skip(8)  # the images that show it
+    return values[1:7]
+
+
+def _rig(reader: _Binary | _Words) -> tuple[int, list[int]]:
+    """Return a rig's number and its cameras, the reference first."""
+    number, count = reader.take("II")
+    sensors = []
+    for i in range(count):
+        sensors.append(reader.take("iI"))
+        if i > 0 and reader.take("B")[0]:
+            reader.take("ddddddd")  # its pose on the rig
+    return number, [sensor for kind, sensor in sensors if kind == CAMERA]
+
+
+def _frame(reader: _Binary | _Words) -> tuple[int, dict[int, int]]:
+    """Return a frame's rig, and its images by camera."""
+    _, rig, *_, count = reader.take("IIdddddddI")
+    taken = [reader.take("iIQ") for _ in range(count)]
+    return rig, {sensor: image for kind, sensor, image in taken if kind == CAMERA}
