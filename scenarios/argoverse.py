@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     centre_line,
     matrix_from_quat,
@@ -110,11 +111,10 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
     layers = ("lane_segments", "drivable_areas", "pedestrian_crossings")
     raw_lanes, raw_areas, raw_crossings = (_layer(files, path, document, key) for key in layers)
     if not raw_lanes:
-        raise files.fail(path, "a map without lanes", "use a log whose map has lane_segments")
+        raise InputError(f"{path}: a map without lanes", "use a log whose map has lane_segments")
     if not raw_areas:
-        raise files.fail(
-            path,
-            "a map without drivable areas, so without road edges",
+        raise InputError(
+            f"{path}: a map without drivable areas, so without road edges",
             "use a log whose map has drivable_areas",
         )
     strange: Counter[str] = Counter()
@@ -127,8 +127,8 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         )
         kind = KINDS.get(str(raw.get("lane_type")))
         if kind is None:
-            raise files.fail(
-                where, f"lane type {raw.get('lane_type')!r}", f"use one of {', '.join(KINDS)}"
+            raise InputError(
+                f"{where}: lane type {raw.get('lane_type')!r}", f"use one of {', '.join(KINDS)}"
             )
         marks = [str(raw.get(f"{side}_lane_mark_type")) for side in ("left", "right")]
         strange.update(mark for mark in marks if mark not in PAINTS)
@@ -192,13 +192,13 @@ def read_ground(
         scale, shift = float(sim2["s"]), np.asarray(sim2["t"], dtype=np.float64)
         rotation = np.asarray(sim2["R"], dtype=np.float64).reshape(2, 2)
     except (KeyError, TypeError, ValueError) as error:
-        raise files.fail(
-            transform_path, f"no Sim2 transform: {error}", "give the keys R, t and s"
+        raise InputError(
+            f"{transform_path}: no Sim2 transform: {error}", "give the keys R, t and s"
         ) from error
     if raster.ndim != 2 or raster.dtype.kind != "f" or shift.shape != (2,) or scale <= 0:
         found = f"raster {raster.dtype} {raster.shape}, scale {scale}"
-        raise files.fail(
-            raster_path, found, "give a 2-D floating-point raster with a positive scale"
+        raise InputError(
+            f"{raster_path}: {found}", "give a 2-D floating-point raster with a positive scale"
         )
     heights, rows, columns = _block_means(raster.astype(np.float64), RASTER_BLOCK)
     # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer
@@ -235,8 +235,8 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
 def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> JsonObject:
     layer = document.get(key) if isinstance(document, dict) else None
     if not isinstance(layer, dict) or not all(isinstance(v, dict) for v in layer.values()):
-        raise files.fail(
-            path, f"no object {key!r}", "use a log_map_archive file of the Argoverse 2 sensor set"
+        raise InputError(
+            f"{path}: no object {key!r}", "use a log_map_archive file of the Argoverse 2 sensor set"
         )
     return layer
 
@@ -250,12 +250,13 @@ def _line(
             -1, 3
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise files.fail(
-            where, f"no usable {key}: {error!r}", "give a list of points with x, y and z"
+        raise InputError(
+            f"{where}: no usable {key}: {error!r}", "give a list of points with x, y and z"
         ) from error
     if len(points) < least or not np.isfinite(points).all():
-        raise files.fail(
-            where, f"{key} with {len(points)} finite points", f"give at least {least} finite points"
+        raise InputError(
+            f"{where}: {key} with {len(points)} finite points",
+            f"give at least {least} finite points",
         )
     return files.near(where, points - origin)
 
@@ -355,7 +356,7 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS})
     t_ns = table["timestamp_ns"].astype(np.int64)
     xyz, quat = _columns(table, POSE[4:]), _columns(table, POSE[:4])
-    checked = checked_trajectory(files, path, t_ns, xyz, quat, least=2)
+    checked = checked_trajectory(path, t_ns, xyz, quat, least=2)
     return EgoPoses(checked.t_us, checked.xyz, checked.quat)
 
 
@@ -369,7 +370,7 @@ def _rig_log(
     keep = np.concatenate([[True], np.diff(t_us) > 0])
     up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
     xyz = files.near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
-    return checked_trajectory(files, path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int(
+    return checked_trajectory(path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int(
         (~keep).sum()
     )
 
@@ -399,13 +400,12 @@ def read_actors(
     lost = poses.t_ns[row] != t_ns
     if lost.any():
         found = f"a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time"
-        raise files.fail(path, found, "use annotations and poses of the same log")
+        raise InputError(f"{path}: {found}", "use annotations and poses of the same log")
     boxes = se3(_columns(table, POSE[4:]), _columns(table, POSE[:4]))
     bad = ~np.isfinite(boxes).all(axis=(1, 2))
     if bad.any():
-        raise files.fail(
-            path,
-            f"a cuboid pose that is not finite in row {int(np.argmax(bad))}",
+        raise InputError(
+            f"{path}: a cuboid pose that is not finite in row {int(np.argmax(bad))}",
             "repair or drop this row",
         )
     T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
@@ -420,15 +420,14 @@ def read_actors(
         where = f"{path}, track {name}"
         norm = np.linalg.norm(_columns(table, POSE[:4])[mine], axis=1)
         if (np.abs(norm - 1) > 1e-2).any():
-            raise files.fail(
-                where,
-                f"a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}",
+            raise InputError(
+                f"{where}: a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}",
                 "give unit quaternions",
             )
         length, width, height = np.median(size[mine], axis=0).tolist()
         if not (min(length, width, height) > 0 and np.isfinite([length, width, height]).all()):
-            raise files.fail(
-                where, f"a size of {length} x {width} x {height} m", "give positive sizes"
+            raise InputError(
+                f"{where}: a size of {length} x {width} x {height} m", "give positive sizes"
             )
         changed += bool((np.ptp(size[mine], axis=0) > 0.01).any())
         kind = str(category[mine[0]])
@@ -436,7 +435,6 @@ def read_actors(
             unknown[kind] += 1
         poses_of = T_local_box[mine]
         track = checked_trajectory(
-            files,
             where,
             t_ns[mine] // 1000,
             poses_of[:, :3, 3].copy(),
@@ -487,8 +485,8 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     cameras: list[CameraSpec] = []
     for i, name in enumerate(inner["sensor_name"].astype(str)):
         if name not in mounts:
-            raise files.fail(
-                outer_path, f"no pose of camera {name!r}", "use calibration files of the same log"
+            raise InputError(
+                f"{outer_path}: no pose of camera {name!r}", "use calibration files of the same log"
             )
         fx, fy, cx, cy = (float(inner[k][i]) for k in ("fx_px", "fy_px", "cx_px", "cy_px"))
         T_rig_camera = mounts[name].copy()

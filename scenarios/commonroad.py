@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.limits import STEP, TIME_STEP_S
 from alpasim_plugin.core.types import (
@@ -72,7 +73,7 @@ class Obstacle:
         t_us = np.round(self.steps * (dt_s * 1e6)).astype(np.int64)
         xyz = self.centre + np.array([0.0, 0.0, self.box.height_m / 2])
         return checked_trajectory(
-            files, f"{path}, obstacle {self.obstacle_id}", t_us, xyz, quat_from_yaw(self.yaw)
+            f"{path}, obstacle {self.obstacle_id}", t_us, xyz, quat_from_yaw(self.yaw)
         )
 
 
@@ -108,7 +109,7 @@ def read_obstacles(
             continue
         shape = element.find("shape")
         if shape is None or len(shape) == 0:
-            raise files.fail(where, "no shape", "give a rectangle, circle or polygon")
+            raise InputError(f"{where}: no shape", "give a rectangle, circle or polygon")
         size, offset, turn = _bounding_box(files, where, shape)
         label = LABELS.get(str(element.findtext("type")), "other")
         yaw = np.array(
@@ -133,8 +134,8 @@ def read_obstacles(
         )
     ids = Counter(o.obstacle_id for o in obstacles)
     if ids and max(ids.values()) > 1:
-        raise files.fail(
-            path, f"obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id"
+        raise InputError(
+            f"{path}: obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id"
         )
     notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
     notes += [
@@ -175,14 +176,14 @@ def _bounding_box(
             turned = half @ np.array([[c, s], [-s, c]])
             clouds.append(np.concatenate([turned, -turned]) + np.array(centre))
         else:
-            raise files.fail(where, f"shape {part.tag!r}", "give a rectangle, circle or polygon")
+            raise InputError(f"{where}: shape {part.tag!r}", "give a rectangle, circle or polygon")
     points = np.concatenate(clouds)
     if len(points) < 2:
-        raise files.fail(where, "a shape without extent", "give a rectangle, circle or polygon")
+        raise InputError(f"{where}: a shape without extent", "give a rectangle, circle or polygon")
     low, high = points.min(axis=0), points.max(axis=0)
     size, middle = high - low, (low + high) / 2
     if not (size > 0).all():
-        raise files.fail(where, f"a shape of {size[0]} x {size[1]} m", "give positive sizes")
+        raise InputError(f"{where}: a shape of {size[0]} x {size[1]} m", "give positive sizes")
     return (float(size[0]), float(size[1])), (float(middle[0]), float(middle[1])), 0.0
 
 
@@ -191,7 +192,7 @@ def _rectangle(
 ) -> tuple[tuple[float, float], float, tuple[float, float]]:
     length, width = (number(files, where, part.find(k), k) for k in ("length", "width"))
     if length <= 0 or width <= 0:
-        raise files.fail(where, f"a shape of {length} x {width} m", "give positive sizes")
+        raise InputError(f"{where}: a shape of {length} x {width} m", "give positive sizes")
     turn = part.find("orientation")
     return (
         (length, width),
@@ -223,15 +224,14 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     version = root.get("commonRoadVersion")
     if root.tag != "commonRoad" or version not in VERSIONS:
         found = f"root element {root.tag!r}, version {version!r}"
-        raise files.fail(
-            file, found, f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
+        raise InputError(
+            f"{file}: {found}", f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
         )
     dt_s = _time_step(files, file, root)
     obstacles, obstacle_notes = read_obstacles(files, file, root, np.zeros(3))
     if not obstacles:
-        raise files.fail(
-            file,
-            "no recorded traffic, so no drive to take the ego from",
+        raise InputError(
+            f"{file}: no recorded traffic, so no drive to take the ego from",
             "use a scenario with dynamic obstacles",
         )
     origin = np.array(
@@ -250,8 +250,8 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     )
     centre_log = chosen.trajectory(files, file, dt_s)
     if len(centre_log) < 2:
-        raise files.fail(
-            f"{file}, obstacle {chosen.obstacle_id}", "1 state", "choose an ego with a trajectory"
+        raise InputError(
+            f"{file}, obstacle {chosen.obstacle_id}: 1 state", "choose an ego with a trajectory"
         )
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
@@ -291,8 +291,8 @@ def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
     try:
         dt_s = float(str(root.get("timeStepSize")))
     except ValueError as error:
-        raise files.fail(
-            path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds"
+        raise InputError(
+            f"{path}: timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds"
         ) from error
     TIME_STEP_S.check(dt_s, path, "timeStepSize")
     return dt_s
@@ -332,9 +332,8 @@ def _choose_ego(
     moving = {o.obstacle_id: o for o in obstacles if not o.static}
     if ego is not None:
         if ego not in moving:
-            raise files.fail(
-                path,
-                f"no moving obstacle {ego!r}",
+            raise InputError(
+                f"{path}: no moving obstacle {ego!r}",
                 f"choose the ego among {', '.join(sorted(moving)) or 'none'}",
             )
         return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
@@ -347,9 +346,8 @@ def _choose_ego(
     ]
     always.sort(key=lambda o: (-_driven_m(o), len(o.obstacle_id), o.obstacle_id))
     if not always:
-        raise files.fail(
-            path,
-            f"{len(moving)} moving obstacles, none a car that is present all the time",
+        raise InputError(
+            f"{path}: {len(moving)} moving obstacles, none a car that is present all the time",
             "name the recorded vehicle that shall be the ego",
         )
     drive = f"the longest drive ({_driven_m(always[0]):.1f} m)"

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint, Signal
@@ -60,7 +61,9 @@ def read_lanelets(
     """
     elements = root.findall("lanelet")
     if not elements:
-        raise files.fail(path, "a map without lanelets", "use a scenario with at least one lanelet")
+        raise InputError(
+            f"{path}: a map without lanelets", "use a scenario with at least one lanelet"
+        )
     signs = _speed_signs(root)
     lights, light_notes = _traffic_lights(files, path, root)
     signals: list[Signal] = []
@@ -123,8 +126,8 @@ def read_lanelets(
             speed_limit_mps=_speed_limit(files, where, element, signs),
         )
     if not lanes:
-        raise files.fail(
-            path, f"{len(elements)} lanelets, none for vehicles", "use a scenario with a road"
+        raise InputError(
+            f"{path}: {len(elements)} lanelets, none for vehicles", "use a scenario with a road"
         )
     notes = [
         f"{n} lanelets of type {t} carry no vehicles and are no lanes"
@@ -172,13 +175,13 @@ def number(files: SourceFiles, where: str, element: Element | None, what: str) -
         InputError: The element is missing or holds no finite number.
     """
     if element is None:
-        raise files.fail(where, f"no {what}", f"add {what}")
+        raise InputError(f"{where}: no {what}", f"add {what}")
     try:
         value = float(str(element.text))
     except ValueError as error:
-        raise files.fail(where, f"{what} = {element.text!r}", "give a number") from error
+        raise InputError(f"{where}: {what} = {element.text!r}", "give a number") from error
     if not np.isfinite(value):
-        raise files.fail(where, f"{what} = {element.text!r}", "give a finite number")
+        raise InputError(f"{where}: {what} = {element.text!r}", "give a finite number")
     return value
 
 
@@ -190,9 +193,8 @@ def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: 
         else [point(files, f"{where}, {side}", p) for p in bound.findall("point")]
     )
     if len(points) < 2:
-        raise files.fail(
-            where,
-            f"{side} with {len(points)} points",
+        raise InputError(
+            f"{where}: {side} with {len(points)} points",
             "give each lanelet two bounds of at least 2 points",
         )
     return files.near(f"{where}, {side}", np.array(points, dtype=np.float64) - origin)
@@ -244,8 +246,9 @@ def _traffic_lights(
             steps = number(files, where, part.find("duration"), "duration")
             if colour is None or steps <= 0:
                 said = f"color {part.findtext('color')!r}, duration {steps:g}"
-                raise files.fail(
-                    where, said, f"use {', '.join(COLOURS)} and durations above 0, in time steps"
+                raise InputError(
+                    f"{where}: {said}",
+                    f"use {', '.join(COLOURS)} and durations above 0, in time steps",
                 )
             phases.append((colour, round(steps * step_us)))
         offset = cycle.find("timeOffset")

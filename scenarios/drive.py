@@ -18,6 +18,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_array, write_json
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import open_npy
@@ -249,7 +250,6 @@ def read_drive(folder: Path) -> RecordedLog:
     document = as_shape(DriveDocument, files.read_json(path), path, DO_THIS)
     ego = document["ego"]
     log = checked_trajectory(
-        files,
         path,
         np.array(ego["t_us"], np.int64),
         _rows(ego["xyz"]),
@@ -335,14 +335,13 @@ def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
     files.note_bytes(GROUND_FILE, files.read_bytes(path))
     z = np.asarray(open_npy(path, DO_THIS))
     if z.ndim != 2 or min(z.shape) < 2:
-        raise files.fail(path, f"heights of shape {z.shape}", DO_THIS)
+        raise InputError(f"{path}: heights of shape {z.shape}", DO_THIS)
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], np.array(z, dtype=np.float64))
 
 
 def _track_actor(files: SourceFiles, path: Path, track: _Track) -> Actor:
     poses, where = track["poses"], f"{path}, track {track['id']}"
     one = checked_trajectory(
-        files,
         where,
         np.array(poses["t_us"], np.int64),
         _rows(poses["xyz"]),
@@ -403,9 +402,8 @@ def _note_files(files: SourceFiles, model: Path) -> None:
         else []
     )
     if not found:
-        raise files.fail(
-            model,
-            "no model: the import was not finished",
+        raise InputError(
+            f"{model}: no model: the import was not finished",
             "give the same import command again; it goes on where it stopped",
         )
     for path in found:

@@ -10,15 +10,16 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lens import rays_of
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
@@ -30,6 +31,7 @@ HORIZONTAL_FOV_RAD = np.pi / 2
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
 # Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
 FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+GIVE = "give an f-theta calibration"
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
 
@@ -64,49 +66,33 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
         InputError: The scene has no calibration, or it is damaged.
     """
     with Archive(SourceFiles(), path) as archive:
-        where, sensors = _sensors(archive)
+        sensors = _sensors(archive)
     cameras = []
     for name, sensor in sensors.items():
         if not (sensor.get("properties") or {}).get("Model"):
             continue  # a radar or a lidar
-        try:
-            numbers = _lens_numbers(sensor["properties"])
+        with parsing(f"{path}, {name}", GIVE):
+            (cx, cy, width, height), polynomial, goes_back = _lens_numbers(sensor["properties"])
             T_rig_camera = orthonormal(mount(sensor))
-        except (KeyError, TypeError, ValueError) as error:
-            raise _no_ftheta(archive, f"{where}, {name}", error) from error
-        cx, cy, width, height = numbers[:4].tolist()
-        given = tuple(numbers[4:10].tolist())
-        goes_back = numbers[10] == 1.0
+            given = (*polynomial, *[0.0] * (6 - len(polynomial)))
+            focal = 1 / given[1] if goes_back else given[1]
         lens = LensModel("ftheta", () if goes_back else given, given if goes_back else ())
-        focal = 1 / given[1] if goes_back else given[1]
         K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
         cameras.append(CameraSpec(name, int(width), int(height), K, T_rig_camera, lens=lens))
     if not cameras:
-        raise archive.files.fail(where, "no calibrated camera", "use a scene with its calibration")
+        raise InputError(f"{path}: no calibrated camera", "use a scene with its calibration")
     return tuple(cameras)
 
 
-def _sensors(archive: Archive) -> tuple[str, JsonObject]:
-    """Return where a scene's calibration stands, and its sensors by name; none where it has none."""
+def _sensors(archive: Archive) -> JsonObject:
+    """Return the sensors of a scene's calibration by name; none where it has none."""
     member = next((name for name in TABLES if name in archive), None)
     if member is None:
-        return str(archive.path), {}
-    where = f"{archive.path}, {member}"
+        return {}
     rows = archive.table(member)
-    try:
-        rig = archive.files.parse_json(
-            str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where
-        )
-        return where, {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
-    except (IndexError, KeyError, TypeError) as error:
-        raise archive.files.fail(
-            where, f"{type(error).__name__}: {error}", "give one row with rig_json"
-        ) from error
-
-
-def _no_ftheta(archive: Archive, where: str, error: Exception) -> InputError:
-    found = f"{type(error).__name__}: {error}"
-    return archive.files.fail(where, found, "give an f-theta calibration")
+    with parsing(f"{archive.path}, {member}", "give one row with rig_json"):
+        rig = json.loads(rows[0]["calibration_estimate"]["rig_json"])
+        return {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
 
 
 def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
@@ -116,34 +102,30 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
         InputError: The table is there, but damaged or its front wide camera is not an f-theta
             camera.
     """
-    where, sensors = _sensors(archive)
-    if not sensors:
-        return (), ("no camera calibration in this scene: the default front camera is used",)
-    sensor = sensors.get(FRONT_WIDE)
+    sensor = _sensors(archive).get(FRONT_WIDE)
     if sensor is None:
         return (), (
-            f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",
+            f"no calibration of {FRONT_WIDE} in this scene: the default front camera is used",
         )
-    try:
-        camera = front_camera(_lens_numbers(sensor["properties"]), mount(sensor))
-    except (KeyError, TypeError, ValueError) as error:
-        raise _no_ftheta(archive, f"{where}, {FRONT_WIDE}", error) from error
+    with parsing(f"{archive.path}, {FRONT_WIDE}", GIVE):
+        camera = front_camera(np.array(_lens_numbers(sensor["properties"])[0]), mount(sensor))
     return (camera,), (
         "rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",
     )
 
 
-def _lens_numbers(properties: JsonObject) -> F64:
+def _lens_numbers(properties: JsonObject) -> tuple[list[float], list[float], bool]:
+    """Return a lens's middle and size, its polynomial, and whether that goes from pixels to the
+    angle.
+    """
     if properties.get("Model") != "ftheta":
         raise ValueError(f"camera model {properties.get('Model')!r}")
-    coefficients = [float(v) for v in str(properties["polynomial"]).split()]
-    if not 1 <= len(coefficients) <= 6:
-        raise ValueError(f"a polynomial of {len(coefficients)} coefficients")
-    backward = (
-        str(properties.get("polynomial-type", "pixeldistance-to-angle")) == "pixeldistance-to-angle"
-    )
+    polynomial = [float(word) for word in properties["polynomial"].split()]
+    if not 1 <= len(polynomial) <= DEGREE + 1:
+        raise ValueError(f"a polynomial of {len(polynomial)} coefficients")
     size = [float(properties[name]) for name in ("cx", "cy", "width", "height")]
-    return np.array([*size, *coefficients, *[0.0] * (6 - len(coefficients)), float(backward)])
+    back = "pixeldistance-to-angle"
+    return size, polynomial, properties.get("polynomial-type", back) == back
 
 
 def mount(sensor: JsonObject) -> F64:
@@ -153,21 +135,11 @@ def mount(sensor: JsonObject) -> F64:
     nominal = sensor["nominalSensor2Rig_FLU"]
     turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
     shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
+    turns = Rotation.from_euler("xyz", [nominal["roll-pitch-yaw"], turn], degrees=True).as_matrix()
     out = np.eye(4)
-    out[:3, :3] = _rotation(nominal["roll-pitch-yaw"]) @ _rotation(turn) @ FLU_FROM_CAMERA
-    out[:3, 3] = np.asarray(nominal["t"], dtype=np.float64) + np.asarray(shift, dtype=np.float64)
+    out[:3, :3] = turns[0] @ turns[1] @ FLU_FROM_CAMERA
+    out[:3, 3] = np.array(nominal["t"], dtype=np.float64) + np.array(shift, dtype=np.float64)
     return out
-
-
-def _rotation(roll_pitch_yaw_deg: Any) -> F64:
-    """Return Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = (
-        f(np.deg2rad(np.asarray(roll_pitch_yaw_deg, dtype=np.float64))) for f in (np.cos, np.sin)
-    )
-    x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return z @ y @ x
 
 
 def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
@@ -242,8 +214,9 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
         "linear-d": "0.0",
         "linear-e": "0.0",
     }
+    turn = Rotation.from_matrix(camera.T_rig_camera[:3, :3] @ FLU_FROM_CAMERA.T)
     mount = {
-        "roll-pitch-yaw": _roll_pitch_yaw_deg(camera.T_rig_camera[:3, :3] @ FLU_FROM_CAMERA.T),
+        "roll-pitch-yaw": turn.as_euler("xyz", degrees=True).tolist(),
         "t": camera.T_rig_camera[:3, 3].tolist(),
     }
     return {
@@ -253,13 +226,3 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
         "correction_sensor_R_FLU": {"roll-pitch-yaw": [0.0, 0.0, 0.0]},
         "correction_rig_T": [0.0, 0.0, 0.0],
     }
-
-
-def _roll_pitch_yaw_deg(rotation: F64) -> list[float]:
-    """Return the angles of Rz(yaw) Ry(pitch) Rx(roll) in degrees."""
-    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
-    roll, yaw = (
-        np.arctan2(rotation[2, 1], rotation[2, 2]),
-        np.arctan2(rotation[1, 0], rotation[0, 0]),
-    )
-    return [float(angle) for angle in np.rad2deg([roll, pitch, yaw])]

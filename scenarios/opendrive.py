@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import densify, project
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import some_of
@@ -288,13 +289,13 @@ def read_lanes(
                 found = _section(road, index, section, T_local_map, left_out)
                 if found is None:
                     here = f"{where}, road {road.road_id}, section {index}"
-                    raise files.fail(
-                        here, "points that are not finite or not on a road", "repair its numbers"
+                    raise InputError(
+                        f"{here}: points that are not finite or not on a road", "repair its numbers"
                     )
                 lanes.update({one.lane_id: one for one in found})
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
-        raise files.fail(
-            where, "a map without a lane for vehicles", "use a map with lanes of type driving"
+        raise InputError(
+            f"{where}: a map without a lane for vehicles", "use a map with lanes of type driving"
         )
     linked, link_notes = following(odr, lanes)
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
@@ -302,9 +303,8 @@ def read_lanes(
     for road in odr.roads:
         missing = missing_m(road) if road.records else 0.0
         if missing > MAX_MISSING_M:
-            raise files.fail(
-                f"{where}, road {road.road_id}",
-                f"a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
+            raise InputError(
+                f"{where}, road {road.road_id}: a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
                 "correct the length of the road, or add the records that lack",
             )
         if abs(missing) > JOIN_M:

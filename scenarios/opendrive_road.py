@@ -19,6 +19,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.types import F64
@@ -341,15 +342,17 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     for element in root.iter():  # without namespaces
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":
-        raise files.fail(
-            where, f"a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>"
+        raise InputError(
+            f"{where}: a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>"
         )
     roads = tuple(_road(files, where, element) for element in root.findall("road"))
     if not roads:
-        raise files.fail(where, "a map without roads", "use a map with at least one road")
+        raise InputError(f"{where}: a map without roads", "use a map with at least one road")
     road_id, n_roads = Counter(road.road_id for road in roads).most_common(1)[0]
     if n_roads > 1:
-        raise files.fail(where, f"{n_roads} roads of id {road_id!r}", "give every road its own id")
+        raise InputError(
+            f"{where}: {n_roads} roads of id {road_id!r}", "give every road its own id"
+        )
     connections = tuple(
         Connection(
             j.get("id", ""),
@@ -507,16 +510,15 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
     MAP_ROAD_M.check(road_m, here, "length")
     rule = element.get("rule", "RHT")
     if rule.upper() not in ("RHT", "LHT"):
-        raise files.fail(
-            here, f"rule = {rule!r}", "use RHT or LHT, the side on which traffic keeps"
+        raise InputError(
+            f"{here}: rule = {rule!r}", "use RHT or LHT, the side on which traffic keeps"
         )
 
     def geometry(record: Element) -> Geometry:
         shape = next((child for child in record if child.tag in KINDS), None)
         if shape is None:
-            raise files.fail(
-                here,
-                f"a <geometry> of {[child.tag for child in record]}",
+            raise InputError(
+                f"{here}: a <geometry> of {[child.tag for child in record]}",
                 f"use {', '.join(KINDS)}",
             )
         numbers = tuple(number(shape, name) for name in _PARAMETERS[shape.tag])
@@ -525,9 +527,8 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         )
         MAP_ROAD_M.check(length, here, "length of a <geometry>")
         if not -1.0 <= s <= road_m + 1.0:
-            raise files.fail(
-                here,
-                f"a <geometry> at s = {s:g} of a road of {road_m:g} m",
+            raise InputError(
+                f"{here}: a <geometry> at s = {s:g} of a road of {road_m:g} m",
                 "start every record on the road",
             )
         if shape.tag in ("arc", "spiral"):
@@ -581,9 +582,8 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         for e, start, end in zip(elements, starts, [*starts, road_m][1:], strict=True)
     )
     if any(not 0 <= start <= road_m for start in starts):
-        raise files.fail(
-            here,
-            f"lane sections at {starts} of a road of {road_m} m",
+        raise InputError(
+            f"{here}: lane sections at {starts} of a road of {road_m} m",
             "start every section on the road",
         )
     view = element.find("planView")
@@ -615,7 +615,7 @@ def _number(
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise files.fail(here, f"<{owner.tag}> with {name} = {text!r}", "give a finite number")
+        raise InputError(f"{here}: <{owner.tag}> with {name} = {text!r}", "give a finite number")
     return value
 
 
@@ -623,8 +623,8 @@ def _integer(files: SourceFiles, where: Path | str, element: Element, name: str)
     try:
         return int(str(element.get(name)))
     except ValueError as error:
-        raise files.fail(
-            where, f"<{element.tag}> with {name} = {element.get(name)!r}", "give an integer"
+        raise InputError(
+            f"{where}: <{element.tag}> with {name} = {element.get(name)!r}", "give an integer"
         ) from error
 
 

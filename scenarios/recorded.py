@@ -81,7 +81,7 @@ class SourceFiles:
                 if not np.isfinite(distance)
                 else f"a point {distance / 1000:.1f} km from the drive"
             )
-            raise self.fail(where, found, "repair the coordinates of this file")
+            raise InputError(f"{where}: {found}", "repair the coordinates of this file")
         return xyz
 
     def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
@@ -92,19 +92,18 @@ class SourceFiles:
             InputError: There is none, or more than one.
         """
         if not os.path.isdir(folder):
-            raise self.fail(folder, "no such folder", f"give the folder that holds {what}")
+            raise InputError(f"{folder}: no such folder", f"give the folder that holds {what}")
         for pattern in patterns:
             found = sorted(folder.glob(pattern))
             if len(found) == 1:
                 return found[0]
             if found:
                 names = ", ".join(f.name for f in found[:3])
-                raise self.fail(
-                    folder,
-                    f"{len(found)} files match {pattern}: {names}",
+                raise InputError(
+                    f"{folder}: {len(found)} files match {pattern}: {names}",
                     f"keep exactly one file with {what}",
                 )
-        raise self.fail(folder, f"no file {' or '.join(patterns)}", f"add the file with {what}")
+        raise InputError(f"{folder}: no file {' or '.join(patterns)}", f"add the file with {what}")
 
     def read_bytes(self, path: Path) -> bytes:
         """Read a whole file.
@@ -114,7 +113,7 @@ class SourceFiles:
         """
         data = reading.read_bytes(path, SOURCE_BYTES)
         if not data:
-            raise self.fail(path, "an empty file", "fetch the file again")
+            raise InputError(f"{path}: an empty file", "fetch the file again")
         self.note_bytes(path.name, data)
         return data
 
@@ -147,8 +146,8 @@ class SourceFiles:
         check_columns(table, columns, path, "use a file of the Argoverse 2 sensor set")
         nulls = next((name for name in columns if table.column(name).null_count), None)
         if nulls is not None:
-            raise self.fail(
-                path, f"column {nulls!r} with empty values", "repair or drop these rows"
+            raise InputError(
+                f"{path}: column {nulls!r} with empty values", "repair or drop these rows"
             )
         return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
 
@@ -202,12 +201,11 @@ class RecordedLog:
 
 
 def checked_trajectory(
-    files: SourceFiles, path: Path | str, t_us: I64, xyz: F64, quat: F64, least: int = 1
+    path: Path | str, t_us: I64, xyz: F64, quat: F64, least: int = 1
 ) -> Trajectory:
     """Build a trajectory after checking what every stage relies on; quaternions are normalised.
 
     Args:
-        files: For the error's first part.
         path: The file the values came from.
         t_us: ``(T,)`` microseconds.
         xyz: ``(T, 3)`` metres.
@@ -220,27 +218,25 @@ def checked_trajectory(
     """
     if len(t_us) < least:
         found = f"{len(t_us)} pose" + ("" if len(t_us) == 1 else "s")
-        raise files.fail(path, found, f"use a recording with at least {least} poses")
+        raise InputError(f"{path}: {found}", f"use a recording with at least {least} poses")
     for name, values in (("positions", xyz), ("rotations", quat)):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
-            raise files.fail(
-                path,
-                f"{name} that are not finite, first in row {int(np.argmax(bad))}",
+            raise InputError(
+                f"{path}: {name} that are not finite, first in row {int(np.argmax(bad))}",
                 "repair or drop these rows",
             )
     steps = np.diff(t_us)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
         found = f"time {int(t_us[row])} us after {int(t_us[row - 1])} us in row {row}"
-        raise files.fail(path, found, "sort the rows and drop repeated times")
+        raise InputError(f"{path}: {found}", "sort the rows and drop repeated times")
     norms = np.linalg.norm(quat, axis=1)
     bad = np.abs(norms - 1.0) > 1e-2
     if bad.any():
         row = int(np.argmax(bad))
-        raise files.fail(
-            path,
-            f"a quaternion of length {norms[row]:.3g} in row {row}",
+        raise InputError(
+            f"{path}: a quaternion of length {norms[row]:.3g} in row {row}",
             "give unit quaternions (w, x, y, z)",
         )
     return Trajectory(

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from alpasim_plugin.core.config import parse
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
 from alpasim_plugin.core.reading import parsing
@@ -68,11 +69,11 @@ class Archive:
         where = f"{self.path}, {member}"
         info = self._infos.get(member)
         if info is None:
-            raise self.files.fail(where, "no such member", "give a complete AlpaSim scene")
+            raise InputError(f"{where}: no such member", "give a complete AlpaSim scene")
         most = int(SOURCE_BYTES.high)
         if info.file_size > most:
-            raise self.files.fail(
-                where, f"{info.file_size} bytes", f"give a member below {most} bytes"
+            raise InputError(
+                f"{where}: {info.file_size} bytes", f"give a member below {most} bytes"
             )
         do = "fetch the file again; it may be damaged"
         with (
@@ -81,7 +82,7 @@ class Archive:
         ):
             data = stream.read(most + 1)
         if len(data) > most:
-            raise self.files.fail(where, f"more than {most} bytes", "do not use this file")
+            raise InputError(f"{where}: more than {most} bytes", "do not use this file")
         self.files.note_bytes(member, data)
         return data
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 import shapely
 
 from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
 from scenarios.recorded import MAX_REACH_M
@@ -31,6 +32,7 @@ from scenarios.usdz_archive import Archive
 
 FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
+RAILS = ("left_rail", "right_rail")
 SIGN = Box(0.1, 0.75, 0.75)  # the table has no size
 
 _XYZ = pa.struct([("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())])
@@ -74,91 +76,69 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
         if not lanes:
             notes.append(f"map tables in {folder}/ passed over: no lane")
             continue
-        notes += (
-            ["fastmap tables: heights are taken as stored, not from the ground mesh"]
-            if folder == "fastmap"
-            else []
-        )
-        return _read(archive, folder, lanes), tuple(notes)
+        if folder == "fastmap":
+            notes.append("fastmap tables: heights are taken as stored, not from the ground mesh")
+        with parsing(f"{archive.path}, {folder}", "write its tables again"):
+            return _read(archive, folder, lanes), tuple(notes)
     return None, tuple(notes)
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One row of a table: where it stands, its key and its content; null structs are empty."""
-
-    where: str
-    key: JsonObject
-    own: JsonObject
-
-    @property
-    def map_id(self) -> str | None:
-        """Give the element's id; None in the placeholder row of an empty table."""
-        return None if self.key.get("map_id") is None else str(self.key["map_id"])
+Row = tuple[JsonObject, JsonObject]  # the key and the content; null structs are empty
 
 
-def _rows(archive: Archive, folder: str, table: str) -> list[_Row]:
-    where = f"{archive.path}, {folder}/{table}.parquet"
-    out = []
-    for i, row in enumerate(archive.table(f"{folder}/{table}.parquet")):
-        key, own = ({} if row.get(name) is None else row[name] for name in ("key", table))
-        if not isinstance(key, dict) or not isinstance(own, dict):
-            raise archive.files.fail(
-                f"{where}, row {i}",
-                f"columns key and {table} that are not structs",
-                "write the table again",
-            )
-        out.append(_Row(f"{where}, {key.get('map_id', f'row {i}')}", key, own))
-    return out
+def _rows(archive: Archive, folder: str, table: str) -> list[Row]:
+    rows = archive.table(f"{folder}/{table}.parquet")
+    return [(row.get("key") or {}, row.get(table) or {}) for row in rows]
 
 
-def _read(archive: Archive, folder: str, rows: list[_Row]) -> LaneMap:
-    links = _link_table(archive, folder)
-    lanes: dict[str, Lane] = {}
-    for row in rows:
-        key, fields = row.map_id, row.own
-        absent = [side for side in ("left_rail", "right_rail") if not fields.get(side)]
-        if key is None or absent:
-            lacks = f"{absent[0]}, only {', '.join(fields) or 'nothing'}" if absent else "an id"
-            raise archive.files.fail(
-                row.where,
-                f"lane {key} without {lacks}",
-                "give every lane both rails; AlpaSim refuses this scene too",
-            )
-        left, right = (
-            points(archive, row.where, fields[side]) for side in ("left_rail", "right_rail")
-        )
-        if len(left) != len(right) or len(left) < 2:
-            found = f"lane {key} with rails of {len(left)} and {len(right)} points"
-            raise archive.files.fail(
-                row.where, found, "give both rails the same number of points, at least two"
-            )
-        lanes[key] = Lane(
-            key,
+def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
+    links: dict[tuple[str, str], tuple[str, ...]] = {}  # of several rows the first counts
+    for key, own in _rows(archive, folder, "association"):
+        objects = tuple(str(one) for one in own.get("objects") or ())
+        links.setdefault((str(key.get("kind")), str(own.get("subjects"))), objects)
+    rails_of: dict[str, tuple[F64, F64]] = {}
+    for key, own in rows:
+        lane_id = str(key["map_id"])
+        do_this = "give every lane two rails with the same number of points, at least two"
+        with parsing(f"{archive.path}, {folder}, lane {lane_id}", do_this):
+            left, right = points(own["left_rail"]), points(own["right_rail"])
+            if len(left) != len(right) or len(left) < 2:
+                raise ValueError(f"rails of {len(left)} and {len(right)} points")
+        rails_of[lane_id] = left, right
+    lanes = {}
+    for lane_id, (left, right) in rails_of.items():
+        found = {
+            kind: [key for key in links.get((kind, lane_id), ()) if key in rails_of]
+            for kind in ("NEXT_LANE", "LEFT_LANE", "RIGHT_LANE")
+        }
+        lanes[lane_id] = Lane(
+            lane_id,
             with_vertices((left + right) / 2),
             with_vertices(left),
             with_vertices(right),
-            successors=links.get(("NEXT_LANE", key), ()),
-            left_neighbour=next(iter(links.get(("LEFT_LANE", key), ())), None),
-            right_neighbour=next(iter(links.get(("RIGHT_LANE", key), ())), None),
+            successors=tuple(found["NEXT_LANE"]),
+            left_neighbour=next(iter(found["LEFT_LANE"]), None),
+            right_neighbour=next(iter(found["RIGHT_LANE"]), None),
         )
     edges: dict[str, F64] = {}
-    for row in _rows(archive, folder, "road_boundary"):
-        edges.setdefault(str(row.map_id), _location(archive, row))  # the first of an id counts
-    stops = [
-        row for row in _rows(archive, folder, "wait_line") if row.own.get("is_implicit") is not True
+    for key, own in _rows(archive, folder, "road_boundary"):
+        edges.setdefault(str(key.get("map_id")), points(own.get("location") or []))
+    stop_lines = [
+        points(own.get("location") or [])
+        for _, own in _rows(archive, folder, "wait_line")
+        if own.get("is_implicit") is not True
     ]
+    signs = []
+    for key, own in _rows(archive, folder, "traffic_sign"):
+        if key.get("map_id") is not None and own.get("center"):
+            pose = np.eye(4)
+            pose[:3, 3] = points([own["center"]])[0]
+            signs.append((pose, SIGN))
     return LaneMap(
-        {key: _known(lane, lanes) for key, lane in lanes.items()},
+        lanes,
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
-        stop_lines=tuple(
-            line for line in (_location(archive, row) for row in stops) if len(line) > 1
-        ),
-        signs=tuple(
-            sign
-            for row in _rows(archive, folder, "traffic_sign")
-            if (sign := _sign(archive, row)) is not None
-        ),
+        stop_lines=tuple(line for line in stop_lines if len(line) > 1),
+        signs=tuple(signs),
     )
 
 
@@ -170,66 +150,13 @@ def without_rails(lane_map: LaneMap) -> LaneMap:
     )
 
 
-def points(archive: Archive, where: str, raw: Any) -> F64:
+def points(raw: Any) -> F64:
     """Return points ``(N, 3)`` of a list of structs or of a struct of lists."""
-    try:
-        if isinstance(raw, dict):
-            xyz = np.stack([np.asarray(raw[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-        else:
-            xyz = np.array([[p["x"], p["y"], p["z"]] for p in raw], dtype=np.float64).reshape(-1, 3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise archive.files.fail(
-            where, f"points that are not x, y, z: {error}", "write the table again"
-        ) from error
-    if len(xyz) and not np.abs(xyz - xyz[0]).max() <= MAX_REACH_M:
-        raise archive.files.fail(
-            where,
-            "points that are not finite or kilometres apart",
-            "repair the coordinates of this table",
-        )
+    columns = [raw[axis] if isinstance(raw, dict) else [p[axis] for p in raw] for axis in "xyz"]
+    xyz = np.array(columns, dtype=np.float64).T
+    if not np.ptp(xyz, axis=0).max(initial=0.0) <= MAX_REACH_M:
+        raise ValueError("points that are not finite or kilometres apart")
     return xyz
-
-
-def _location(archive: Archive, row: _Row) -> F64:
-    return points(archive, row.where, row.own.get("location") or [])
-
-
-def _link_table(archive: Archive, folder: str) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return (kind, lane) -> lanes; of several rows for a lane and kind the first counts."""
-    out: dict[tuple[str, str], tuple[str, ...]] = {}
-    for row in _rows(archive, folder, "association"):
-        kind = row.key.get("kind")
-        subject = row.own.get("subjects")
-        objects = row.own.get("objects") or []
-        if not isinstance(objects, list):
-            raise archive.files.fail(row.where, f"objects {objects!r}", "give a list of ids")
-        if kind and subject is not None:
-            out.setdefault((str(kind), str(subject)), tuple(str(one) for one in objects))
-    return out
-
-
-def _known(lane: Lane, lanes: dict[str, Lane]) -> Lane:
-    left, right = (n if n in lanes else None for n in (lane.left_neighbour, lane.right_neighbour))
-    return replace(
-        lane,
-        successors=tuple(s for s in lane.successors if s in lanes),
-        left_neighbour=left,
-        right_neighbour=right,
-    )
-
-
-def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
-    centre = row.own.get("center")
-    if (
-        row.map_id is None
-        or not centre
-        or not isinstance(centre, dict)
-        or any(centre.get(axis) is None for axis in "xyz")
-    ):
-        return None
-    pose = np.eye(4)
-    pose[:3, 3] = points(archive, row.where, [centre])[0]
-    return pose, SIGN
 
 
 def map_tables(lane_map: LaneMap, clip_id: str) -> dict[str, bytes]:
@@ -240,43 +167,32 @@ def map_tables(lane_map: LaneMap, clip_id: str) -> dict[str, bytes]:
         clip_id: Names the clip in every row.
     """
     lanes = {key: lane for key, lane in lane_map.lanes.items() if lane.kind not in NO_LANES_OF_CARS}
-    ids = table_ids(list(lanes))
-    own = {
-        key: dict(zip(("left_rail", "right_rail"), map(_line, rails(lane)), strict=True))
-        for key, lane in lanes.items()
-    }
+    # A hyphen parts a stop line's id from its lane's.
+    ids = {key: key.replace("-", "~") for key in lanes}
+    edges = [edge for edge in lane_map.road_edges if len(edge) > 1]
     rows = {
-        "lane": [_row(ids[key], "lane", fields) for key, fields in own.items()],
+        "lane": [
+            _row(ids[key], "lane", dict(zip(RAILS, map(_line, rails(lane)), strict=True)))
+            for key, lane in lanes.items()
+        ],
         "association": _links(lanes, ids),
         "road_boundary": [
-            _row(f"edge{i}", "road_boundary", {"location": _line(e)})
-            for i, e in enumerate(lane_map.road_edges)
-            if len(e) > 1
+            _row(f"edge{i}", "road_boundary", {"location": _line(edge)})
+            for i, edge in enumerate(edges)
         ],
         "clip": [_row("clip", "clip", {"label_class_id": "clip"})],
-        "traffic_sign": _signs(lane_map),
+        "traffic_sign": [
+            _row(f"sign{i}", "traffic_sign", {"center": _point(pose), "category": "UNKNOWN"})
+            for i, (pose, _) in enumerate(lane_map.signs)
+        ]
+        or [
+            _row(None, "traffic_sign", {"center": _point(np.zeros((4, 4))), "category": "UNKNOWN"})
+        ],
         "wait_line": _wait_lines(lane_map, lanes, ids),
     }
     return {
         f"clipgt/{name}.parquet": _parquet(name, table, clip_id) for name, table in rows.items()
     }
-
-
-def table_ids(names: Sequence[str]) -> dict[str, str]:
-    """Return the id of each lane in the tables: its name, without the hyphen that parts a stop
-    line's id from its lane's there.
-
-    Example:
-        >>> table_ids(["road1/-2", "road1/2"])
-        {'road1/-2': 'road1/~2', 'road1/2': 'road1/2'}
-    """
-    out = {name: name.replace("-", "~") for name in names}
-    taken = set(out.values())
-    if len(taken) == len(names):
-        return out
-    return {
-        name: f"lane{i}" for i, name in enumerate(names)
-    }  # two names that differ only in these two characters
 
 
 def _row(map_id: str | None, label: str, own: JsonView, kind: str | None = None) -> JsonObject:
@@ -293,42 +209,25 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject
     """
     before = predecessors(lanes)
     out: list[JsonObject] = []
+
+    def add(kind: str, subject: str, objects: list[str]) -> None:
+        own = {"subjects": subject, "objects": objects}
+        out.append(_row(f"a{len(out)}", "association", own, kind))
+
     for key, lane in lanes.items():
-        found: dict[str, tuple[str | None, ...]] = {
-            "NEXT_LANE": tuple(lane.successors),
-            "PREVIOUS_LANE": tuple(before[key]),
+        found = {
+            "NEXT_LANE": lane.successors,
+            "PREVIOUS_LANE": before[key],
             "LEFT_LANE": (lane.left_neighbour,),
             "RIGHT_LANE": (lane.right_neighbour,),
         }
         for kind, others in found.items():
-            objects = [ids[other] for other in others if other is not None and other in ids]
+            objects = [ids[other] for other in others if other in ids]
             if objects:
-                out.append(
-                    _row(
-                        f"a{len(out)}",
-                        "association",
-                        {"subjects": ids[key], "objects": objects},
-                        kind,
-                    )
-                )
-    return out or [
-        _row(
-            "a0",
-            "association",
-            {"subjects": next(iter(ids.values())), "objects": []},
-            "SIGN_TO_LANE",
-        )
-    ]
-
-
-def _signs(lane_map: LaneMap) -> list[JsonObject]:
-    signs = [
-        _row(f"sign{i}", "traffic_sign", {"center": _point(pose[:3, 3]), "category": "UNKNOWN"})
-        for i, (pose, _) in enumerate(lane_map.signs)
-    ]
-    return signs or [
-        _row(None, "traffic_sign", {"center": _point(np.zeros(3)), "category": "UNKNOWN"})
-    ]
+                add(kind, ids[key], objects)
+    if not out:
+        add("SIGN_TO_LANE", next(iter(ids.values())), [])
+    return out
 
 
 def _wait_lines(
@@ -337,28 +236,25 @@ def _wait_lines(
     """Return a row per stop line, with the lane whose end it is nearest to in its id."""
     keys = list(lanes)
     ends = shapely.points(np.array([lane.centre[-1, :2] for lane in lanes.values()]))
+    lines = [line for line in lane_map.stop_lines if len(line) > 1]
+    is_implicit = not lines
+    if is_implicit:
+        left, right = rails(lanes[keys[0]])
+        lines = [np.stack([left[-1], right[-1]])]
     out = []
-    for i, line in enumerate(one for one in lane_map.stop_lines if len(one) > 1):
+    for i, line in enumerate(lines):
         nearest = keys[int(np.argmin(shapely.distance(ends, shapely.linestrings(line[:, :2]))))]
-        own = {"location": _line(line), "category": "STOP", "is_implicit": False}
+        own = {"location": _line(line), "category": "STOP", "is_implicit": is_implicit}
         out.append(_row(f"wait{i}-{ids[nearest]}", "wait_line", own))
-    if out:
-        return out
-    left, right = rails(lanes[keys[0]])
-    own = {
-        "location": _line(np.stack([left[-1], right[-1]])),
-        "category": "STOP",
-        "is_implicit": True,
-    }
-    return [_row(f"wait0-{ids[keys[0]]}", "wait_line", own)]
+    return out
 
 
 def _line(xyz: F64) -> list[dict[str, float]]:
     return [{"x": x, "y": y, "z": z} for x, y, z in xyz.tolist()]
 
 
-def _point(xyz: F64) -> dict[str, float]:
-    return dict(zip("xyz", xyz.tolist(), strict=True))
+def _point(pose: F64) -> dict[str, float]:
+    return _line(pose[None, :3, 3])[0]
 
 
 def _parquet(name: str, rows: Sequence[JsonObject], clip_id: str) -> bytes:

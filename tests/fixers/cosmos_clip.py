@@ -490,6 +490,6 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
     t_us = start_us + np.round(np.arange(len(poses)) * (1e6 / FRAME_RATE_HZ)).astype(np.int64)
     files.near(path, poses[:, :3, 3])
     quat = quat_from_matrix(poses[:, :3, :3])
-    return checked_trajectory(files, path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp[
+    return checked_trajectory(path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp[
         "clip"
     ] if stamp else path.stem
