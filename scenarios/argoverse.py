@@ -21,10 +21,9 @@ from alpasim_plugin.core.geometry import (
     matrix_from_quat,
     quat_from_matrix,
     se3,
-    wrap_angle,
 )
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import real
+from alpasim_plugin.core.reading import parsing, real
 from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import (
     F64,
@@ -108,64 +107,54 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         InputError: A layer or a lane's edge is missing, or a lane type is unknown to Argoverse 2.
     """
     document = files.read_json(path)
-    layers = ("lane_segments", "drivable_areas", "pedestrian_crossings")
-    raw_lanes, raw_areas, raw_crossings = (_layer(files, path, document, key) for key in layers)
-    if not raw_lanes:
-        raise InputError(f"{path}: a map without lanes", "use a log whose map has lane_segments")
-    if not raw_areas:
-        raise InputError(
-            f"{path}: a map without drivable areas, so without road edges",
-            "use a log whose map has drivable_areas",
-        )
-    strange: Counter[str] = Counter()
-    lanes: dict[str, Lane] = {}
-    for key, raw in raw_lanes.items():
-        where = f"{path}, lane {key}"
-        left, right = (
-            _line(files, where, raw, f"{side}_lane_boundary", origin, least=2)
+    with parsing(path, "use a log_map_archive file of the Argoverse 2 sensor set"):
+        raw_lanes, raw_areas = document["lane_segments"], document["drivable_areas"]
+        raw_crossings = document["pedestrian_crossings"]
+        if not raw_lanes or not raw_areas:
+            raise ValueError("a map without lanes or without drivable areas")
+        raw_marks = [
+            str(raw.get(f"{side}_lane_mark_type"))
+            for raw in raw_lanes.values()
             for side in ("left", "right")
-        )
-        kind = KINDS.get(str(raw.get("lane_type")))
-        if kind is None:
-            raise InputError(
-                f"{where}: lane type {raw.get('lane_type')!r}", f"use one of {', '.join(KINDS)}"
+        ]
+        lanes = {}
+        for key, raw in raw_lanes.items():
+            where = f"{path}, lane {key}"
+            left = _line(files, where, raw, "left_lane_boundary", origin)
+            right = _line(files, where, raw, "right_lane_boundary", origin)
+            lanes[str(key)] = Lane(
+                lane_id=str(key),
+                centre=centre_line(left, right),
+                left=left,
+                right=right,
+                kind=KINDS[raw["lane_type"]],
+                successors=tuple(str(i) for i in raw.get("successors", ())),
+                left_neighbour=str(raw.get("left_neighbor_id")),
+                right_neighbour=str(raw.get("right_neighbor_id")),
+                left_paint=PAINTS.get(str(raw.get("left_lane_mark_type")), "unknown"),
+                right_paint=PAINTS.get(str(raw.get("right_lane_mark_type")), "unknown"),
+                is_intersection=bool(raw.get("is_intersection")),
             )
-        marks = [str(raw.get(f"{side}_lane_mark_type")) for side in ("left", "right")]
-        strange.update(mark for mark in marks if mark not in PAINTS)
-        paints = [PAINTS.get(mark, "unknown") for mark in marks]
-        lanes[str(key)] = Lane(
-            lane_id=str(key),
-            centre=centre_line(left, right),
-            left=left,
-            right=right,
-            kind=kind,
-            successors=tuple(str(i) for i in raw.get("successors", ())),
-            left_neighbour=str(raw.get("left_neighbor_id")),
-            right_neighbour=str(raw.get("right_neighbor_id")),
-            left_paint=paints[0],
-            right_paint=paints[1],
-            is_intersection=bool(raw.get("is_intersection")),
+        areas = tuple(
+            _closed(_line(files, f"{path}, drivable area {key}", raw, "area_boundary", origin))
+            for key, raw in raw_areas.items()
         )
-    lanes = {key: _same_way_neighbours(lane, lanes) for key, lane in lanes.items()}
-    areas = tuple(
-        _closed(_line(files, f"{path}, drivable area {k}", a, "area_boundary", origin, least=3))
-        for k, a in raw_areas.items()
-    )
-    crossings = []
-    for key, raw in raw_crossings.items():
-        one, two = (
-            _line(files, f"{path}, crossing {key}", raw, edge, origin, least=2)
-            for edge in ("edge1", "edge2")
-        )
-        crossings.append(_closed(np.concatenate([one, two[::-1]])))
-    surface = merge_areas([shapely.Polygon(a[:, :2]) for a in areas])
-    edges = border_lines(surface, np.concatenate(areas))
+        crossings = []
+        for key, raw in raw_crossings.items():
+            where = f"{path}, crossing {key}"
+            one, two = (_line(files, where, raw, edge, origin) for edge in ("edge1", "edge2"))
+            crossings.append(_closed(np.concatenate([one, two[::-1]])))
+        surface = merge_areas([shapely.Polygon(area[:, :2]) for area in areas])
     lane_map = LaneMap(
-        lanes=lanes, road_edges=edges, drivable_areas=areas, crosswalks=tuple(crossings)
+        {key: _same_way_neighbours(lane, lanes) for key, lane in lanes.items()},
+        road_edges=border_lines(surface, np.concatenate(areas)),
+        drivable_areas=areas,
+        crosswalks=tuple(crossings),
     )
     notes = [
         "road edges are the border of the union of the drivable areas; where the map is cut off, its border is an edge too"
     ]
+    strange = Counter(mark for mark in raw_marks if mark not in PAINTS)
     notes += [
         f"{count} lane edges have the mark type {mark!r}: taken as paint 'unknown'"
         for mark, count in sorted(strange.items())
@@ -182,30 +171,22 @@ def read_ground(
     The raster is averaged over blocks of 1.5 m; its holes are bridged by the fit. Edges and path
     carry centimetres where it matters.
     """
-    transform_path = files.only(folder, ("*___img_Sim2_city.json",), "the raster's Sim2 transform")
-    raster_path = files.only(
-        folder, ("*_ground_height_surface____*.npy",), "the ground height raster"
-    )
+    what = "the ground height raster and its Sim2 transform"
+    transform_path = files.only(folder, ("*___img_Sim2_city.json",), what)
+    raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), what)
     sim2 = files.read_json(transform_path)
     raster = np.asarray(files.parse_npy(files.read_bytes(raster_path), raster_path))
-    try:
-        scale, shift = float(sim2["s"]), np.asarray(sim2["t"], dtype=np.float64)
-        rotation = np.asarray(sim2["R"], dtype=np.float64).reshape(2, 2)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{transform_path}: no Sim2 transform: {error}", "give the keys R, t and s"
-        ) from error
-    if raster.ndim != 2 or raster.dtype.kind != "f" or shift.shape != (2,) or scale <= 0:
-        found = f"raster {raster.dtype} {raster.shape}, scale {scale}"
-        raise InputError(
-            f"{raster_path}: {found}", "give a 2-D floating-point raster with a positive scale"
-        )
-    heights, rows, columns = _block_means(raster.astype(np.float64), RASTER_BLOCK)
-    # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer
-    # pixels.
-    city = (np.stack([columns, rows], axis=1) / scale - shift) @ rotation
-    known = np.isfinite(heights)
-    grid = files.near(raster_path, np.column_stack([city[known], heights[known]]) - origin)
+    with parsing(transform_path, "give the keys R, t and s, and a raster of 2-D floats"):
+        if raster.ndim != 2 or raster.dtype.kind != "f":
+            raise ValueError(f"a raster of {raster.dtype} {raster.shape}")
+        heights, rows, columns = _block_means(raster.astype(np.float64), RASTER_BLOCK)
+        # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer
+        # pixels.
+        pixel = np.stack([columns, rows], axis=1)
+        city = (pixel / float(sim2["s"]) - np.array(sim2["t"], dtype=np.float64)) @ np.array(
+            sim2["R"], dtype=np.float64
+        ).reshape(2, 2)
+    grid = files.near(raster_path, np.column_stack([city, heights]) - origin)
     return from_points(
         np.concatenate([grid, *lane_edges(lane_map.lanes), *lane_map.drivable_areas, wheels]),
         GROUND_CELL_M,
@@ -214,51 +195,31 @@ def read_ground(
 
 
 def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
-    """Return means of the finite pixels of square blocks and the blocks' centres in pixels:
-    heights, rows, columns, each ``(B,)``.
+    """Return means of the finite pixels of square blocks that have any, and of their places in
+    pixels: heights, rows, columns, each ``(B,)``.
     """
     ny, nx = raster.shape
-    padded = np.full((-(-ny // block) * block, -(-nx // block) * block), np.nan)
+    shape = -(-ny // block), block, -(-nx // block), block
+    padded = np.full((shape[0] * block, shape[2] * block), np.nan)
     padded[:ny, :nx] = raster
-    tiles = padded.reshape(padded.shape[0] // block, block, -1, block)
-    finite = np.isfinite(tiles)
+    finite = np.isfinite(padded).reshape(shape)
     count = finite.sum(axis=(1, 3))
-    row, column = np.meshgrid(np.arange(padded.shape[0]), np.arange(padded.shape[1]), indexing="ij")
+    row, column = np.indices(padded.shape)
 
     def mean(values: F64) -> F64:
-        total = np.where(finite, values.reshape(tiles.shape), 0.0).sum(axis=(1, 3))
-        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan)).ravel()
+        total = np.where(finite, values.reshape(shape), 0.0).sum(axis=(1, 3))
+        return np.asarray(total[count > 0] / count[count > 0])
 
     return mean(padded), mean(row + 0.5), mean(column + 0.5)
 
 
-def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> JsonObject:
-    layer = document.get(key) if isinstance(document, dict) else None
-    if not isinstance(layer, dict) or not all(isinstance(v, dict) for v in layer.values()):
-        raise InputError(
-            f"{path}: no object {key!r}", "use a log_map_archive file of the Argoverse 2 sensor set"
-        )
-    return layer
-
-
-def _line(
-    files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64, least: int
-) -> F64:
+def _line(files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
-    try:
-        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64).reshape(
-            -1, 3
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{where}: no usable {key}: {error!r}", "give a list of points with x, y and z"
-        ) from error
-    if len(points) < least or not np.isfinite(points).all():
-        raise InputError(
-            f"{where}: {key} with {len(points)} finite points",
-            f"give at least {least} finite points",
-        )
-    return files.near(where, points - origin)
+    with parsing(f"{where}, {key}", "give a list of at least two points with x, y and z"):
+        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64)
+        if len(points) < 2:
+            raise ValueError(f"{len(points)} points")
+        return files.near(where, points - origin)
 
 
 def _closed(ring: F64) -> F64:
@@ -268,22 +229,17 @@ def _closed(ring: F64) -> F64:
 def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
     """Drop neighbours that are not in the map or run the other way."""
 
-    def heading(line: F64) -> float:
-        d = line[-1, :2] - line[0, :2]
-        return float(np.arctan2(d[1], d[0]))
-
-    def keep(other: str) -> str | None:
+    def keep(other: str | None) -> str | None:
         if other not in lanes:
             return None
-        return (
-            other
-            if abs(float(wrap_angle(heading(lanes[other].centre) - heading(lane.centre))))
-            < np.pi / 2
-            else None
-        )
+        ahead, own = ((one.centre[-1] - one.centre[0])[:2] for one in (lanes[other], lane))
+        return other if ahead @ own > 0 else None
 
-    left, right = keep(str(lane.left_neighbour)), keep(str(lane.right_neighbour))
-    return replace(lane, left_neighbour=left, right_neighbour=right)
+    return replace(
+        lane,
+        left_neighbour=keep(lane.left_neighbour),
+        right_neighbour=keep(lane.right_neighbour),
+    )
 
 
 @dataclass(frozen=True)
@@ -395,58 +351,36 @@ def read_actors(
     others = np.nonzero(category != EGO_CATEGORY)[0]
     if len(others) == 0:
         return (), (NOBODY,)
-    row = np.searchsorted(poses.t_ns, t_ns)
-    row = np.minimum(row, len(poses.t_ns) - 1)
+    row = np.minimum(np.searchsorted(poses.t_ns, t_ns), len(poses.t_ns) - 1)
     lost = poses.t_ns[row] != t_ns
     if lost.any():
-        found = f"a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time"
-        raise InputError(f"{path}: {found}", "use annotations and poses of the same log")
-    boxes = se3(_columns(table, POSE[4:]), _columns(table, POSE[:4]))
-    bad = ~np.isfinite(boxes).all(axis=(1, 2))
-    if bad.any():
         raise InputError(
-            f"{path}: a cuboid pose that is not finite in row {int(np.argmax(bad))}",
-            "repair or drop this row",
+            f"{path}: a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time",
+            "use annotations and poses of the same log",
         )
+    quat = _columns(table, POSE[:4])
+    unlike = np.abs(np.linalg.norm(quat, axis=1) - 1) > 1e-2
+    if unlike[others].any():
+        found = f"a quaternion that is not of length 1 in row {int(np.argmax(unlike))}"
+        raise InputError(f"{path}: {found}", "give unit quaternions")
     T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
-    T_local_box = T_local_ego @ boxes
+    T_local_box = T_local_ego @ se3(_columns(table, POSE[4:]), quat)
+    xyz, turns = T_local_box[:, :3, 3].copy(), quat_from_matrix(T_local_box[:, :3, :3])
     size = _columns(table, sizes)
     actors: list[Actor] = []
     unknown: Counter[str] = Counter()
-    changed = split = 0
+    split = 0
     order, first = np.unique(uuid[others], return_index=True)
     for name in order[np.argsort(first)]:
         mine = others[uuid[others] == name]
         where = f"{path}, track {name}"
-        norm = np.linalg.norm(_columns(table, POSE[:4])[mine], axis=1)
-        if (np.abs(norm - 1) > 1e-2).any():
-            raise InputError(
-                f"{where}: a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}",
-                "give unit quaternions",
-            )
-        length, width, height = np.median(size[mine], axis=0).tolist()
-        if not (min(length, width, height) > 0 and np.isfinite([length, width, height]).all()):
-            raise InputError(
-                f"{where}: a size of {length} x {width} x {height} m", "give positive sizes"
-            )
-        changed += bool((np.ptp(size[mine], axis=0) > 0.01).any())
+        track = checked_trajectory(where, t_ns[mine] // 1000, xyz[mine], turns[mine])
         kind = str(category[mine[0]])
         if kind not in LABELS:
             unknown[kind] += 1
-        poses_of = T_local_box[mine]
-        track = checked_trajectory(
-            where,
-            t_ns[mine] // 1000,
-            poses_of[:, :3, 3].copy(),
-            quat_from_matrix(poses_of[:, :3, :3]),
-        )
-        parts = actors_of_track(
-            str(name),
-            LABELS.get(kind, "other"),
-            Box(length, width, height),
-            track,
-            fixed=kind in FIXED,
-        )
+        box = Box(*np.median(size[mine], axis=0).tolist())
+        label, fixed = LABELS.get(kind, "other"), kind in FIXED
+        parts = actors_of_track(str(name), label, box, track, fixed=fixed)
         split += len(parts) > 1
         actors += parts
     notes = [
@@ -455,8 +389,6 @@ def read_actors(
     ]
     if split:
         notes.append(f"{split} tracks have holes longer than 0.5 s and were split")
-    if changed:
-        notes.append(f"{changed} tracks change their size by more than 1 cm: the median is used")
     return tuple(actors), tuple(notes)
 
 
