@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,10 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint, Signal
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
-from scenarios.recorded import SourceFiles
+from scenarios.recorded import near
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
 PAINTS: dict[str, Paint] = {
@@ -51,21 +53,15 @@ CROSSING_SHARE = (
 )
 
 
-def read_lanelets(
-    files: SourceFiles, path: Path, root: Element, origin: F64
-) -> tuple[LaneMap, tuple[str, ...]]:
+def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
     """Read all lanelets around ``origin (3,)``, with notes.
 
     Raises:
-        InputError: There is no lanelet, or one lacks a bound.
+        InputError: There is no lanelet for vehicles, or one lacks a bound.
     """
     elements = root.findall("lanelet")
-    if not elements:
-        raise InputError(
-            f"{path}: a map without lanelets", "use a scenario with at least one lanelet"
-        )
     signs = _speed_signs(root)
-    lights, light_notes = _traffic_lights(files, path, root)
+    lights, notes = _traffic_lights(path, root)
     signals: list[Signal] = []
     lanes: dict[str, Lane] = {}
     crosswalks: list[F64] = []
@@ -76,60 +72,60 @@ def read_lanelets(
     for element in elements:
         lane_id = str(element.get("id"))
         where = f"{path}, lanelet {lane_id}"
-        left, right = (
-            _bound(files, where, element, side, origin) for side in ("leftBound", "rightBound")
-        )
-        types = [str(t.text) for t in element.findall("laneletType")]
-        if any(t in NOT_FOR_CARS for t in types):
-            left_out.update(t for t in types if t in NOT_FOR_CARS)
-            if "crosswalk" in types:
-                crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
-            continue
-        strange.update(t for t in types if t not in KNOWN)
-        if is_left_of(right, left):  # bounds exchanged
-            left, right, swapped = right, left, swapped + 1
-        stop_line = _stop_line(files, where, element, left, right, origin)
-        stop_lines += stop_line
-        waits = stop_line[0] if stop_line else np.stack([left[-1], right[-1]])
-        refs = [
-            str(ref.get("ref"))
-            for ref in (
-                *element.findall("trafficLightRef"),
-                *element.findall("stopLine/trafficLightRef"),
+        with parsing(where, "correct the lanelet"):
+            left, right = (
+                near(where, _line(element, side, 2) - origin)
+                for side in ("leftBound", "rightBound")
             )
-        ]
-        ends = centre_line(left, right)[-2:, :2]
-        heading = float(np.arctan2(*(ends[1] - ends[0])[::-1]))
-        signals += [
-            Signal(waits, heading, *lights[ref]) for ref in dict.fromkeys(refs) if ref in lights
-        ]
-        beside = {
-            side: n
-            for side in ("left", "right")
-            if (n := element.find(f"adjacent{side.capitalize()}")) is not None
-        }
-        same = {
-            side: str(n.get("ref")) for side, n in beside.items() if n.get("drivingDir") == "same"
-        }
-        lanes[lane_id] = Lane(
-            lane_id=lane_id,
-            centre=centre_line(left, right),
-            left=left,
-            right=right,
-            kind=next((KINDS[t] for t in types if t in KINDS), "vehicle"),
-            successors=tuple(str(s.get("ref")) for s in element.findall("successor")),
-            left_neighbour=same.get("left"),
-            right_neighbour=same.get("right"),
-            left_paint=_marking(element, "leftBound"),
-            right_paint=_marking(element, "rightBound"),
-            is_intersection="intersection" in types,
-            speed_limit_mps=_speed_limit(files, where, element, signs),
-        )
+            types = [str(t.text) for t in element.findall("laneletType")]
+            if any(t in NOT_FOR_CARS for t in types):
+                left_out.update(t for t in types if t in NOT_FOR_CARS)
+                if "crosswalk" in types:
+                    crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
+                continue
+            strange.update(t for t in types if t not in KNOWN)
+            if is_left_of(right, left):  # bounds exchanged
+                left, right, swapped = right, left, swapped + 1
+            waits = np.stack([left[-1], right[-1]])
+            if element.find("stopLine") is not None:
+                points = _line(element, "stopLine", 0)
+                waits = points - origin if len(points) == 2 else waits
+                stop_lines.append(waits)
+            centre = centre_line(left, right)
+            ahead = centre[-1] - centre[-2]
+            heading = float(np.arctan2(ahead[1], ahead[0]))
+            refs = [
+                str(ref.get("ref"))
+                for place in ("trafficLightRef", "stopLine/trafficLightRef")
+                for ref in element.findall(place)
+            ]
+            signals += [
+                Signal(waits, heading, *lights[ref]) for ref in dict.fromkeys(refs) if ref in lights
+            ]
+            neighbours = {
+                beside.tag: str(beside.get("ref"))
+                for beside in element
+                if beside.get("drivingDir") == "same"
+            }
+            lanes[lane_id] = Lane(
+                lane_id=lane_id,
+                centre=centre,
+                left=left,
+                right=right,
+                kind=next((KINDS[t] for t in types if t in KINDS), "vehicle"),
+                successors=tuple(str(s.get("ref")) for s in element.findall("successor")),
+                left_neighbour=neighbours.get("adjacentLeft"),
+                right_neighbour=neighbours.get("adjacentRight"),
+                left_paint=PAINTS.get(str(element.findtext("leftBound/lineMarking")), "unknown"),
+                right_paint=PAINTS.get(str(element.findtext("rightBound/lineMarking")), "unknown"),
+                is_intersection="intersection" in types,
+                speed_limit_mps=_speed_limit(element, signs),
+            )
     if not lanes:
         raise InputError(
             f"{path}: {len(elements)} lanelets, none for vehicles", "use a scenario with a road"
         )
-    notes = [
+    notes += [
         f"{n} lanelets of type {t} carry no vehicles and are no lanes"
         for t, n in sorted(left_out.items())
     ]
@@ -139,85 +135,49 @@ def read_lanelets(
     ]
     if swapped:
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
-    notes += light_notes
-    lanes = mark_intersections(lanes)
-    if (
-        root.find("lanelet/leftBound/lineMarking") is None
-        and root.find("lanelet/rightBound/lineMarking") is None
-    ):
+    if root.find("lanelet/*/lineMarking") is None:
         notes.append("the file has no line markings: the paint of all lane edges is unknown")
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )
-    known = tuple(signals) if signals else None
+    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     return LaneMap(
-        lanes=lanes,
-        road_edges=edges,
+        lanes=mark_intersections(lanes),
+        road_edges=border_lines(surface, np.concatenate(lane_edges(lanes))),
         crosswalks=tuple(crosswalks),
         stop_lines=tuple(stop_lines),
-        signals=known,
+        signals=tuple(signals) or None,
     ), tuple(notes)
 
 
-def point(files: SourceFiles, where: str, element: Element) -> tuple[float, float, float]:
+def point(element: Element) -> tuple[float, float, float]:
     """Read ``x``, ``y`` and, where given, ``z`` of a point element in metres."""
-    x, y = (number(files, where, element.find(axis), axis) for axis in ("x", "y"))
-    height = element.find("z")
-    return x, y, 0.0 if height is None else number(files, where, height, "z")
+    return number(element, "x"), number(element, "y"), number(element, "z", 0.0)
 
 
-def number(files: SourceFiles, where: str, element: Element | None, what: str) -> float:
-    """Read a finite number out of an element's text.
+def number(element: Element, place: str, default: float | None = None) -> float:
+    """Read a finite number out of an element below another.
 
     Raises:
-        InputError: The element is missing or holds no finite number.
+        ValueError: The element is missing or holds no finite number.
     """
-    if element is None:
-        raise InputError(f"{where}: no {what}", f"add {what}")
-    try:
-        value = float(str(element.text))
-    except ValueError as error:
-        raise InputError(f"{where}: {what} = {element.text!r}", "give a number") from error
+    text = element.findtext(place)
+    if text is None and default is not None:
+        return default
+    value = float(text or "nan")
     if not np.isfinite(value):
-        raise InputError(f"{where}: {what} = {element.text!r}", "give a finite number")
+        raise ValueError(f"{place} = {text!r}, which is no finite number")
     return value
 
 
-def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: F64) -> F64:
-    bound = element.find(side)
-    points = (
-        []
-        if bound is None
-        else [point(files, f"{where}, {side}", p) for p in bound.findall("point")]
-    )
-    if len(points) < 2:
-        raise InputError(
-            f"{where}: {side} with {len(points)} points",
-            "give each lanelet two bounds of at least 2 points",
-        )
-    return files.near(f"{where}, {side}", np.array(points, dtype=np.float64) - origin)
+def _line(element: Element, name: str, least: int) -> F64:
+    points = [point(one) for one in element.findall(f"{name}/point")]
+    if len(points) < least:
+        raise ValueError(f"{name} with {len(points)} points, at least {least} are needed")
+    return np.array(points, dtype=np.float64)
 
 
-def _marking(element: Element, side: str) -> Paint:
-    text = element.findtext(f"{side}/lineMarking")
-    return PAINTS.get(str(text), "unknown")
-
-
-def _stop_line(
-    files: SourceFiles, where: str, element: Element, left: F64, right: F64, origin: F64
-) -> list[F64]:
-    line = element.find("stopLine")
-    if line is None:
-        return []
-    points = [point(files, f"{where}, stopLine", p) for p in line.findall("point")]
-    return [np.array(points) - origin if len(points) == 2 else np.stack([left[-1], right[-1]])]
-
-
-def _traffic_lights(
-    files: SourceFiles, path: Path, root: Element
-) -> tuple[dict[str, Cycle], list[str]]:
+def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[str]]:
     """Return the cycle of each traffic light that is on and holds back all directions, by id
     (2020a), with a note on the others.
 
@@ -232,33 +192,20 @@ def _traffic_lights(
     found: dict[str, Cycle] = {}
     lights = root.findall("trafficLight")
     for light in lights:
-        where = f"{path}, trafficLight {light.get('id')}"
-        cycle = light.find("cycle")
-        if (
-            cycle is None
-            or light.findtext("active") == "false"
-            or light.findtext("direction") not in (None, "all")
-        ):
+        key = str(light.get("id"))
+        parts = light.findall("cycle/cycleElement")
+        partly = light.findtext("direction") not in (None, "all")
+        if not parts or light.findtext("active") == "false" or partly:
             continue
-        phases = []
-        for part in cycle.findall("cycleElement"):
-            colour = COLOURS.get(str(part.findtext("color")))
-            steps = number(files, where, part.find("duration"), "duration")
-            if colour is None or steps <= 0:
-                said = f"color {part.findtext('color')!r}, duration {steps:g}"
-                raise InputError(
-                    f"{where}: {said}",
-                    f"use {', '.join(COLOURS)} and durations above 0, in time steps",
-                )
-            phases.append((colour, round(steps * step_us)))
-        offset = cycle.find("timeOffset")
-        if phases:
-            found[str(light.get("id"))] = (
-                tuple(phases),
-                0
-                if offset is None
-                else round(number(files, where, offset, "timeOffset") * step_us),
-            )
+        do_this = f"use {', '.join(COLOURS)} and durations above 0, in time steps"
+        with parsing(f"{path}, trafficLight {key}", do_this):
+            phases = []
+            for part in parts:
+                lasts_us = round(number(part, "duration") * step_us)
+                if lasts_us <= 0:
+                    raise ValueError(f"a duration of {lasts_us} us")
+                phases.append((COLOURS[str(part.findtext("color"))], lasts_us))
+            found[key] = tuple(phases), round(number(light, "cycle/timeOffset", 0.0) * step_us)
     left_out = len(lights) - len(found)
     return found, [
         f"{left_out} traffic lights are off, without a cycle or for some directions only, and are not used"
@@ -270,25 +217,17 @@ def _speed_signs(root: Element) -> dict[str, float]:
     speeds: dict[str, float] = {}
     for sign in root.findall("trafficSign"):
         for part in sign.findall("trafficSignElement"):
-            value = part.findtext("additionalValue")
-            if part.findtext("trafficSignID") in MAX_SPEED_SIGNS and value is not None:
-                try:
-                    speeds[str(sign.get("id"))] = float(value)
-                except ValueError:
-                    continue  # a textual value ("30 mph zone") is no number to rely on
+            if part.findtext("trafficSignID") in MAX_SPEED_SIGNS:
+                with contextlib.suppress(ValueError):  # "30 mph zone" is no number to rely on
+                    speeds[str(sign.get("id"))] = number(part, "additionalValue")
     return speeds
 
 
-def _speed_limit(
-    files: SourceFiles, where: str, element: Element, signs: dict[str, float]
-) -> float | None:
-    given = element.find("speedLimit")
-    if given is not None and (given.text or "").strip():
-        return number(files, where, given, "speedLimit")
-    limits = [
-        signs[ref] for s in element.findall("trafficSignRef") if (ref := str(s.get("ref"))) in signs
-    ]
-    return min(limits) if limits else None
+def _speed_limit(element: Element, signs: dict[str, float]) -> float | None:
+    if (element.findtext("speedLimit") or "").strip():
+        return number(element, "speedLimit")
+    refs = [str(ref.get("ref")) for ref in element.findall("trafficSignRef")]
+    return min((signs[ref] for ref in refs if ref in signs), default=None)
 
 
 def mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
@@ -302,16 +241,9 @@ def mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
     marked: dict[str, Lane] = {}
     for n, (key, lane) in enumerate(lanes.items()):
         friends = {key, *lane.successors, *before[key], lane.left_neighbour, lane.right_neighbour}
-        covered = [
-            polygons[m]
-            for m in tree.query(polygons[n], predicate="intersects")
-            if ids[m] not in friends
-        ]
-        shared = (
-            shapely.area(shapely.intersection(polygons[n], shapely.union_all(covered)))
-            if covered
-            else 0.0
-        )
+        others = tree.query(polygons[n], predicate="intersects")
+        covering = shapely.union_all([polygons[m] for m in others if ids[m] not in friends])
+        shared = shapely.area(shapely.intersection(polygons[n], covering))
         crossing = lane.is_intersection or bool(shared > CROSSING_SHARE * polygons[n].area)
         marked[key] = replace(lane, is_intersection=crossing)
     return marked

@@ -52,6 +52,17 @@ STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up t
 STATIC_SPEED_MPS = 0.3
 
 
+def near(where: Path | str, xyz: F64) -> F64:
+    """Return local points ``(..., 3)`` after checking that they are finite and within `MAX_REACH_M`
+    of the origin.
+    """
+    distance = float(np.abs(xyz).max(initial=0.0))  # NaN stays NaN
+    if not distance <= MAX_REACH_M:
+        found = f"a point {distance / 1000:.1f} km from the drive"
+        raise InputError(f"{where}: {found}", "repair the coordinates of this file")
+    return xyz
+
+
 class SourceFiles:
     """Reads the files of one recorded log and hashes what it read.
 
@@ -70,19 +81,7 @@ class SourceFiles:
         """Make the error that names a file; the caller raises it."""
         return InputError(f"{path}: {found}", do_this)
 
-    def near(self, where: Path | str, xyz: F64) -> F64:
-        """Return local points ``(..., 3)`` after checking that they are finite and within
-        `MAX_REACH_M` of the origin.
-        """
-        distance = float(np.abs(xyz).max(initial=0.0))  # NaN stays NaN
-        if not distance <= MAX_REACH_M:
-            found = (
-                "a coordinate that is not finite"
-                if not np.isfinite(distance)
-                else f"a point {distance / 1000:.1f} km from the drive"
-            )
-            raise InputError(f"{where}: {found}", "repair the coordinates of this file")
-        return xyz
+    near = staticmethod(near)
 
     def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
         """Return the one file of a folder that matches one of the glob patterns, the first pattern

@@ -15,7 +15,6 @@ from alpasim_plugin.core.types import CameraSpec, SensorSpec
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad_map import read_lanelets
 from scenarios.load import load_scenario
-from scenarios.recorded import SourceFiles
 from scenarios.suite import load_suite
 from tests.scenarios.make_argoverse import TRACKS, cuboids, write_argoverse
 from tests.scenarios.make_commonroad import lanelet
@@ -71,6 +70,6 @@ def test_lanelets_of_an_unknown_type_are_said(tmp_path):
     root = ElementTree.fromstring(
         f'<commonRoad timeStepSize="0.1">{lanelet(1, 0, 50, 0, types)}</commonRoad>'
     )
-    _, notes = read_lanelets(SourceFiles(), Path("a.xml"), root, np.zeros(3))
+    _, notes = read_lanelets(Path("a.xml"), root, np.zeros(3))
     assert any("restricted" in note for note in notes)
     assert not any("urban" in note for note in notes)
