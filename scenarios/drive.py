@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NotRequired
+from typing import Any
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_array, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.reading import file_sha256, parsing
 from alpasim_plugin.core.reading.arrays import open_npy
-from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -31,133 +30,18 @@ from alpasim_plugin.core.types import (
     HeightField,
     Lane,
     LaneMap,
-    Marking,
-    Paint,
     Photograph,
     Trajectory,
     Vehicle,
 )
-from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, stands_still
+from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 
 DRIVE_FILE = "drive.json"
 TRANSFORMS_FILE = "transforms.json"
 GROUND_FILE = "ground.npy"
 MODEL_FOLDER = "model"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
-LINES: tuple[Literal["road_edges", "crosswalks", "stop_lines"], ...] = (
-    "road_edges",
-    "crosswalks",
-    "stop_lines",
-)
-Numbers = list[float]
-Rows = list[list[float]]
-
-
-class _Poses(TypedDict):
-    t_us: list[int]
-    xyz: Rows
-    quat: Rows
-
-
-class _Camera(TypedDict):
-    name: str
-    width: int
-    height: int
-    K: Rows
-    T_rig_camera: Rows
-
-
-class _Lane(TypedDict):
-    lane_id: str
-    centre: Rows
-    left: Rows | None
-    right: Rows | None
-    kind: str
-    successors: list[str]
-    left_neighbour: str | None
-    right_neighbour: str | None
-    left_paint: Paint
-    right_paint: Paint
-    is_intersection: bool
-    speed_limit_mps: float | None
-
-
-class _Marking(TypedDict):
-    xyz: Rows
-    paint: Paint
-
-
-class _Map(TypedDict):
-    lanes: list[_Lane]
-    road_edges: list[Rows]
-    crosswalks: list[Rows]
-    stop_lines: list[Rows]
-    markings: list[_Marking]
-
-
-class _Track(TypedDict):
-    id: str
-    label: str
-    size_m: Numbers
-    poses: _Poses
-
-
-class _Obstacle(TypedDict):
-    id: str
-    size_m: Numbers
-    xyz: Numbers  # of the box's middle
-    yaw_rad: float
-    uncertainty_m: float
-
-
-class _Grid(TypedDict):
-    x0_m: float
-    y0_m: float
-    cell_m: float
-
-
-class _Body(TypedDict):
-    length_m: float
-    width_m: float
-    height_m: float
-    rear_axle_to_centre_m: float
-
-
-class DriveDocument(TypedDict):
-    """What ``drive.json`` holds."""
-
-    format: Literal["simrun drive"]
-    version: Literal[1]
-    scene_id: str
-    ego: _Poses
-    vehicle: NotRequired[_Body]
-    cameras: list[_Camera]
-    map: _Map
-    ground: _Grid
-    tracks: list[_Track]
-    obstacles: list[_Obstacle] | None  # None: not looked for
-    world_origin: Numbers
-    notes: list[str]
-
-
-class _Frame(TypedDict):
-    file_path: str
-    transform_matrix: Rows
-    w: int
-    h: int
-    fl_x: float
-    fl_y: float
-    cx: float
-    cy: float
-    t_us: int
-    camera: str
-    use: Literal["fitted", "held-out", "never-fitted"]
-    exposure: NotRequired[Numbers]
-
-
-class _Transforms(TypedDict):
-    axes: Literal["opencv"]
-    frames: list[_Frame]
+LINES = ("road_edges", "crosswalks", "stop_lines")
 
 
 @dataclass(frozen=True)
@@ -179,52 +63,47 @@ class Obstacle:
     uncertainty_m: float
 
 
-def write_drive(
-    folder: Path, log: RecordedLog, tracks: Sequence[Actor], obstacles: Sequence[Obstacle] | None
-) -> None:
-    """Write ``drive.json`` and ``ground.npy``; pictures and model are written by who makes them.
+def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -> None:
+    """Write ``drive.json`` and ``ground.npy``; images and model are written by who makes them.
 
     Args:
         folder: Of the drive, which exists.
         log: Map, ground, ego, vehicle, cameras, origin and notes; its actors are not read.
-        tracks: Recorded road users.
-        obstacles: What stands in the model; None where it was not looked for.
+        obstacles: What stands in the model.
     """
     write_array(folder / GROUND_FILE, log.ground.z)
-    box = log.vehicle.box
+    ego, lane_map = log.ego_log, log.lane_map
     document = {
         "format": "simrun drive",
         "version": 1,
         "scene_id": log.scene_id,
-        "ego": _poses(log.ego_log),
+        "ego": {"t_us": ego.t_us.tolist(), "xyz": ego.xyz.tolist(), "quat": ego.quat.tolist()},
         "vehicle": {
-            "length_m": box.length_m,
-            "width_m": box.width_m,
-            "height_m": box.height_m,
+            **vars(log.vehicle.box),
             "rear_axle_to_centre_m": log.vehicle.rear_axle_to_centre_m,
         },
         "cameras": [
             {
-                "name": c.name,
-                "width": c.width,
-                "height": c.height,
-                "K": c.K.tolist(),
-                "T_rig_camera": c.T_rig_camera.tolist(),
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "K": camera.K.tolist(),
+                "T_rig_camera": camera.T_rig_camera.tolist(),
             }
-            for c in log.cameras
+            for camera in log.cameras
         ],
-        "map": _map_document(log.lane_map),
+        "map": {
+            "lanes": [
+                {name: _plain(value) for name, value in vars(lane).items()}
+                for lane in lane_map.lanes.values()
+            ],
+            **{name: [line.tolist() for line in getattr(lane_map, name)] for name in LINES},
+        },
         "ground": {"x0_m": log.ground.x0_m, "y0_m": log.ground.y0_m, "cell_m": log.ground.cell_m},
-        "tracks": [
-            {"id": a.actor_id, "label": a.label, "size_m": _size(a.box), "poses": _poses(a.track)}
-            for a in tracks
-        ],
-        "obstacles": None
-        if obstacles is None
-        else [
+        "obstacles": [
             {
                 "id": one.obstacle_id,
-                "size_m": _size(one.box),
+                "size_m": [one.box.length_m, one.box.width_m, one.box.height_m],
                 "xyz": one.xyz.tolist(),
                 "yaw_rad": one.yaw_rad,
                 "uncertainty_m": one.uncertainty_m,
@@ -237,6 +116,10 @@ def write_drive(
     write_json(folder / DRIVE_FILE, document)
 
 
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def read_drive(folder: Path) -> RecordedLog:
     """Read what ``simrun import`` has written, as a recorded log with its photographs and the
     folder of its model.
@@ -246,54 +129,44 @@ def read_drive(folder: Path) -> RecordedLog:
             it.
     """
     files = SourceFiles()
-    path = folder / DRIVE_FILE
-    document = as_shape(DriveDocument, files.read_json(path), path, DO_THIS)
-    ego = document["ego"]
-    log = checked_trajectory(
-        path,
-        np.array(ego["t_us"], np.int64),
-        _rows(ego["xyz"]),
-        _rows(ego["quat"], 4),
-        least=2,
-    )
-    model = folder / MODEL_FOLDER
+    path, model = folder / DRIVE_FILE, folder / MODEL_FOLDER
+    document = files.read_json(path)
     _note_files(files, model)
-    obstacles = [_obstacle_actor(one, log) for one in document["obstacles"] or ()]
-    tracks = [_track_actor(files, path, track) for track in document["tracks"]]
-    body = document.get("vehicle")
-    return RecordedLog(
-        scene_id=document["scene_id"],
-        source="drive",
-        lane_map=_map_of(document["map"]),
-        ground=_ground_of(files, folder, document["ground"]),
-        ego_log=log,
-        vehicle=Vehicle(
-            Box(body["length_m"], body["width_m"], body["height_m"]), body["rear_axle_to_centre_m"]
-        )
-        if body
-        else Vehicle(),
-        actors=(*tracks, *obstacles),
-        cameras=tuple(
+    with parsing(path, DO_THIS, "no drive of simrun"):
+        if (document["format"], document["version"]) != ("simrun drive", 1):
+            raise ValueError(f"version {document['version']!r}")
+        ego = document["ego"]
+        t_us = np.array(ego["t_us"], np.int64)
+        log = checked_trajectory(path, t_us, _rows(ego["xyz"]), _rows(ego["quat"], 4), least=2)
+        body = document["vehicle"]
+        size = body["length_m"], body["width_m"], body["height_m"]
+        cameras = [
             CameraSpec(
-                c["name"], c["width"], c["height"], _rows(c["K"]), _rows(c["T_rig_camera"], 4)
+                one["name"],
+                one["width"],
+                one["height"],
+                _rows(one["K"]),
+                _rows(one["T_rig_camera"], 4),
             )
-            for c in document["cameras"]
-        ),
-        world_origin=(*document["world_origin"],),  # type: ignore[arg-type]  # three numbers
-        content_hash=files.content_hash,
-        notes=tuple(document["notes"]),
-        recording=_recording(files, folder),
-        model=str(model),
-        standing="unknown" if document["obstacles"] is None else "found",
-    )
-
-
-def _poses(track: Trajectory) -> _Poses:
-    return {"t_us": track.t_us.tolist(), "xyz": track.xyz.tolist(), "quat": track.quat.tolist()}
-
-
-def _size(box: Box) -> Numbers:
-    return [box.length_m, box.width_m, box.height_m]
+            for one in document["cameras"]
+        ]
+        x, y, z = document["world_origin"]
+        return RecordedLog(
+            scene_id=document["scene_id"],
+            source="drive",
+            lane_map=_map_of(document["map"]),
+            ground=_ground_of(files, folder, document["ground"]),
+            ego_log=log,
+            vehicle=Vehicle(Box(*size), body["rear_axle_to_centre_m"]),
+            actors=tuple(_obstacle_actor(one, log) for one in document["obstacles"]),
+            cameras=tuple(cameras),
+            world_origin=(x, y, z),
+            content_hash=files.content_hash,
+            notes=tuple(document["notes"]),
+            recording=_recording(files, folder),
+            model=str(model),
+            standing="found",
+        )
 
 
 def _rows(values: Any, width: int = 3) -> F64:
@@ -301,97 +174,51 @@ def _rows(values: Any, width: int = 3) -> F64:
     return np.array(values, dtype=np.float64).reshape(-1, width)
 
 
-def _map_document(lane_map: LaneMap) -> JsonObject:
-    return {
-        "lanes": [
-            {name: _plain(getattr(lane, name)) for name in _Lane.__annotations__}
-            for lane in lane_map.lanes.values()
-        ],
-        **{name: [line.tolist() for line in getattr(lane_map, name)] for name in LINES},
-        "markings": [{"xyz": m.xyz.tolist(), "paint": m.paint} for m in lane_map.markings],
-    }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _map_of(document: _Map) -> LaneMap:
+def _map_of(document: JsonObject) -> LaneMap:
     lanes = {}
-    for lane in document["lanes"]:
-        fields: JsonObject = {**lane, "successors": tuple(lane["successors"])}
-        for name in ("centre", "left", "right"):
-            fields[name] = None if fields[name] is None else _rows(fields[name])
-        lanes[lane["lane_id"]] = Lane(**fields)
-    lines: JsonObject = {name: tuple(map(_rows, document[name])) for name in LINES}
-    markings = tuple(Marking(_rows(one["xyz"]), one["paint"]) for one in document["markings"])
-    return LaneMap(lanes, **lines, markings=markings)
+    for fields in document["lanes"]:
+        lines = {name: _rows(fields[name]) for name in ("centre", "left", "right")}
+        lane = Lane(**{**fields, **lines, "successors": tuple(fields["successors"])})
+        lanes[lane.lane_id] = lane
+    return LaneMap(lanes, **{name: tuple(map(_rows, document[name])) for name in LINES})
 
 
-def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
+def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightField:
     path = folder / GROUND_FILE
     files.note_bytes(GROUND_FILE, files.read_bytes(path))
-    z = np.asarray(open_npy(path, DO_THIS))
+    z = np.array(open_npy(path, DO_THIS), dtype=np.float64)
     if z.ndim != 2 or min(z.shape) < 2:
         raise InputError(f"{path}: heights of shape {z.shape}", DO_THIS)
-    return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], np.array(z, dtype=np.float64))
+    return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], z)
 
 
-def _track_actor(files: SourceFiles, path: Path, track: _Track) -> Actor:
-    poses, where = track["poses"], f"{path}, track {track['id']}"
-    one = checked_trajectory(
-        where,
-        np.array(poses["t_us"], np.int64),
-        _rows(poses["xyz"]),
-        _rows(poses["quat"], 4),
-    )
-    return Actor(
-        track["id"],
-        track["label"],
-        Box(*track["size_m"]),
-        one,
-        stands_still(one.t_us, one.xyz, track["label"]),
-    )
-
-
-def _obstacle_actor(one: _Obstacle, ego: Trajectory) -> Actor:
+def _obstacle_actor(one: JsonObject, ego: Trajectory) -> Actor:
     """Return an obstacle as an actor that stands for the whole drive."""
-    half = one["yaw_rad"] / 2
-    ends = np.array([ego.t_us[0], ego.t_us[-1]])
-    quat = np.tile([np.cos(half), 0.0, 0.0, np.sin(half)], (2, 1))
-    return Actor(
-        one["id"],
-        "other",
-        Box(*one["size_m"]),
-        Trajectory(ends, np.tile(_rows(one["xyz"]), (2, 1)), quat),
-        is_static=True,
-    )
+    xyz, quat = np.tile(_rows(one["xyz"]), (2, 1)), quat_from_yaw([one["yaw_rad"]] * 2)
+    track = Trajectory(ego.t_us[[0, -1]], xyz, quat)
+    return Actor(one["id"], "other", Box(*one["size_m"]), track, is_static=True)
 
 
 def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
     path = folder / TRANSFORMS_FILE
-    frames = as_shape(_Transforms, files.read_json(path), path, DO_THIS)["frames"]
-    return tuple(_photograph(folder, frame) for frame in frames)
+    document = files.read_json(path)
+    with parsing(path, DO_THIS):
+        return tuple(_photograph(folder, frame) for frame in document["frames"])
 
 
-def _photograph(folder: Path, frame: _Frame) -> Photograph:
-    K = np.array(
-        [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
-    )
-    one = Photograph(
+def _photograph(folder: Path, frame: JsonObject) -> Photograph:
+    K = [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
+    return Photograph(
         frame["t_us"],
         frame["camera"],
         frame["w"],
         frame["h"],
-        K,
+        np.array(K),
         _rows(frame["transform_matrix"], 4),
         str(folder / frame["file_path"]),
         frame["use"],
+        tuple(frame.get("exposure", (1.0, 1.0, 1.0))),  # type: ignore[arg-type]  # three gains
     )
-    gains = frame.get("exposure")
-    return one if gains is None else replace(one, exposure=(gains[0], gains[1], gains[2]))
 
 
 def _note_files(files: SourceFiles, model: Path) -> None:

@@ -226,12 +226,7 @@ def write_folder(
         np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8),
     )
     _write_transforms(work, shown, exposures)
-    write_drive(
-        work,
-        log,
-        [],
-        standing.obstacles,
-    )
+    write_drive(work, log, standing.obstacles)
     comparisons, coverage = measure(model, views, exposures, tell)
     quality = write_page(work, drive, placed, standing, len(views["fitted"]), comparisons, coverage)
     length_us = int(log.ego_log.t_us[-1])
