@@ -30,10 +30,8 @@ from scenarios.opendrive_road import (
     OdrLane,
     OdrMap,
     Road,
-    RoadLink,
     Section,
     cubics_at,
-    curved,
     driven_along,
     gap_m,
     lane_borders,
@@ -156,7 +154,7 @@ def _ahead(
     next_section = index + (1 if along else -1)
     if 0 <= next_section < len(road.sections):
         return [lane_key(road, next_section, i) for i in linked or (lane.lane_id,)]
-    link: RoadLink | None = road.successor if along else road.predecessor
+    link = road.successor if along else road.predecessor
     if link is None:
         return []
     if link.kind == "junction":
@@ -254,7 +252,7 @@ def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
 
 
 def lane_map_of(
-    files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map: F64
+    where: Path | str, odr: OdrMap, T_local_map: F64
 ) -> tuple[LaneMap, tuple[str, ...]]:
     """Return the lane map of a parsed file in the local frame, with notes on what was left out.
 
@@ -264,12 +262,12 @@ def lane_map_of(
         InputError: No road has a lane for vehicles.
     """
     odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
-    lanes, notes = read_lanes(files, where, odr, T_local_map)
+    lanes, notes = read_lanes(where, odr, T_local_map)
     return bordered(lanes, roadside(odr, lanes, T_local_map)), notes
 
 
 def read_lanes(
-    files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map: F64
+    where: Path | str, odr: OdrMap, T_local_map: F64
 ) -> tuple[dict[str, Lane], tuple[str, ...]]:
     """Return the linked lanes of a parsed file in the local frame, with notes on what was left out.
 
@@ -327,13 +325,13 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     Raises:
         InputError: The file is no map, or broken.
     """
-    odr = parse_map(files, path, files.read_xml(path))
+    odr = parse_map(path, files.read_xml(path))
     odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     starts = [road.records[0] for road in odr.roads if road.records]
     origin = (np.round(starts[0].x_m), np.round(starts[0].y_m), 0.0) if starts else (0.0, 0.0, 0.0)
     T_local_map = np.eye(4)
     T_local_map[:3, 3] = np.negative(origin)
-    lanes, notes = read_lanes(files, path, odr, T_local_map)
+    lanes, notes = read_lanes(path, odr, T_local_map)
     heads, light_notes = traffic_lights(odr, lanes, T_local_map)
     roads = {road.road_id: road for road in odr.roads if road.records and road.sections}
 
@@ -435,19 +433,14 @@ def _stations(road: Road, section: Section) -> F64:
     """Return the arc lengths of a section's stations: its ends, the start of every record, and no
     gap above the step.
     """
-    cubics = [
-        *road.lane_offset,
-        *(c for lane in section.lanes for c in (*lane.widths, *lane.borders)),
-    ]
-    bends = curved(road.records) or any(abs(c.b) + abs(c.c) + abs(c.d) > 0 for c in cubics)
-    starts = [
-        *(r.s_m for r in road.records),
-        *(c.s_m for c in cubics),
-        *(c.s_m for c in road.elevation),
-    ]
+    lines = [record for lane in section.lanes for record in (lane.widths, lane.borders)]
+    cubics = np.concatenate([road.lane_offset, *lines])
+    curved = any(record.kind != "line" for record in road.records)
+    starts = [*(record.s_m for record in road.records), *cubics[:, 0], *road.elevation[:, 0]]
     inside = [at for at in starts if section.s_m < at < section.end_m]
     knots = np.unique([section.s_m, *inside, section.end_m])
-    step = STEP_M if bends or len(road.elevation) > 1 else STRAIGHT_STEP_M
+    bends = curved or cubics[:, 2:].any() or len(road.elevation) > 1
+    step = STEP_M if bends else STRAIGHT_STEP_M
     pieces = np.maximum(np.ceil(np.diff(knots) / step - 1e-9).astype(np.int64), 1)
     parts = [
         np.linspace(a, b, n, endpoint=False)

@@ -12,24 +12,21 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import scipy
+from numpy.polynomial import Polynomial
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64
-from scenarios.recorded import SourceFiles
-
-Kind = Literal["line", "arc", "spiral", "poly3", "paramPoly3"]
-KINDS: tuple[Kind, ...] = ("line", "arc", "spiral", "poly3", "paramPoly3")
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
-_TABLE = 257  # stations at which a cubic's arc length is tabulated before it is inverted
+_TABLE = 2001  # places at which a cubic's arc length is tabulated before it is inverted
 
 MAX_ROAD_M = MAP_ROAD_M.high
 # Elements of a map that are read, or that change no road; types of junctions that are read.
@@ -49,17 +46,6 @@ _PARAMETERS = {
 
 
 @dataclass(frozen=True)
-class Cubic:
-    """``a + b ds + c ds^2 + d ds^3`` from ``s_m`` on, where ``ds = s - s_m``."""
-
-    s_m: float
-    a: float
-    b: float = 0.0
-    c: float = 0.0
-    d: float = 0.0
-
-
-@dataclass(frozen=True)
 class Geometry:
     """One record of a plan view."""
 
@@ -68,7 +54,7 @@ class Geometry:
     y_m: float
     heading_rad: float
     length_m: float
-    kind: Kind
+    kind: str  # of `_PARAMETERS`
     # line: none; arc: curvature; spiral: start and end curvature; poly3: a b c d; paramPoly3: aU bU
     # cU dU aV bV cV dV.
     numbers: tuple[float, ...] = ()
@@ -80,11 +66,16 @@ class Geometry:
         """
         if self.kind in ("line", "arc", "spiral"):
             return self._clothoid(s_m)
-        u, v, heading = self._poly3(s_m) if self.kind == "poly3" else self._param_poly3(s_m)
+        if self.kind == "poly3":
+            p, along, across = self._along_poly3(s_m), Polynomial([0.0, 1.0]), self.numbers
+        else:
+            p = s_m / self.length_m if self.normalised and self.length_m > 0 else s_m
+            along, across = Polynomial(self.numbers[:4]), self.numbers[4:]
+        left = Polynomial(across)
+        u, v = along(p), left(p)
+        heading = self.heading_rad + np.arctan2(left.deriv()(p), along.deriv()(p))
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
-        return np.column_stack(
-            [self.x_m + u * c - v * s, self.y_m + u * s + v * c, self.heading_rad + heading]
-        )
+        return np.column_stack([self.x_m + u * c - v * s, self.y_m + u * s + v * c, heading])
 
     def _clothoid(self, s_m: F64) -> F64:
         """Integrate the heading, which is quadratic in s; 32-point Gauss-Legendre is exact to
@@ -98,38 +89,12 @@ class Geometry:
         y = self.y_m + 0.5 * s_m * (np.sin(heading) @ _WEIGHTS)
         return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
 
-    def _poly3(self, s_m: F64) -> tuple[F64, F64, F64]:
-        """Return u, v and heading of ``v = a + b u + c u^2 + d u^3``; u follows from the arc
-        length.
-        """
-        a, b, c, d = self.numbers
-        reach = max(self.length_m, 1e-9)
-        table_u = np.linspace(0.0, reach, _TABLE)  # an arc is never shorter than its u
-
-        def slope(u: F64) -> F64:
-            return b + u * (2 * c + 3 * d * u)
-
-        half = 0.5 * np.diff(table_u)[:, None]
-        nodes = 0.5 * (table_u[1:] + table_u[:-1])[:, None] + half * _NODES
-        lengths = np.concatenate(
-            [[0.0], np.cumsum(np.sum(half * _WEIGHTS * np.hypot(1.0, slope(nodes)), axis=1))]
-        )
-        u = np.interp(s_m, lengths, table_u)
-        for _ in range(3):  # Newton on the arc length from the table's station below
-            below = np.clip(np.searchsorted(table_u, u, side="right") - 1, 0, _TABLE - 1)
-            gap = 0.5 * (u - table_u[below])
-            part = gap * (
-                np.hypot(1.0, slope(table_u[below][:, None] + gap[:, None] * (1.0 + _NODES)))
-                @ _WEIGHTS
-            )
-            u = u - (lengths[below] + part - s_m) / np.hypot(1.0, slope(u))
-        return u, a + u * (b + u * (c + d * u)), np.arctan(slope(u))
-
-    def _param_poly3(self, s_m: F64) -> tuple[F64, F64, F64]:
-        p = s_m / self.length_m if self.normalised and self.length_m > 0 else s_m
-        (au, bu, cu, du), (av, bv, cv, dv) = self.numbers[:4], self.numbers[4:]
-        u, v = au + p * (bu + p * (cu + du * p)), av + p * (bv + p * (cv + dv * p))
-        return u, v, np.arctan2(bv + p * (2 * cv + 3 * dv * p), bu + p * (2 * cu + 3 * du * p))
+    def _along_poly3(self, s_m: F64) -> F64:
+        """Return u at arc lengths of ``v = a + b u + c u^2 + d u^3``."""
+        u = np.linspace(0.0, max(self.length_m, 1e-9), _TABLE)  # an arc is never shorter than its u
+        speed = np.hypot(1.0, Polynomial(self.numbers).deriv()(u))
+        s = scipy.integrate.cumulative_simpson(speed, x=u, initial=0)
+        return np.asarray(scipy.interpolate.CubicSpline(s, u)(s_m))
 
 
 def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
@@ -204,16 +169,18 @@ def _in_force(road: Road, s_m: float, sign: int) -> tuple[Section, ...]:
     return tuple(said[-1:])
 
 
-def cubics_at(records: Sequence[Cubic], s_m: F64) -> F64:
+def cubics_at(records: F64, s_m: F64) -> F64:
     """Return ``(N,)`` the value of the record in force at each arc length; before the first record
     that one is extended, none gives 0.
+
+    Args:
+        records: Rows s, a, b, c, d, ordered by s: ``a + b ds + c ds^2 + d ds^3`` from s on.
+        s_m: ``(N,)``.
     """
-    if not records:
+    if not len(records):
         return np.zeros(len(s_m))
-    table = np.array([[one.s_m, one.a, one.b, one.c, one.d] for one in records])
-    s0, a, b, c, d = table[
-        np.clip(np.searchsorted(table[:, 0], s_m, side="right") - 1, 0, len(records) - 1)
-    ].T
+    rows = np.searchsorted(records[:, 0], s_m, side="right") - 1
+    s0, a, b, c, d = records[np.maximum(rows, 0)].T
     ds = s_m - s0
     return a + ds * (b + ds * (c + d * ds))
 
@@ -233,8 +200,8 @@ class OdrLane:
 
     lane_id: int
     kind: str
-    widths: tuple[Cubic, ...]
-    borders: tuple[Cubic, ...]
+    widths: F64  # see `cubics_at`
+    borders: F64
     successors: tuple[int, ...]
     predecessors: tuple[int, ...]
     mark: tuple[str, str] | None  # type and colour of the first road mark of its outer border
@@ -298,9 +265,9 @@ class Road:
     junction: str  # "-1": none
     left_hand: bool  # traffic keeps left
     records: tuple[Geometry, ...]
-    elevation: tuple[Cubic, ...]
-    superelevation: tuple[Cubic, ...]
-    lane_offset: tuple[Cubic, ...]
+    elevation: F64  # see `cubics_at`
+    superelevation: F64
+    lane_offset: F64
     sections: tuple[Section, ...]
     successor: RoadLink | None
     predecessor: RoadLink | None
@@ -333,7 +300,7 @@ class OdrMap:
     notes: tuple[str, ...] = ()
 
 
-def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
+def parse_map(where: Path | str, root: Element) -> OdrMap:
     """Parse an OpenDRIVE document.
 
     Raises:
@@ -341,46 +308,49 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     """
     for element in root.iter():  # without namespaces
         element.tag = element.tag.rpartition("}")[2]
-    if root.tag != "OpenDRIVE":
+    elements = {str(road.get("id")): road for road in root.findall("road")}
+    if root.tag != "OpenDRIVE" or not elements:
         raise InputError(
-            f"{where}: a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>"
+            f"{where}: a document <{root.tag}> of {len(elements)} roads",
+            "give an OpenDRIVE file, whose root is <OpenDRIVE>, with at least one road",
         )
-    roads = tuple(_road(files, where, element) for element in root.findall("road"))
-    if not roads:
-        raise InputError(f"{where}: a map without roads", "use a map with at least one road")
-    road_id, n_roads = Counter(road.road_id for road in roads).most_common(1)[0]
-    if n_roads > 1:
-        raise InputError(
-            f"{where}: {n_roads} roads of id {road_id!r}", "give every road its own id"
+    if len(elements) < len(root.findall("road")):
+        raise InputError(f"{where}: two roads of one id", "give every road its own id")
+    originals = {str(signal.get("id")): signal for signal in root.iter("signal")}
+    unused: Counter[str] = Counter()
+    roads = []
+    for road_id, element in elements.items():
+        with parsing(f"{where}, road {road_id}", "correct the numbers of this road"):
+            roads.append(_road(element, f"{where}, road {road_id}", originals, unused))
+    with parsing(where, "correct the links of its junctions"):
+        connections = tuple(
+            Connection(
+                junction.get("id", ""),
+                one.get("incomingRoad", ""),
+                one.get("connectingRoad", one.get("linkedRoad", "")),
+                one.get("contactPoint", "start") == "start",
+                tuple(
+                    (int(link.get("from", "")), int(link.get("to", "")))
+                    for link in one.findall("laneLink")
+                ),
+                "linkedRoad" in one.attrib,
+            )
+            for junction in root.findall("junction")
+            for one in junction.findall("connection")
         )
-    connections = tuple(
-        Connection(
-            j.get("id", ""),
-            c.get("incomingRoad", ""),
-            c.get("connectingRoad", c.get("linkedRoad", "")),
-            c.get("contactPoint", "start") == "start",
-            tuple(
-                (_integer(files, where, link, "from"), _integer(files, where, link, "to"))
-                for link in c.findall("laneLink")
-            ),
-            "linkedRoad" in c.attrib,
-        )
-        for j in root.findall("junction")
-        for c in j.findall("connection")
-    )
-    reference = root.find(".//geoReference")
-    roads, signal_notes = _with_signals(files, where, roads, root)
     notes = [
         f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
         for tag in sorted({child.tag for child in root} - KNOWN)
     ]
-    notes += signal_notes
+    notes += [f"{n} {what}" for what, n in sorted(unused.items())]
     if root.find("header/offset") is not None:
         notes.append(
             "the offset in the map's header is not applied: its coordinates are as written"
         )
-    kinds = sorted({j.get("type", "default") for j in root.findall("junction")} - {*JUNCTIONS})
-    notes += [f"junctions of type {kind} are not driven through" for kind in kinds]
+    kinds = {junction.get("type", "default") for junction in root.findall("junction")}
+    notes += [
+        f"junctions of type {kind} are not driven through" for kind in sorted(kinds - {*JUNCTIONS})
+    ]
     both_ways = sum(
         lane.get("type") == "bidirectional" or lane.get("direction") == "both"
         for lane in root.iter("lane")
@@ -388,244 +358,165 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     if both_ways:
         notes.append(f"lanes for both directions are driven in one only: {both_ways}")
     shapes = len(root.findall(".//lateralProfile/shape"))
-    notes += [f"{shapes} cross section shapes of the map are not used"] if shapes else []
-    geo = "" if reference is None else (reference.text or "").strip()
+    if shapes:
+        notes.append(f"{shapes} cross section shapes of the map are not used")
     controllers = {
         control.get("signalId", ""): controller.get("id", "")
         for controller in root.findall("controller")
         for control in controller.findall("control")
     }
-    return OdrMap(roads, connections, geo, controllers, tuple(notes))
+    geo_reference = (root.findtext(".//geoReference") or "").strip()
+    return OdrMap(tuple(roads), connections, geo_reference, controllers, tuple(notes))
 
 
-def _with_signals(
-    files: SourceFiles, where: Path | str, roads: tuple[Road, ...], root: Element
-) -> tuple[tuple[Road, ...], list[str]]:
-    """Return the roads with what stands on them, and notes on what is not used.
+def _road(
+    element: Element, where: str, originals: Mapping[str, Element], unused: Counter[str]
+) -> Road:
+    """Parse a road; what stands on it and is not used is counted in ``unused``.
 
     Crosswalks are objects of that type, or marks of type 1000003, which have no length along the
     road: 4 m is assumed. Stop lines are marks of type 294, or objects with such a name.
     """
-    written: dict[str, RoadSignal] = {}
-    unused: Counter[str] = Counter()
-    placed: list[tuple[list[RoadSignal], list[F64]]] = []
-    for road, element in zip(roads, root.findall("road"), strict=True):
-        here = f"{where}, road {road.road_id}"
-        signals = [_signal(files, here, one) for one in element.findall("signals/signal")]
-        rings = [_rectangle(one, CROSSWALK_M) for one in signals if one.kind == CROSSWALK]
-        for one in element.findall("objects/object"):
-            if one.get("type") == "crosswalk" and one.find(".//outline") is not None:
-                rings.append(_crosswalk(files, here, one))
-            elif "stopline" in f"{one.get('name')}{one.get('subtype')}".lower().replace(" ", ""):
-                signals.append(replace(_signal(files, here, one), kind=STOP_LINE))
-            else:
-                unused[f"objects of type {one.get('type')} are not used"] += 1
-        written |= {one.signal_id: one for one in signals}
-        placed.append((signals, rings))
-    for road, element, (signals, _) in zip(roads, root.findall("road"), placed, strict=True):
-        for one in element.findall("signals/signalReference"):
-            original = written.get(one.get("id", ""))
-            if original is None:
-                unused["references to signals that the map does not have are left out"] += 1
-                continue
-            place = _signal(files, f"{where}, road {road.road_id}", one)
-            signals.append(
-                replace(
-                    original,
-                    s_m=place.s_m,
-                    t_m=place.t_m,
-                    orientation=place.orientation,
-                    lanes=place.lanes,
-                )
-            )
-    roads = tuple(
-        replace(road, signals=tuple(signals), crosswalks=tuple(rings))
-        for road, (signals, rings) in zip(roads, placed, strict=True)
-    )
-    return roads, [f"{n} {what}" for what, n in sorted(unused.items())]
-
-
-def _signal(files: SourceFiles, here: str, one: Element) -> RoadSignal:
-    s, t, above, width, height = (
-        _number(files, here, one, name, default)
-        for name, default in (
-            ("s", None),
-            ("t", None),
-            ("zOffset", 0.0),
-            ("width", 0.0),
-            ("height", 0.0),
-        )
-    )
-    lanes = tuple(
-        tuple(_integer(files, here, range_, name) for name in ("fromLane", "toLane"))
-        for range_ in one.findall("validity")
-    )
-    return RoadSignal(
-        one.get("id", ""),
-        one.get("type", ""),
-        one.get("dynamic") == "yes",
-        s,
-        t,
-        above,
-        one.get("orientation", "none"),
-        width,
-        height,
-        tuple((min(ends), max(ends)) for ends in lanes),
-    )
-
-
-def _rectangle(one: RoadSignal, along_m: float) -> F64:
-    """Return the ring ``(5, 2)`` of s and t of a mark across a road."""
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    return np.array([one.s_m, one.t_m]) + corners * [along_m / 2, one.width_m / 2]
-
-
-def _crosswalk(files: SourceFiles, here: str, one: Element) -> F64:
-    """Return the ring ``(N, 2)`` of s and t of a crosswalk's outline."""
-    number = partial(_number, files, here)
-    turn = number(one, "hdg", 0.0)
-    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    local = [[number(corner, k) for k in "uv"] for corner in one.findall(".//cornerLocal")]
-    placed = np.array(local).reshape(-1, 2) @ turned + [number(one, "s"), number(one, "t")]
-    on_road = [[number(corner, k) for k in "st"] for corner in one.findall(".//cornerRoad")]
-    ring = np.concatenate([placed, np.array(on_road).reshape(-1, 2)])
-    return np.concatenate([ring, ring[:1]])
-
-
-def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
-    here = f"{where}, road {element.get('id')}"
-
-    number = partial(_number, files, here)
-
-    def cubics(
-        owner: Element | None, tag: str, at: str = "s", start_m: float = 0.0
-    ) -> tuple[Cubic, ...]:
-        found = owner.findall(tag) if owner is not None else []
-        records = [
-            Cubic(start_m + number(r, at), *(number(r, k, 0.0) for k in _ABCD)) for r in found
-        ]
-        return tuple(sorted(records, key=lambda r: r.s_m))
-
-    road_m = number(element, "length")
-    MAP_ROAD_M.check(road_m, here, "length")
-    rule = element.get("rule", "RHT")
-    if rule.upper() not in ("RHT", "LHT"):
-        raise InputError(
-            f"{here}: rule = {rule!r}", "use RHT or LHT, the side on which traffic keeps"
-        )
-
-    def geometry(record: Element) -> Geometry:
-        shape = next((child for child in record if child.tag in KINDS), None)
-        if shape is None:
-            raise InputError(
-                f"{here}: a <geometry> of {[child.tag for child in record]}",
-                f"use {', '.join(KINDS)}",
-            )
-        numbers = tuple(number(shape, name) for name in _PARAMETERS[shape.tag])
-        s, x, y, heading, length = (
-            number(record, name) for name in ("s", "x", "y", "hdg", "length")
-        )
-        MAP_ROAD_M.check(length, here, "length of a <geometry>")
-        if not -1.0 <= s <= road_m + 1.0:
-            raise InputError(
-                f"{here}: a <geometry> at s = {s:g} of a road of {road_m:g} m",
-                "start every record on the road",
-            )
-        if shape.tag in ("arc", "spiral"):
-            for value in numbers:
-                MAP_CURVATURE_PER_M.check(value, here)
-        kind = next(k for k in KINDS if k == shape.tag)
-        return Geometry(
-            s,
-            x,
-            y,
-            heading,
-            length,
-            kind,
-            numbers,
-            shape.get("pRange", "normalized") != "arcLength",
-        )
-
-    def lane(one: Element, start_m: float) -> OdrLane:
-        mark = one.find("roadMark")
-        links = {
-            tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}"))
-            for tag in ("successor", "predecessor")
-        }
-        return OdrLane(
-            _integer(files, here, one, "id"),
-            one.get("type", "none"),
-            cubics(one, "width", "sOffset", start_m),
-            cubics(one, "border", "sOffset", start_m),
-            links["successor"],
-            links["predecessor"],
-            None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
-            one.get("direction") == "reversed",
-        )
-
-    lanes = element.find("lanes")
-    elements = sorted(
-        lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0)
-    )
-    starts = [number(e, "s", 0.0) for e in elements]
-    sections = tuple(
-        Section(
-            start,
-            end,
-            tuple(
-                lane(one, start)
-                for side in ("left", "center", "right")
-                for one in e.findall(f"{side}/lane")
-            ),
-            e.get("singleSide") == "true",
-        )
-        for e, start, end in zip(elements, starts, [*starts, road_m][1:], strict=True)
-    )
-    if any(not 0 <= start <= road_m for start in starts):
-        raise InputError(
-            f"{here}: lane sections at {starts} of a road of {road_m} m",
-            "start every section on the road",
-        )
-    view = element.find("planView")
-    unsorted = [geometry(r) for r in (view.findall("geometry") if view is not None else [])]
-    records = tuple(sorted(unsorted, key=lambda record: record.s_m))
+    road_m = _number(element, "length")
+    MAP_ROAD_M.check(road_m, where, "length")
+    rule = element.get("rule", "RHT").upper()
+    if rule not in ("RHT", "LHT"):
+        raise ValueError(f"rule = {rule!r}, neither RHT nor LHT")
+    signals = [_signal(one, one) for one in element.findall("signals/signal")]
+    rings = [_rectangle(one) for one in signals if one.kind == CROSSWALK]
+    for one in element.findall("objects/object"):
+        if one.get("type") == "crosswalk" and one.find(".//outline") is not None:
+            rings.append(_crosswalk(one))
+        elif "stopline" in f"{one.get('name')}{one.get('subtype')}".lower().replace(" ", ""):
+            signals.append(replace(_signal(one, one), kind=STOP_LINE))
+        else:
+            unused[f"objects of type {one.get('type')} are not used"] += 1
+    for one in element.findall("signals/signalReference"):
+        original = originals.get(str(one.get("id")))
+        if original is None:
+            unused["references to signals that the map does not have are left out"] += 1
+        else:
+            signals.append(_signal(one, original))
+    sections = sorted(element.findall("lanes/laneSection"), key=lambda one: _number(one, "s", 0.0))
+    starts = [_number(one, "s", 0.0) for one in sections]
+    if starts and not (starts[0] >= 0 and starts[-1] <= road_m):
+        raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
+    records = [_geometry(one, where, road_m) for one in element.findall("planView/geometry")]
     return Road(
         str(element.get("id")),
         road_m,
         element.get("junction", "-1"),
-        rule.upper() == "LHT",
-        records,
-        cubics(element.find("elevationProfile"), "elevation"),
-        cubics(element.find("lateralProfile"), "superelevation"),
-        cubics(lanes, "laneOffset"),
-        sections,
+        rule == "LHT",
+        tuple(sorted(records, key=lambda record: record.s_m)),
+        _cubics(element, "elevationProfile/elevation"),
+        _cubics(element, "lateralProfile/superelevation"),
+        _cubics(element, "lanes/laneOffset"),
+        tuple(
+            _section(one, start, end)
+            for one, start, end in zip(sections, starts, [*starts, road_m][1:], strict=True)
+        ),
         _link(element, "successor"),
         _link(element, "predecessor"),
+        tuple(signals),
+        tuple(rings),
     )
 
 
-def _number(
-    files: SourceFiles, here: str, owner: Element, name: str, default: float | None = None
-) -> float:
-    text = owner.get(name)
+def _geometry(record: Element, where: str, road_m: float) -> Geometry:
+    shapes = [child for child in record if child.tag in _PARAMETERS]
+    if not shapes:
+        raise ValueError(f"a <geometry> of none of {', '.join(_PARAMETERS)}")
+    shape = shapes[0]
+    numbers = tuple(_number(shape, name) for name in _PARAMETERS[shape.tag])
+    s, x, y, heading, length = (_number(record, name) for name in ("s", "x", "y", "hdg", "length"))
+    MAP_ROAD_M.check(length, where, "length of a <geometry>")
+    if not -1.0 <= s <= road_m + 1.0:
+        raise ValueError(f"a <geometry> at s = {s:g} of a road of {road_m:g} m")
+    if shape.tag in ("arc", "spiral"):
+        for value in numbers:
+            MAP_CURVATURE_PER_M.check(value, where)
+    normalised = shape.get("pRange", "normalized") != "arcLength"
+    return Geometry(s, x, y, heading, length, shape.tag, numbers, normalised)
+
+
+def _section(element: Element, start_m: float, end_m: float) -> Section:
+    lanes = []
+    for side in ("left", "center", "right"):
+        for one in element.findall(f"{side}/lane"):
+            mark = one.find("roadMark")
+            lanes.append(
+                OdrLane(
+                    int(one.get("id", "")),
+                    one.get("type", "none"),
+                    _cubics(one, "width", "sOffset", start_m),
+                    _cubics(one, "border", "sOffset", start_m),
+                    tuple(int(link.get("id", "")) for link in one.findall("link/successor")),
+                    tuple(int(link.get("id", "")) for link in one.findall("link/predecessor")),
+                    None
+                    if mark is None
+                    else (mark.get("type", "none"), mark.get("color", "standard")),
+                    one.get("direction") == "reversed",
+                )
+            )
+    return Section(start_m, end_m, tuple(lanes), element.get("singleSide") == "true")
+
+
+def _cubics(owner: Element, place: str, at: str = "s", start_m: float = 0.0) -> F64:
+    """Return the records of an element as rows s, a, b, c, d, ordered by s; see `cubics_at`."""
+    rows = [
+        [start_m + _number(one, at), *(_number(one, name, 0.0) for name in _ABCD)]
+        for one in owner.findall(place)
+    ]
+    return np.array(sorted(rows, key=lambda row: row[0]), dtype=np.float64).reshape(-1, 5)
+
+
+def _signal(place: Element, nature: Element) -> RoadSignal:
+    """Return a signal; one by reference has its place from there, and its nature from where it was
+    written.
+    """
+    lanes = [
+        (int(one.get("fromLane", "")), int(one.get("toLane", "")))
+        for one in place.findall("validity")
+    ]
+    return RoadSignal(
+        nature.get("id", ""),
+        nature.get("type", ""),
+        nature.get("dynamic") == "yes",
+        _number(place, "s"),
+        _number(place, "t"),
+        _number(nature, "zOffset", 0.0),
+        place.get("orientation", "none"),
+        _number(nature, "width", 0.0),
+        _number(nature, "height", 0.0),
+        tuple((min(ends), max(ends)) for ends in lanes),
+    )
+
+
+def _rectangle(one: RoadSignal) -> F64:
+    """Return the ring ``(5, 2)`` of s and t of a crosswalk that is a mark across a road."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    return np.array([one.s_m, one.t_m]) + corners * [CROSSWALK_M / 2, one.width_m / 2]
+
+
+def _crosswalk(one: Element) -> F64:
+    """Return the ring ``(N, 2)`` of s and t of a crosswalk's outline."""
+    turn = _number(one, "hdg", 0.0)
+    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    local = [[_number(corner, k) for k in "uv"] for corner in one.findall(".//cornerLocal")]
+    on_road = [[_number(corner, k) for k in "st"] for corner in one.findall(".//cornerRoad")]
+    placed = np.array(local).reshape(-1, 2) @ turned + [_number(one, "s"), _number(one, "t")]
+    ring = np.concatenate([placed, np.array(on_road).reshape(-1, 2)])
+    return np.concatenate([ring, ring[:1]])
+
+
+def _number(element: Element, name: str, default: float | None = None) -> float:
+    text = element.get(name)
     if text is None and default is not None:
         return default
-    try:
-        value = float(str(text))
-    except ValueError:
-        value = float("nan")
+    value = float(text or "nan")
     if not np.isfinite(value):
-        raise InputError(f"{here}: <{owner.tag}> with {name} = {text!r}", "give a finite number")
+        raise ValueError(f"<{element.tag}> with {name} = {text!r}, which is no finite number")
     return value
-
-
-def _integer(files: SourceFiles, where: Path | str, element: Element, name: str) -> int:
-    try:
-        return int(str(element.get(name)))
-    except ValueError as error:
-        raise InputError(
-            f"{where}: <{element.tag}> with {name} = {element.get(name)!r}", "give an integer"
-        ) from error
 
 
 def _link(road: Element, tag: str) -> RoadLink | None:
@@ -652,7 +543,7 @@ def lane_borders(road: Road, section: Section, s_m: F64) -> Iterator[tuple[OdrLa
     for sign in (1, -1):
         inner_t = middle
         for lane in section.side(sign):
-            if lane.borders and not lane.widths:
+            if len(lane.borders) and not len(lane.widths):
                 outer_t = middle + cubics_at(lane.borders, s_m)
             else:
                 outer_t = inner_t + sign * np.maximum(cubics_at(lane.widths, s_m), 0.0)
@@ -685,8 +576,3 @@ def road_points(road: Road, line: F64, s_m: F64, t_m: F64, T_local_map: F64) -> 
 def lane_key(road: Road, section: int, lane_id: int) -> str:
     """Return the id under which a lane of a section enters a lane map."""
     return f"{road.road_id}.{section}.{lane_id}"
-
-
-def curved(records: Sequence[Geometry]) -> bool:
-    """Return whether any record is curved."""
-    return any(one.kind != "line" for one in records)

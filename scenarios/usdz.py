@@ -41,7 +41,7 @@ from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_wide
 from scenarios.map_lines import lane_edges, with_vertices
 from scenarios.opendrive import T_local_map, lane_map_of
-from scenarios.opendrive_road import MAX_ROAD_M, Cubic, OdrMap, Road, beside, cubics_at, parse_map
+from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road, beside, cubics_at, parse_map
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 from scenarios.usdz_archive import Archive
 from scenarios.usdz_tables import clipgt_map, without_rails
@@ -178,11 +178,11 @@ def _road(archive: Archive, rig: JsonObject) -> RoadMap:
     if "map.xodr" not in archive:
         return RoadMap(LaneMap({}), None, (*notes, "no map: neither tables nor map.xodr"))
     where = f"{archive.path}, map.xodr"
-    odr = parse_map(archive.files, where, parse_xml(archive.read("map.xodr"), where))
+    odr = parse_map(where, parse_xml(archive.read("map.xodr"), where))
     with parsing(f"{archive.path}, {RIG_MEMBER}", "give T_world_base, 4 x 4"):
         T_earth_local = np.array(rig["T_world_base"], dtype=np.float64).reshape(4, 4)
         place = T_local_map(odr.geo_reference, T_earth_local)
-    lane_map, more = lane_map_of(archive.files, where, odr, place)
+    lane_map, more = lane_map_of(where, odr, place)
     return RoadMap(lane_map, alpasim_map(odr, place), (*notes, *more))
 
 
@@ -299,17 +299,18 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
     s = np.asarray(STEP_M * np.arange(len(line)), dtype=np.float64)
     line[:, :2] = beside(line[:, :3], cubics_at(road.lane_offset, s))
     z = line[:, 3]
-    by_id: dict[int, list[Cubic]] = {}
+    by_id: dict[int, list[F64]] = {}
     kinds: dict[int, str] = {}
     for section in road.sections:
         for lane in (*section.side(1), *section.side(-1)):
             kinds.setdefault(lane.lane_id, lane.kind.lower())
-            if lane.widths:
-                by_id.setdefault(lane.lane_id, []).extend(lane.widths)
+            if len(lane.widths):
+                by_id.setdefault(lane.lane_id, []).append(lane.widths)
     for sign, name in ((1, "L"), (-1, "R")):
         inner = line[:, :2]
         for lane_id in sorted((i for i in by_id if i * sign > 0), key=abs):
-            width = cubics_at(sorted(by_id[lane_id], key=lambda one: one.s_m), s)
+            widths = np.concatenate(by_id[lane_id])
+            width = cubics_at(widths[np.argsort(widths[:, 0], kind="stable")], s)
             at = np.column_stack([inner, line[:, 2]])
             rows = [
                 np.column_stack([xy, z])

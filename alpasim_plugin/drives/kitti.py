@@ -128,10 +128,12 @@ def _rows_of_poses(folder: Path, files: dict[str, list[Path]], poses: int) -> di
 
 def _table(path: Path, columns: int, do_this: str) -> F64:
     """Return the numbers ``(N, columns)`` of a text file."""
-    lines = read_text(path).splitlines()
-    with parsing(path, do_this, "not only numbers"):
-        rows = [[float(word) for word in line.split()] for line in lines if line.strip()]
-        return np.array(rows).reshape(len(rows), columns)
+    rows = []
+    for i, line in enumerate(read_text(path).splitlines()):
+        if line.strip():
+            with parsing(f"{path}, line {i + 1}", do_this, "not only numbers"):
+                rows.append(np.array(line.split(), dtype=np.float64).reshape(columns))
+    return np.array(rows).reshape(-1, columns)
 
 
 def _poses(folder: Path) -> list[F64]:

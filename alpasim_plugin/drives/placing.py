@@ -361,8 +361,8 @@ def given_map(
             "give poses in metres, in the map's coordinates",
         )
     files = SourceFiles()
-    odr = parse_map(files, path, files.read_xml(path))
-    lane_map, notes = lane_map_of(files, path, odr, placed.T_world_source)
+    odr = parse_map(path, files.read_xml(path))
+    lane_map, notes = lane_map_of(path, odr, placed.T_world_source)
     centres = np.concatenate(
         [lane.centre for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
     )

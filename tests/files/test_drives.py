@@ -468,12 +468,6 @@ def test_images_of_a_frame_of_a_rig_have_one_time(tmp_path, folders, binary):
     assert np.allclose(mount, np.linalg.inv(SIDE), atol=1e-9)
 
 
-def test_a_rig_that_its_images_do_not_fit_is_refused(tmp_path):
-    rig(tmp_path / "sparse/0", ("front/", "left/"), [0, 4], turn=0.9)
-    with pytest.raises(InputError, match="left/"):
-        read_source(tmp_path, photographs=False)
-
-
 def test_rigs_of_one_camera_change_nothing(tmp_path):
     model = tmp_path / "sparse/0"
     colmap(model, [f"{i}.png" for i in range(13)])

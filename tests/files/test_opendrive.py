@@ -13,9 +13,7 @@ import pytest
 
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
-from scenarios.recorded import SourceFiles
 
-FILES = SourceFiles()
 WIDTH = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
 
 
@@ -57,7 +55,7 @@ def road(
 
 def read(*parts: str):
     root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
-    return lane_map_of(FILES, "map.xodr", parse_map(FILES, "map.xodr", root), np.eye(4))
+    return lane_map_of("map.xodr", parse_map("map.xodr", root), np.eye(4))
 
 
 def span(lanes, key):

@@ -16,11 +16,8 @@ from scenarios.load import load_scenario
 from scenarios.opendrive import read_lanes
 from scenarios.opendrive_road import parse_map
 from scenarios.opendrive_signals import traffic_lights
-from scenarios.recorded import SourceFiles
 from scenarios.street_map import with_cycles
 from tests.files.test_opendrive import lane, road, section
-
-FILES = SourceFiles()
 
 
 def light(i: str, s: float, more: str = "", kind: str = "1000001", t: float = -5.0) -> str:
@@ -151,8 +148,8 @@ def test_lights_of_a_junction_take_turns_and_people_walk_while_their_road_has_re
         junction_of('<controller id="n"><control signalId="b"/></controller>'),
     )
     root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
-    odr = parse_map(FILES, "map.xodr", root)
-    lanes, _ = read_lanes(FILES, "map.xodr", odr, np.eye(4))
+    odr = parse_map("map.xodr", root)
+    lanes, _ = read_lanes("map.xodr", odr, np.eye(4))
     heads, notes = traffic_lights(odr, lanes, np.eye(4))
     assert not notes
     signals = with_cycles(heads, {"9": 1_000_000})
