@@ -19,10 +19,10 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, densify
+from alpasim_plugin.core.geometry import arc_lengths, densify, matrix_from_quat
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
-from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap
-from alpasim_plugin.world.ground import flat, from_points
+from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
+from alpasim_plugin.world.ground import flat, from_points, height_at
 
 MAX_STEP_M = 2.0
 
@@ -32,6 +32,13 @@ NO_LANES_OF_CARS = (
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
 MIN_HOLE_M2 = 0.5  # smaller holes are seams too
 STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
+
+LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
+    3.5,
+    8.0,
+    15.0,
+    1.0,
+)  # of the corridor: width, how far it goes on, distance of vertices
 
 
 def lane_edges(lanes: Mapping[str, Lane]) -> list[F64]:
@@ -54,6 +61,42 @@ def bordered(lanes: Mapping[str, Lane], beside: LaneMap) -> LaneMap:
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
     return replace(beside, lanes=lanes, road_edges=edges)
+
+
+def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
+    """Return the driven path as one lane of usual width, without paint: nothing says where lines
+    were.
+    """
+    xy = ego.xyz[:, :2]
+    keep = [0]
+    for i in range(1, len(xy)):
+        if np.linalg.norm(xy[i] - xy[keep[-1]]) > 0.5:
+            keep.append(i)
+    line = (
+        xy[keep]
+        if len(keep) > 1
+        else np.stack([xy[0], xy[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
+    )
+    first, last = line[1] - line[0], line[-1] - line[-2]
+    line = np.concatenate(
+        [
+            [line[0] - first / np.linalg.norm(first) * BEFORE_M],
+            line,
+            [line[-1] + last / np.linalg.norm(last) * BEYOND_M],
+        ]
+    )
+    s = arc_lengths(line)
+    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / VERTEX_M) + 1))
+    centre = np.stack([np.interp(at, s, line[:, axis]) for axis in range(2)], axis=1)
+    along = np.gradient(centre, axis=0)
+    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(
+        np.linalg.norm(along, axis=1, keepdims=True), 1e-12
+    )
+    edges = [centre + side * LANE_M / 2 * left for side in (0.0, 1.0, -1.0)]
+    middle, one, other = (np.column_stack([edge, height_at(field, edge)]) for edge in edges)
+    return LaneMap(
+        {"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")}
+    )
 
 
 def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:

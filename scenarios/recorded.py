@@ -177,7 +177,7 @@ class RecordedLog:
     """
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | drive | usdz
+    source: str  # yaml | argoverse | commonroad | drive | osi | usdz
     lane_map: LaneMap
     ground: HeightField
     ego_log: Trajectory  # rig poses, world

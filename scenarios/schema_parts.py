@@ -16,7 +16,7 @@ Turn = Literal["left", "straight", "right"]
 CentrePaint = Literal[
     "double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"
 ]
-SHIPPED = ("argoverse", "commonroad", "drive", "usdz")
+SHIPPED = ("argoverse", "commonroad", "drive", "osi", "usdz")
 Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]
 ActorId = Annotated[
     str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")
@@ -193,6 +193,7 @@ class LogSpec(Part):
     drive: str | None = Field(
         default=None, min_length=1, description="Folder that simrun import has written."
     )
+    osi: str | None = Field(default=None, min_length=1, description="OSI trace.")
     usdz: str | None = Field(default=None, min_length=1, description="AlpaSim scene file.")
     source: str | None = Field(
         default=None,

@@ -75,6 +75,22 @@ class ImportedDrive(Source):
         return read_drive(path)
 
 
+class Osi(Source):
+    """Traces of the Open Simulation Interface."""
+
+    help = "OSI trace"
+
+    def matches(self, path: Path) -> bool:
+        """Go by the ending."""
+        return path.suffix == ".osi"
+
+    def read(self, path: Path, ego: str | None) -> RecordedLog:
+        """Read a trace; ``ego`` is the id of the moving object that becomes the ego."""
+        from scenarios.osi import read_osi
+
+        return read_osi(path, ego)
+
+
 class Usdz(Source):
     """AlpaSim scenes."""
 

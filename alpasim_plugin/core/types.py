@@ -443,7 +443,7 @@ class Scenario:
     """A complete test case, the same type for every source."""
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | drive | usdz
+    source: str  # yaml | argoverse | commonroad | drive | osi | usdz
     seed: int  # scene seed: geometry, textures, scripted actors
     lane_map: LaneMap
     ground: HeightField

@@ -27,7 +27,6 @@ from alpasim_plugin.drives.placing import (
     NO_MAP,
     PlacedDrive,
     check_motion,
-    corridor,
     given_map,
     place,
 )
@@ -41,6 +40,7 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
+from scenarios.map_lines import corridor
 from scenarios.recorded import RecordedLog
 
 SCENARIO_FILE = "scenario.yaml"

@@ -1,6 +1,4 @@
-"""Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts, and a
-corridor where there is no map.
-"""
+"""Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts."""
 
 from __future__ import annotations
 
@@ -13,12 +11,10 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
-    arc_lengths,
     inverse,
-    matrix_from_quat,
     trajectory_from_poses,
 )
-from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
+from alpasim_plugin.core.types import F64, HeightField, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
@@ -32,12 +28,6 @@ MOST_MPS, MOST_MPS2 = 100.0, 50.0  # speed and acceleration that no car has
 LEAST_MPS = 0.05  # the top speed of a drive whose times are in another unit
 MOST_STEP_MPS = 10.0  # a smaller change of speed may be an error of the poses
 OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median
-LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
-    3.5,
-    8.0,
-    15.0,
-    1.0,
-)  # of the corridor: width, how far it goes on, distance of vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,42 +297,6 @@ def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
 
 
 NO_MAP = "no map: the road is the driven path, 3.5 m wide, without paint"
-
-
-def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
-    """Return the driven path as one lane of usual width, without paint: nothing says where lines
-    were.
-    """
-    xy = ego.xyz[:, :2]
-    keep = [0]
-    for i in range(1, len(xy)):
-        if np.linalg.norm(xy[i] - xy[keep[-1]]) > 0.5:
-            keep.append(i)
-    line = (
-        xy[keep]
-        if len(keep) > 1
-        else np.stack([xy[0], xy[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
-    )
-    first, last = line[1] - line[0], line[-1] - line[-2]
-    line = np.concatenate(
-        [
-            [line[0] - first / np.linalg.norm(first) * BEFORE_M],
-            line,
-            [line[-1] + last / np.linalg.norm(last) * BEYOND_M],
-        ]
-    )
-    s = arc_lengths(line)
-    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / VERTEX_M) + 1))
-    centre = np.stack([np.interp(at, s, line[:, axis]) for axis in range(2)], axis=1)
-    along = np.gradient(centre, axis=0)
-    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(
-        np.linalg.norm(along, axis=1, keepdims=True), 1e-12
-    )
-    edges = [centre + side * LANE_M / 2 * left for side in (0.0, 1.0, -1.0)]
-    middle, one, other = (np.column_stack([edge, height_at(field, edge)]) for edge in edges)
-    return LaneMap(
-        {"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")}
-    )
 
 
 def given_map(

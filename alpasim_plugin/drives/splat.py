@@ -25,7 +25,7 @@ from alpasim_plugin.drives.build import (
     write_photographs,
 )
 from alpasim_plugin.drives.opening import read_source
-from alpasim_plugin.drives.placing import PlacedDrive, check_motion, corridor, place
+from alpasim_plugin.drives.placing import PlacedDrive, check_motion, place
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud, require_rigid
@@ -36,6 +36,7 @@ from alpasim_plugin.gaussians.raster.rasterize import rasterize
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.world.ground import height_at
+from scenarios.map_lines import corridor
 
 OPAQUE = 0.3  # opacity from which a Gaussian counts as surface
 MAX_POINTS = 100_000  # of them, in which the ground is looked for

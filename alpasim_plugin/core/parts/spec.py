@@ -349,6 +349,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),
         "commonroad": ("scenarios.sources:CommonRoad", "CommonRoad XML"),
         "drive": ("scenarios.sources:ImportedDrive", "folder that simrun import has written"),
+        "osi": ("scenarios.sources:Osi", "OSI trace"),
         "usdz": ("scenarios.sources:Usdz", "AlpaSim scene"),
     },
 }

@@ -1,0 +1,338 @@
+"""Traces of the Open Simulation Interface (``.osi``), as esmini and CARLA write them: a recorded drive
+with its traffic, and the lanes where the trace holds them.
+
+Positions are centres of boxes in the world's frame. The host vehicle is the ego. Lanes are those of
+the first message that has any; a lane of the type intersection is an area, through which each pair
+of lanes that it joins gets a lane.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
+from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
+from alpasim_plugin.world.ground import flat
+from scenarios.map_lines import bordered, corridor, ground_of, is_left_of
+from scenarios.osi_messages import UNREAD, ground_truths
+from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
+
+VEHICLE, PEDESTRIAN = 2, 3  # types of moving objects
+LABELS = {
+    **dict.fromkeys((2, 3, 4, 5, 6), "car"),
+    **dict.fromkeys((7, 8, 9, 16), "truck"),
+    10: "motorcycle",
+    **dict.fromkeys((11, 17, 18), "cyclist"),
+    12: "bus",
+}  # of vehicles; all else is "other"
+DRIVING, INTERSECTION = 2, 4  # types of lanes
+KINDS = {3: "bike", 5: "parking", 6: "shoulder", 9: "shoulder"}  # by their subtype
+SOLID, DASHED, DOTS = 3, 4, 5  # types of boundaries
+YELLOW = 4
+JOIN_STEPS = 16  # of a lane through an intersection
+DEFAULT = Vehicle()
+
+
+@dataclass
+class _Track:
+    """One moving object as it is collected."""
+
+    first: Any  # its first message
+    t_us: list[int] = field(default_factory=list)
+    xyz: list[tuple[float, float, float]] = field(default_factory=list)
+    angles: list[tuple[float, float, float]] = field(default_factory=list)  # yaw, pitch, roll
+
+    @property
+    def label(self) -> str:
+        """Return the class of road user."""
+        if self.first.type == PEDESTRIAN:
+            return "pedestrian"
+        if self.first.type != VEHICLE:
+            return "other"
+        return LABELS.get(self.first.vehicle_classification.type, "car")
+
+    @property
+    def box(self) -> Box:
+        size = self.first.base.dimension
+        return Box(size.length, size.width, size.height)
+
+    def trajectory(self, files: SourceFiles, where: str, origin: F64) -> Trajectory:
+        """Return the poses of the box centre."""
+        quat = Rotation.from_euler("ZYX", np.nan_to_num(self.angles)).as_quat()[:, [3, 0, 1, 2]]
+        xyz = np.array(self.xyz) - origin
+        return checked_trajectory(files, where, np.array(self.t_us), files.near(where, xyz), quat)
+
+
+def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
+    """Read a trace of GroundTruth or SensorView messages.
+
+    Args:
+        path: The file.
+        ego: Id of the moving object that becomes the ego; None takes the host vehicle, where the
+            trace names none the vehicle of the smallest id that is present all the time.
+
+    Raises:
+        InputError: The file is broken, holds no moving object, or ``ego`` names none.
+    """
+    file = Path(path)
+    files = SourceFiles()
+    tracks: dict[int, _Track] = {}
+    times: list[int] = []
+    host: int | None = None
+    roads: Any = None
+    unread: Counter[str] = Counter()
+    notes: list[str] = []
+    for message in ground_truths(files, file):
+        times.append(message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000))
+        if not times[:-1]:
+            unread.update({name: len(getattr(message, name)) for name in UNREAD})
+        if host is None and message.HasField("host_vehicle_id"):
+            host = message.host_vehicle_id.value
+        if roads is None and message.lane:
+            roads = message
+        for one in message.moving_object:
+            track = tracks.setdefault(one.id.value, _Track(one))
+            place, turn = one.base.position, one.base.orientation
+            track.t_us.append(times[-1])
+            track.xyz.append((place.x, place.y, place.z))
+            track.angles.append((turn.yaw, turn.pitch, turn.roll))
+    chosen, why = _choose_ego(files, file, tracks, len(times), host, ego)
+    begin = tracks[chosen].xyz[0]
+    if not np.isfinite(begin).all():
+        raise files.fail(f"{file}, object {chosen}", "a place that is not finite", "repair it")
+    origin = np.array([*np.round(begin[:2]), 0.0])
+    centres = {
+        key: track.trajectory(files, f"{file}, object {key}", origin)
+        for key, track in tracks.items()
+    }
+    vehicle = _vehicle(tracks[chosen])
+    T_centre_rig = np.eye(4)
+    T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
+    ego_log = offset_trajectory(centres[chosen], T_centre_rig)
+    if len(ego_log) < 2:
+        raise files.fail(f"{file}, object {chosen}", "1 pose", "choose an ego that drives")
+    lanes = {} if roads is None else _lanes(files, file, roads, origin)
+    if any(lane.kind == "vehicle" for lane in lanes.values()):
+        lane_map = bordered(lanes, LaneMap({}))
+        ground = ground_of(lane_map, ego_log.xyz)
+    else:
+        notes.append("the trace holds no lanes: the driven path is one lane without lane markings")
+        ground = flat(float(np.median(ego_log.xyz[:, 2])))
+        lane_map = corridor(ego_log, ground)
+        lane_map = bordered(lane_map.lanes, lane_map)
+    notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
+    return RecordedLog(
+        f"osi-{file.stem}",
+        "osi",
+        lane_map,
+        ground,
+        ego_log,
+        vehicle,
+        _actors({key: (tracks[key], centres[key]) for key in tracks if key != chosen}),
+        (),
+        (float(origin[0]), float(origin[1]), 0.0),
+        files.content_hash,
+        (why, *notes),
+    )
+
+
+def _actors(tracks: Mapping[int, tuple[_Track, Trajectory]]) -> tuple[Actor, ...]:
+    return tuple(
+        actor
+        for key, (track, centre) in tracks.items()
+        for actor in actors_of_track(str(key), track.label, track.box, centre)
+    )
+
+
+def _choose_ego(
+    files: SourceFiles,
+    path: Path,
+    tracks: Mapping[int, _Track],
+    n_messages: int,
+    host: int | None,
+    ego: str | None,
+) -> tuple[int, str]:
+    """Return the id of the object that becomes the ego, and why it does."""
+    if ego is not None or host is not None:
+        name = str(host) if ego is None else ego
+        key = next((key for key in tracks if str(key) == name), None)
+        if key is None:
+            raise files.fail(
+                path,
+                f"no moving object {name!r} for the ego",
+                f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
+            )
+        return key, f"ego is {'the host vehicle' if ego is None else 'object'} {key}"
+    always = [
+        key
+        for key, track in tracks.items()
+        if track.first.type == VEHICLE and len(track.t_us) == n_messages
+    ]
+    if not always:
+        raise files.fail(
+            path,
+            f"{len(tracks)} moving objects, none a vehicle that is present all the time",
+            "name the ego: log: {osi: FILE, ego: ID}",
+        )
+    key = min(always)
+    return key, f"the trace names no host vehicle: ego is vehicle {key}; choose another with ego=ID"
+
+
+def _vehicle(track: _Track) -> Vehicle:
+    """Return the ego's body; axles that the trace does not place are in proportion to its length."""
+    scale = track.box.length_m / DEFAULT.box.length_m
+    rear_m, wheelbase_m = DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale
+    attributes = track.first.vehicle_attributes
+    if attributes.HasField("bbcenter_to_rear"):
+        rear_m = -attributes.bbcenter_to_rear.x
+        if attributes.HasField("bbcenter_to_front"):
+            wheelbase_m = attributes.bbcenter_to_front.x + rear_m
+    return Vehicle(track.box, rear_m, wheelbase_m)
+
+
+def _lanes(files: SourceFiles, path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
+    """Return the lanes of a message, linked."""
+    borders = {one.id.value: one for one in roads.lane_boundary}
+    lanes: dict[str, Lane] = {}
+    for one in roads.lane:
+        lane = _lane(files, f"{path}, lane {one.id.value}", one, borders, origin)
+        if lane is not None:
+            lanes[lane.lane_id] = lane
+    after = {key: list(lane.successors) for key, lane in lanes.items()}
+    for one in (one for one in roads.lane if one.classification.type == INTERSECTION):
+        for pair in one.classification.lane_pairing:
+            begin, end = str(pair.antecessor_lane_id.value), str(pair.successor_lane_id.value)
+            if begin in lanes and end in lanes and begin != end:
+                lane = _through(str(one.id.value), lanes[begin], lanes[end])
+                after[begin].append(lane.lane_id)
+                lanes[lane.lane_id] = lane
+    out = {}
+    for key, lane in lanes.items():
+        found = after.get(key, list(lane.successors))
+        out[key] = replace(
+            lane,
+            successors=tuple(name for name in found if name in lanes),
+            left_neighbour=_beside(lanes, lane, lane.left_neighbour),
+            right_neighbour=_beside(lanes, lane, lane.right_neighbour),
+        )
+    return out
+
+
+def _beside(lanes: Mapping[str, Lane], lane: Lane, name: str | None) -> str | None:
+    """Return a neighbour that is driven the same way."""
+    if name not in lanes:
+        return None
+    first, other = (one.centre[-1, :2] - one.centre[0, :2] for one in (lane, lanes[name]))
+    return name if float(first @ other) > 0 else None
+
+
+def _lane(
+    files: SourceFiles, where: str, one: Any, borders: Mapping[int, Any], origin: F64
+) -> Lane | None:
+    """Return a lane in driving direction; None for one that is not driven or lacks a border."""
+    facts = one.classification
+    kind = "vehicle" if facts.type == DRIVING else KINDS.get(facts.subtype)
+    if kind is None or len(facts.centerline) < 2:
+        return None
+    centre = files.near(where, _points(facts.centerline) - origin)
+    sides = []
+    for ids in (facts.left_lane_boundary_id, facts.right_lane_boundary_id):
+        found = [borders[ref.value] for ref in ids if ref.value in borders]
+        points = [_points(p.position for p in border.boundary_line) for border in found]
+        edge = _along(centre, np.concatenate([np.zeros((0, 3)), *points]) - origin)
+        if len(edge) < 2:
+            return None
+        sides.append((files.near(where, edge), _paint(found[0])))
+    ahead = [str(pair.successor_lane_id.value) for pair in facts.lane_pairing]
+    behind = [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing]
+    beside = [
+        str(ids[0].value) if ids else None
+        for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
+    ]
+    if not facts.centerline_is_driving_direction:
+        sides = [(edge[::-1], paint) for edge, paint in sides[::-1]]
+        ahead, beside = behind, beside[::-1]
+    if not is_left_of(sides[0][0], sides[1][0]):
+        sides = sides[::-1]
+    (left, left_paint), (right, right_paint) = sides
+    if min(float(arc_lengths(edge)[-1]) for edge in (left, right)) <= 0.0:
+        return None
+    return Lane(
+        str(one.id.value),
+        centre_line(left, right),
+        left,
+        right,
+        kind,
+        successors=tuple(dict.fromkeys(ahead)),
+        left_neighbour=beside[0],
+        right_neighbour=beside[1],
+        left_paint=left_paint,
+        right_paint=right_paint,
+    )
+
+
+def _points(vectors: Any) -> F64:
+    return np.array([(one.x, one.y, one.z) for one in vectors], dtype=np.float64).reshape(-1, 3)
+
+
+def _along(centre: F64, points: F64) -> F64:
+    """Return the points of a border ``(N, 3)`` in the order of a centre line, each place once."""
+    s_m = np.array([project(centre, point)[0] for point in points])
+    order = np.argsort(s_m, kind="stable")
+    line = points[order]
+    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    return line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
+
+
+def _paint(border: Any) -> Paint:
+    """Return the paint of a boundary; colours other than yellow are white."""
+    yellow = border.classification.color == YELLOW
+    if border.classification.type == SOLID:
+        return "solid_yellow" if yellow else "solid_white"
+    if border.classification.type in (DASHED, DOTS):
+        return "dashed_yellow" if yellow else "dashed_white"
+    return "none"
+
+
+def _through(area: str, begin: Lane, end: Lane) -> Lane:
+    """Return the lane through an intersection from the end of one lane to the start of another."""
+    assert begin.left is not None
+    assert begin.right is not None
+    assert end.left is not None
+    assert end.right is not None
+    left = _curve(begin.left, end.left)
+    right = _curve(begin.right, end.right)
+    return Lane(
+        f"{area}.{begin.lane_id}.{end.lane_id}",
+        (left + right) / 2,
+        left,
+        right,
+        successors=(end.lane_id,),
+        left_paint="none",
+        right_paint="none",
+        is_intersection=True,
+    )
+
+
+def _curve(begin: F64, end: F64) -> F64:
+    """Return the cubic ``(N, 3)`` that leaves one line's end and meets another line's start in
+    their directions.
+    """
+    first, last = begin[-1], end[0]
+    reach_m = float(np.linalg.norm(last - first))
+    out, into = begin[-1] - begin[-2], end[1] - end[0]
+    out, into = (reach_m * way / np.linalg.norm(way) for way in (out, into))
+    t = np.linspace(0.0, 1.0, JOIN_STEPS)[:, None]
+    return np.asarray(
+        (1 - t) ** 2 * (1 + 2 * t) * first
+        + t**2 * (3 - 2 * t) * last
+        + t * (1 - t) ** 2 * out
+        - t**2 * (1 - t) * into
+    )
