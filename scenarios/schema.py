@@ -44,9 +44,7 @@ class LaneChangeSpec(Part):
 
 
 class EgoSpec(Part):
-    """How the expert that writes the ego's log drives. It follows the road, keeps its distance and
-    slows down for bends.
-    """
+    """The expert who drives the recorded drive."""
 
     lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0: at the centre line.", 0)
     start_m: float = within(
@@ -69,7 +67,7 @@ class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
     buildings: float = Field(
-        default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades."
+        default=0.7, ge=0, le=1, description="Share of the roadside covered by facades."
     )
     building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
         default=(6.0, 18.0), description="Least and greatest height of facades."
@@ -109,7 +107,7 @@ class CameraModel(Part):
     width: int = within(b.IMAGE_SIDE_PX, "Image width in pixels.", 256)
     height: int = within(b.IMAGE_SIDE_PX, "Image height in pixels.", 144)
     lens: Literal["pinhole", "opencv", "fisheye", "ftheta"] = Field(
-        default="pinhole", description="What bends its rays; docs/cameras.md has the equations."
+        default="pinhole", description="Equations: docs/cameras.md."
     )
     hfov_deg: float = Field(
         default=75.0,
@@ -126,7 +124,7 @@ class CameraModel(Part):
     coefficients: tuple[float, ...] = Field(
         default=(),
         max_length=12,
-        description="opencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. fisheye: k1 to k4. ftheta: pixels from the middle as a polynomial of the angle (rad).",
+        description="opencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. fisheye: k1 to k4. ftheta: a0, a1, ...",
     )
     max_angle_deg: float | None = Field(
         default=None, gt=0, le=110, description="Black beyond this angle from the axis."
@@ -175,18 +173,18 @@ class CameraSet(Part):
     from_: str | None = Field(
         default=None,
         alias="from",
-        description="Calibration, relative to this file: an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json.",
+        description="Calibration: Argoverse 2 log, AlpaSim .usdz or transforms.json, relative to this file.",
     )
     names: tuple[str, ...] = Field(
         default=(),
         max_length=int(b.CAMERAS.high),
-        description="Which cameras of the calibration; none: all.",
+        description="Which of its cameras; none: all.",
     )
     width: int | None = Field(
         default=None,
         ge=b.IMAGE_SIDE_PX.low,
         le=b.IMAGE_SIDE_PX.high,
-        description="Width of every camera, pixels; its height follows.",
+        description="Of every camera; its height follows.",
     )
     shutter_us: int = within(b.SHUTTER_US, "Rolling shutter of every camera.", 0)
 
@@ -204,7 +202,7 @@ class Rigs(Part):
 
 
 class RatesSpec(Part):
-    """Integer periods; camera and policy periods are whole multiples of the control period."""
+    """Periods; those of cameras and policy are multiples of the control period."""
 
     control_us: int = within(b.PERIOD_US, "Control period.", 100_000)
     camera_us: int = within(b.PERIOD_US, "Camera period.", 100_000)
@@ -309,14 +307,14 @@ class DegradationSpec(Part):
 
 
 class BackgroundSpec(Part):
-    """A Gaussian file (.ply, .splat, .spz) used as background instead of generated surroundings."""
+    """A Gaussian file as background."""
 
     file: str = Field(min_length=1, description="Path, relative to this file.")
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
         default=None,
         min_length=4,
         max_length=4,
-        description="4 x 4 matrix from the file's frame to the world, row by row; may scale.",
+        description="4 x 4 matrix from the file to the world; may scale.",
     )
     keep_road: bool = Field(
         default=False,
@@ -344,26 +342,14 @@ class VehicleSpec(Part):
 
 
 class JitterSpec(Part):
-    """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off.
-    Uniform, relative unless in a unit.
-    """
+    """Ranges within which scenes of other seeds than 0 differ; uniform, relative unless in a unit."""
 
-    length: float = Field(
-        default=0.05, ge=0, le=0.5, description="Relative change of element lengths."
-    )
-    curvature: float = Field(
-        default=0.1, ge=0, le=0.5, description="Relative change of curvatures."
-    )
-    lane_width: float = Field(
-        default=0.02, ge=0, le=0.2, description="Relative change of the lane width."
-    )
-    speed: float = Field(
-        default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors."
-    )
-    position_m: float = Field(
-        default=1.5, ge=0, le=20, description="Shift of actors along the road, each way."
-    )
-    time_us: int = within(b.TIME_US, "Shift of scripted moments, each way.", 150_000)
+    length: float = Field(default=0.05, ge=0, le=0.5, description="Of elements.")
+    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Of curvatures.")
+    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Of lanes.")
+    speed: float = Field(default=0.05, ge=0, le=0.5, description="Of ego and actors.")
+    position_m: float = Field(default=1.5, ge=0, le=20, description="Of actors along the road.")
+    time_us: int = within(b.TIME_US, "Of scripted moments.", 150_000)
 
 
 class RangeSpec(Part):
@@ -395,7 +381,7 @@ class ScenarioSpec(Part):
         default=None,
         max_length=100,
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*(@@[-+.0-9e]+)?$",
-        description="Name of the scene; none: the file's folder and name.",
+        description="None: the file's folder and name.",
     )
     description: str = Field(default="", description="One sentence.")
     tags: tuple[str, ...] = Field(
@@ -430,7 +416,7 @@ class ScenarioSpec(Part):
             Discriminator(lambda given: "(list)" if isinstance(given, list | tuple) else "(set)"),
         ]
         | None
-    ) = Field(default=None, description="Cameras; none: the log's own, or one named front.")
+    ) = Field(default=None, description="None: the log's own, or one named front.")
     rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
     timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
     latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
@@ -441,7 +427,7 @@ class ScenarioSpec(Part):
         default=None, description="A Gaussian file as background."
     )
     vehicle: VehicleSpec | None = Field(
-        default=None, description="The ego vehicle; none: the log's own, or the default one."
+        default=None, description="The ego; none: the log's, or the default one."
     )
     jitter: JitterSpec = Field(
         default=JitterSpec(), description="How other scene seeds than 0 differ."

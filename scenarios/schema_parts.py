@@ -101,13 +101,11 @@ class IntersectionSegment(Part):
         default=8.0, ge=3, le=40, description="Size of the kerb's corners."
     )
     crosswalks: bool = Field(default=True, description="Crosswalks on every arm.")
-    guide_lines: bool = Field(
-        default=True, description="Dashed lines through the junction along the road."
-    )
+    guide_lines: bool = Field(default=True, description="Dashed lines through the junction.")
 
 
 class NarrowGapSegment(Part):
-    """A straight on which parked cars on both sides leave a narrow gap for the ego."""
+    """A straight on which parked cars leave a narrow gap."""
 
     kind: Literal["narrow_gap"]
     length_m: float = within(b.SEGMENT_M, "Length; the cars stand in its middle half.", 40.0)
@@ -147,9 +145,7 @@ SegmentSpec = Annotated[
 
 
 class RoadSpec(Part):
-    """A road built from segments that follow one another along the ego's path. Driving is on the
-    right.
-    """
+    """A road of segments along the ego's path. Driving is on the right."""
 
     lanes_forward: int = Field(
         default=1, ge=1, le=6, description="Lanes in the ego's direction at the start."
@@ -160,7 +156,7 @@ class RoadSpec(Part):
         default=0.0,
         ge=0,
         le=30,
-        description="Raised median between the directions; 0: markings only.",
+        description="Raised median; 0: markings only.",
     )
     shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the lanes.")
     parking_m: float = Field(
@@ -173,18 +169,14 @@ class RoadSpec(Part):
     centre_paint: CentrePaint = Field(
         default="double_yellow", description="Line between the directions."
     )
-    heading_deg: float = within(
-        b.ANGLE_DEG, "Direction of the road's beginning, from east to the left.", 0.0
-    )
+    heading_deg: float = within(b.ANGLE_DEG, "Of the road's beginning, from east to the left.", 0.0)
     segments: tuple[SegmentSpec, ...] = Field(
         min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order."
     )
 
 
 class LogSpec(Part):
-    """A recorded drive. Exactly one of the sources is given; relative paths start at this file's
-    folder.
-    """
+    """A recorded drive, of one source; paths are relative to this file."""
 
     argoverse: str | None = Field(
         default=None, min_length=1, description="Folder of one Argoverse 2 log."
@@ -334,14 +326,12 @@ class LoggedActor(_Actor):
 
 
 class IdmActor(_InLane):
-    """A driver who follows the lane, keeps the distance (also to the ego) and reacts in the closed
-    loop.
-    """
+    """A driver who follows the lane and reacts, also to the ego."""
 
     kind: Literal["idm"]
     speed_mps: float = within(b.SPEED_MPS, "Speed at the start.")
     desired_speed_mps: float | None = within(
-        b.CRUISE_MPS, "Desired speed; none: the speed at the start, at least 1.", None
+        b.CRUISE_MPS, "None: the speed at the start, at least 1.", None
     )
     headway_s: float = within(b.HEADWAY_S, "Time gap.", 1.5)
     min_gap_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Gap at standstill.")
@@ -350,7 +340,7 @@ class IdmActor(_InLane):
 
 
 class DriveActor(_InLane):
-    """A vehicle that drives a given speed over time and reacts to nobody."""
+    """A vehicle of given speeds that reacts to nobody."""
 
     kind: Literal["drive"]
     speeds: tuple[tuple[Annotated[float, Field(ge=0, le=b.MOMENT_S.high)], Speed], ...] = Field(
@@ -370,7 +360,7 @@ class DriveActor(_InLane):
 
 
 class OncomingActor(_Actor):
-    """A vehicle that comes the other way at a constant speed."""
+    """A vehicle that comes the other way."""
 
     kind: Literal["oncoming"]
     lane: int = within(b.LANE_INDEX, "Oncoming lane; 0: at the centre line.", 0)
@@ -398,7 +388,7 @@ class HardBrakeActor(_InLane):
 
 
 class CutInActor(_Actor):
-    """A vehicle that changes into another lane with a quintic lateral motion."""
+    """A vehicle that changes its lane."""
 
     kind: Literal["cut_in"]
     from_lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0: at the centre line.")

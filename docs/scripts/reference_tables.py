@@ -83,7 +83,7 @@ def metric_table() -> str:
     names: dict[tuple[str, ...], list[str]] = {}
     for name in METRICS.ordered(METRICS):
         metric = METRICS[name]
-        if name in BENCHMARKS:
+        if name in BENCHMARKS or metric.formula.endswith("`alpasim` only"):
             continue
         row = (
             metric.formula or metric.help,
