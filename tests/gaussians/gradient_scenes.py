@@ -14,8 +14,11 @@ from torch import Tensor
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.cloud import logit, sigmoid
-from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
-from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import (
+    GradientOutput,
+    Splats,
+    rasterize_gradient,
+)
 from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,

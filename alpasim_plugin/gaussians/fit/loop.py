@@ -38,8 +38,7 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
-from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput
-from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
@@ -171,7 +170,7 @@ class SplatFit:
         loss = _loss(rgb, out, target, recipe)
         if recipe.needle_weight > 0:
             loss = loss + recipe.needle_weight * needles(
-                splats.log_scales[out.screen.radii > 0], recipe.needle_ratio
+                splats.log_scales[out.index[out.on_screen]], recipe.needle_ratio
             )
         if not torch.isfinite(loss):
             self._stop(target, f"loss {float(loss.detach())}")
@@ -179,8 +178,9 @@ class SplatFit:
         for name, p in self.model.params.items():
             if p.grad is not None and not torch.isfinite(p.grad.sum()):
                 self._stop(target, f"a gradient of {name} that is not finite")
-        assert out.screen.gradient_norm is not None  # the backward pass has run
-        self.gradients.add(rows, out.screen.gradient_norm, out.screen.radii, target.camera.width)
+        assert out.uv.grad is not None  # the backward pass has run
+        pull = out.uv.grad[out.on_screen].norm(dim=1) * (target.camera.width / 2)
+        self.gradients.add(rows[out.index[out.on_screen]], pull)
         self.adam.update(self.model.params, self._rates())
         self.exposure.update(recipe.lr_exposure)
         self.step += 1

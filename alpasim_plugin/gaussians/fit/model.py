@@ -22,7 +22,7 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.start import Start
-from alpasim_plugin.gaussians.raster.gradient_types import Splats
+from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats
 from alpasim_plugin.gaussians.sh import SH_SIZES, sh_rotation
 
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh_dc", "sh_rest")
@@ -307,12 +307,10 @@ class ScreenGradients:
     def __init__(self, n: int) -> None:
         self.total, self.count = torch.zeros(n), torch.zeros(n)
 
-    def add(self, rows: Tensor, gradient_norm_px: Tensor, radii: Tensor, width_px: int) -> None:
-        """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii
-        ``(M,)``, both 0 where not drawn.
-        """
-        self.total.index_add_(0, rows, gradient_norm_px * (width_px / 2))
-        self.count.index_add_(0, rows, (radii > 0).float())
+    def add(self, rows: Tensor, norms: Tensor) -> None:
+        """Count one view: the rows ``(M,)`` of the Gaussians that it shows, and the norms ``(M,)``."""
+        self.total.index_add_(0, rows, norms)
+        self.count.index_add_(0, rows, torch.ones(len(rows)))
 
     def mean(self) -> Tensor:
         """Return ``(N,)``; 0 for what no view showed."""

@@ -66,10 +66,10 @@ from alpasim_plugin.gaussians.sh import C0, sh_terms
 
 _sh_terms = njit(cache=True, nogil=True)(sh_terms)
 # Boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw.
-_MARGIN_PX = 0.01
+MARGIN_PX = 0.01
 _LOWPASS_REACH_PX = EXTENT_MAX_SIGMA * EPS2D_PX2**0.5 + 0.5
 _CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0
-_BLOCK_HALF = 1.5
+BLOCK_HALF = 1.5
 
 
 @njit(cache=True, nogil=True, inline="never")
@@ -271,9 +271,9 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     c11, c22 = mm + eps, nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
     radius_x, radius_y = extent * v.sqrt(c11), extent * v.sqrt(c22)
-    mask = mask & (u + radius_x + _MARGIN_PX >= 0.5) & (w + radius_y + _MARGIN_PX >= 0.5)
-    mask = mask & (u - radius_x - _MARGIN_PX <= camera[CAM_WIDTH] - 0.5)
-    mask = mask & (w - radius_y - _MARGIN_PX <= camera[CAM_HEIGHT] - 0.5)
+    mask = mask & (u + radius_x + MARGIN_PX >= 0.5) & (w + radius_y + MARGIN_PX >= 0.5)
+    mask = mask & (u - radius_x - MARGIN_PX <= camera[CAM_WIDTH] - 0.5)
+    mask = mask & (w - radius_y - MARGIN_PX <= camera[CAM_HEIGHT] - 0.5)
     chosen = v.bits(mask)
     if chosen == 0:
         return 0
@@ -301,7 +301,7 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
             lanes[lane] = np.log2(lanes[lane]) / 16
         peak = peak + v.load(lanes, PEAK * 16)
         chosen &= v.bits(peak >= _CUT)
-    corner_s, corner_t = _BLOCK_HALF * (l11 + v.absolute(l12)), _BLOCK_HALF * l22
+    corner_s, corner_t = BLOCK_HALF * (l11 + v.absolute(l12)), BLOCK_HALF * l22
     block_radius = (
         v.sqrt(peak - _CUT) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + 1e-3
     )
@@ -313,11 +313,11 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     v.store(lanes, L22 * 16, l22)
     v.store(lanes, PEAK * 16, peak)
     v.store(lanes, Z * 16, z)
-    v.store(lanes, RADIUS_X * 16, radius_x + _MARGIN_PX)
-    v.store(lanes, RADIUS_Y * 16, radius_y + _MARGIN_PX)
+    v.store(lanes, RADIUS_X * 16, radius_x + MARGIN_PX)
+    v.store(lanes, RADIUS_Y * 16, radius_y + MARGIN_PX)
     v.store(lanes, TOP_Y * 16, radius_x * mn / c11)
     v.store(lanes, SLOPE * 16, slope)
-    v.store(lanes, HALF_WIDTH * 16, extent * deviation + _MARGIN_PX)
+    v.store(lanes, HALF_WIDTH * 16, extent * deviation + MARGIN_PX)
     v.store(lanes, BLOCK_REACH * 16, block_radius * block_radius)
     return chosen
 

@@ -99,7 +99,7 @@ def rasterize_prepared(
     workers = threads if room > WORTH_THREADS else 1
     count = project_parts(workers, parts, view, records, ids)
 
-    order = depth_order(records[: count * RECORD], ids[:count])
+    order = depth_order(records[Z : count * RECORD : RECORD], ids[:count])
     tiles = list_per_tile(order, records, camera, threads)
     colour, alpha, depth_sum = composite(tiles, records, None, camera, threads)
     rgb = np.clip(colour + (1 - alpha[..., None]) * behind, 0, 1)
@@ -138,14 +138,13 @@ def project_parts(
     return int(cursor[0])
 
 
-def depth_order(records: F32, ids: I64) -> I64:
-    """Return the numbers ``(N,)`` of records nearest first, equal depths by identity ``(N,)``.
+def depth_order(depths: F32, ids: I64) -> I64:
+    """Return the numbers ``(N,)`` of depths nearest first, equal ones by identity ``(N,)``.
 
     Bits of depths sort as the depths do, which are not negative. The result does not depend on the
     order in which threads wrote the records.
     """
-    depth_bits = records.view(np.int32)[Z::RECORD].astype(np.int64)
-    return np.argsort(depth_bits << 32 | ids)
+    return np.argsort(depths.view(np.int32).astype(np.int64) << 32 | ids)
 
 
 def camera_numbers(camera: PinholeCamera) -> F32:

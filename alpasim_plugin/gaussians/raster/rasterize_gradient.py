@@ -1,208 +1,110 @@
-"""Render splats for training: one `torch.autograd.Function` whose forward and backward passes are
-compiled CPU kernels.
+"""Render splats for training: torch projects them, compiled CPU kernels composite the tiles and take
+the image's gradient back to the projected splats.
 
 `rasterize_reference` is the definition.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.constants import (
-    BUNDLE,
-    GEO_SIZE,
+    ALPHA_MIN,
+    EPS2D_PX2,
+    EXPONENT_SCALE,
+    EXTENT_MAX_SIGMA,
+    LOG_SCALE_LIMIT,
     NEAR_M,
-    POSE_CENTRE,
     RADIUS_X,
     RADIUS_Y,
-    RECORD,
+    U,
+    V,
 )
-from alpasim_plugin.gaussians.raster.gradient_kernels import PAIR, colour_splats, tile_gradients
-from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
-from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
+from alpasim_plugin.gaussians.raster.gradient_kernels import (
+    PAIR,
+    PAIR_H,
+    PAIR_R,
+    PAIR_S,
+    PAIR_SS,
+    PAIR_ST,
+    PAIR_T,
+    PAIR_TT,
+    PAIR_Z,
+    add_pairs,
+    tile_gradients,
+)
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.raster.raster_kernels import KEPT
+from alpasim_plugin.gaussians.raster.project_kernels import BLOCK_HALF, MARGIN_PX
+from alpasim_plugin.gaussians.raster.raster_kernels import CUT, KEPT
 from alpasim_plugin.gaussians.raster.rasterize_cpu import (
-    WORTH_THREADS,
-    TileLists,
-    camera_numbers,
     composite,
     depth_order,
     list_per_tile,
-    node_poses,
-    project_parts,
     run_on_threads,
     thread_count,
 )
+from alpasim_plugin.gaussians.sh import C0, sh_terms
 
-_LANES = 16
-F32 = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One camera as the kernels read it."""
-
-    camera: PinholeCamera
-    numbers: F32
-    pose: F64
-    threads: int
+_OPACITY_LIMIT = 1e-6  # opacities of exactly 0 and 1 have no finite logit
 
 
-@dataclass(frozen=True, eq=False)
-class _Parameters:
-    """The splats' parameters as arrays that share memory with the tensors where types allow."""
+class Splats(NamedTuple):
+    """Gaussians as an optimiser moves them; any of the tensors may require gradients.
 
-    means: F64
-    log_scales: F32
-    quaternions: F32
-    logits: F32
-    sh: F32
+    Attributes:
+        means: ``(N, 3)`` metres, world, float32 or (where coordinates are large) float64.
+        log_scales: ``(N, 3)`` logarithms of the standard deviations in metres.
+        quaternions: ``(N, 4)`` wxyz, of any length but zero.
+        logit_opacities: ``(N,)`` opacities before the logistic function.
+        sh: ``(N, K, 3)`` colour coefficients, K in 1, 4, 9, 16.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
 
     @classmethod
-    def of(cls, *tensors: Tensor) -> _Parameters:
-        means, *rest = tensors
-        arrays = (t.detach().to(torch.float32).contiguous().numpy() for t in rest)
-        return cls(means.detach().to(torch.float64).contiguous().numpy(), *arrays)
+    def from_cloud(cls, cloud: GaussianCloud) -> Splats:
+        """Copy a drawable cloud; scales below ``exp(-20)`` m are raised to it and opacities kept
+        1e-6 away from 0 and 1.
+        """
+        scales = np.log(np.maximum(cloud.scales.astype(np.float64), np.exp(-LOG_SCALE_LIMIT)))
+        opacities = np.clip(cloud.opacities, _OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
+        arrays = (scales, cloud.quats, logit(opacities), cloud.sh)
+        return cls(
+            torch.as_tensor(np.array(cloud.means, np.float64)),
+            *(torch.as_tensor(np.array(array, np.float32)) for array in arrays),
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """What the forward pass keeps for the backward pass."""
+class GradientOutput(NamedTuple):
+    """One rendered view with its graph.
 
-    tiles: TileLists
-    records: F32  # RECORD per rank
-    gaussian: npt.NDArray[np.int64]  # (M,) which Gaussian each rank shows
-    pixels: F32  # per tile, see gradient_kernels
-
-
-def _chunk(count: int) -> int:
-    """Return how many splats to take at once: at most 64 chunks, whatever the number of threads."""
-    return max(512, -(-count // 64))
-
-
-def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[np.int64]]:
-    """Project, sort and list the splats, colours included; returns the lists, the records by rank
-    and which Gaussian each shows.
+    Attributes:
+        rgb: ``(H, W, 3)``, background included, not clamped.
+        alpha: ``(H, W)`` accumulated opacity.
+        depth: ``(H, W)`` metres along the optical axis, alpha-weighted mean; 0 where alpha is 0.
+        index: ``(M,)`` the Gaussians that may reach the image, nearest first.
+        uv: ``(M, 2)`` their centres, pixels; keeps its gradient.
+        on_screen: ``(M,)`` bool, which of them do reach it.
     """
-    n = len(p.means)
-    groups = -(-n // _LANES)
-    lane_means, geometry = (
-        np.empty(groups * 3 * _LANES),
-        np.zeros(groups * GEO_SIZE * _LANES, np.float32),
-    )
-    bad = pack(p.means, p.log_scales, p.quaternions, p.logits, lane_means, geometry)
-    if bad >= 0:
-        _refuse(p, bad)
-    records, ids = np.empty(n * RECORD, np.float32), np.empty(n, np.int64)
-    # Colours follow for the visible ones alone, and bundles in the optimiser's order have no
-    # bounding spheres worth a test.
-    plain = np.zeros(groups * 3 * _LANES, np.float32)
-    everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
-    index = np.arange(groups * _LANES)
-    workers = view.threads if n > WORTH_THREADS else 1
-    part = (lane_means, geometry, plain, 1, index, everywhere, np.int64(0), view.pose)
-    count = project_parts(workers, [part], view.numbers, records, ids)
-    cursor = np.zeros(2, np.int64)
-    centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]
-    run_on_threads(
-        workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records
-    )
-    if cursor[1]:
-        _refuse(p, -1)
-    order = depth_order(records[: count * RECORD], ids[:count])
-    # In the order of depth, so that numbers ascend within a tile and the pairs of a range of splats
-    # are found by bisection.
-    ordered = records.reshape(n, RECORD)[order].reshape(-1)
-    tiles = list_per_tile(np.arange(count), ordered, view.camera, view.threads)
-    return tiles, ordered, ids[order]
 
-
-def _refuse(p: _Parameters, bad: int) -> None:
-    """Raise the error about Gaussian ``bad``, or about a colour where that is below zero.
-
-    Raises:
-        InputError: Always.
-    """
-    cause = "a mean, scale, opacity or quaternion that is not finite, a quaternion of length zero or a scale beyond exp(20) m"
-    if bad < 0:
-        bad, cause = (
-            int(np.argmin(np.isfinite(p.sh).all(axis=(1, 2)))),
-            "a colour that is not finite",
-        )
-    raise InputError(
-        f"{len(p.means)} splats: number {bad} has {cause}",
-        "lower the learning rate, or drop such splats",
-    )
-
-
-class _Rasterize(torch.autograd.Function):
-    """Colour sum, alpha and depth sum of one view; the background is added outside."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        log_scales: Tensor,
-        quaternions: Tensor,
-        logits: Tensor,
-        sh: Tensor,
-        view: _View,
-        screen: ScreenStatistics,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        p = _Parameters.of(means, log_scales, quaternions, logits, sh)
-        tiles, records, gaussian = _project(p, view)
-        pixels = np.empty((len(tiles.starts) - 1) * _LANES * KEPT, np.float32)
-        images = composite(tiles, records, pixels, view.camera, view.threads)
-        boxes = records.reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
-        screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(
-            np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32)
-        )
-        ctx.save_for_backward(means, log_scales, quaternions, logits, sh)
-        ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, records, gaussian, pixels)
-        colour, alpha, depth_sum = (torch.from_numpy(image) for image in images)
-        return colour, alpha, depth_sum
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        view = ctx.view
-        kept = ctx.kept
-        tensors = ctx.saved_tensors
-        p = _Parameters.of(*tensors)
-        tiles = kept.tiles
-        g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
-        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
-        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, kept.records)
-        images = (kept.pixels, g_colour, g_alpha, g_depth)
-        run_on_threads(view.threads, tile_gradients, *lists, *images, pairs)
-        sums = np.empty(len(p.means) * PAIR, np.float32)
-        workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
-        chunks = (np.zeros(1, np.int64), _chunk(len(kept.gaussian)), kept.gaussian)
-        splats = (tiles.starts, tiles.lists, pairs, kept.records, sums)
-        run_on_threads(workers, sum_pairs, *chunks, *splats)
-        parameters = (p.means, p.log_scales, p.quaternions, p.logits, p.sh)
-        out = [np.zeros(a.shape, a.dtype) for a in parameters]
-        norm = np.zeros(len(p.means), np.float32)
-        chunks = (np.zeros(1, np.int64), _chunk(len(p.means)), ctx.screen.radii.numpy())
-        seen = (sums, view.pose, view.numbers)
-        run_on_threads(workers, splat_gradients, *chunks, *seen, *parameters, *out, norm)
-        ctx.screen.gradient_norm = torch.from_numpy(norm)
-        return (
-            *(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)),
-            None,
-            None,
-        )
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    index: Tensor
+    uv: Tensor
+    on_screen: Tensor
 
 
 def rasterize_gradient(
@@ -229,11 +131,7 @@ def rasterize_gradient(
             depend on it.
 
     Returns:
-        The image with its graph. A second backward pass through the same graph needs
-        ``retain_graph=True`` as usual; second derivatives are not available.
-
-    Raises:
-        InputError: A splat that cannot be drawn, or a background that does not fit.
+        The image with its graph; second derivatives are not available.
 
     Example:
         >>> import numpy as np, torch
@@ -244,30 +142,31 @@ def rasterize_gradient(
         >>> K = np.array([[30.0, 0, 16], [0, 30, 8], [0, 0, 1]])
         >>> out = rasterize_gradient(splats, PinholeCamera(32, 16, K, np.eye(4)))
         >>> out.alpha[:, :16].sum().backward()
-        >>> bool(splats.means.grad[0, 0] < 0), out.screen.gradient_norm.shape
-        (True, torch.Size([1]))
+        >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
+        (True, torch.Size([1, 2]))
     """
-    size = (camera.height, camera.width, 3)
-    if background is not None and background.shape not in ((3,), size):
-        raise InputError(
-            f"a background of shape {tuple(background.shape)}: a camera of {camera.width} x {camera.height} pixels",
-            f"give a tensor of shape (3,) or {size}",
-        )
-    pose = node_poses([None], camera, near_m)[0]
-    view = _View(camera, camera_numbers(camera), pose, thread_count(threads))
-    screen = ScreenStatistics(torch.zeros(len(splats), dtype=torch.int32))
-    colour, alpha, depth_sum = _Rasterize.apply(
-        splats.means,
-        splats.log_scales,
-        splats.quaternions,
-        splats.logit_opacities,
-        splats.sh,
-        view,
-        screen,
+    with torch.no_grad():
+        index = _candidates(splats, camera, near_m)
+    seen = Splats(*(tensor.index_select(0, index) for tensor in splats))
+    local = _in_camera(seen.means, camera)
+    uv, m, n = _ellipses(local, seen, camera)
+    if uv.requires_grad:
+        uv.retain_grad()
+    log_opacity = torch.nn.functional.logsigmoid(seen.logit_opacities)
+    projected = (uv, m, n, log_opacity, _colours(seen.sh, local, camera), local[2])
+    with torch.no_grad():
+        records = _records(*projected)
+        centre, reach = records[:, [U, V]], records[:, [RADIUS_X, RADIUS_Y]]
+        last = torch.tensor([camera.width, camera.height]) - 0.5
+        on_screen = ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
+    colour_sum, alpha, depth_sum = _Composite.apply(
+        *projected, records.numpy().reshape(-1), camera, thread_count(threads)
     )  # type: ignore[no-untyped-call]
-    rgb = colour if background is None else colour + (1 - alpha)[..., None] * background.float()
+    rgb = colour_sum
+    if background is not None:
+        rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
-    return GradientOutput(rgb, alpha, depth, screen)
+    return GradientOutput(rgb, alpha, depth, index, uv, on_screen)
 
 
 def rasterize_torch(
@@ -279,9 +178,6 @@ def rasterize_torch(
 ) -> RasterOutput:
     """Render a cloud by `rasterize_gradient`, without gradients.
 
-    Splats are float32, so the cloud and the camera are moved to the camera's centre first:
-    UTM-sized coordinates cost no precision.
-
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn or was trained with antialiasing,
             or the background does not fit.
@@ -292,17 +188,194 @@ def rasterize_torch(
             f"a cloud trained with antialiasing ({cloud.antialias_px2} px^2): a fit knows none",
             "draw it with another backend",
         )
-    behind = torch.as_tensor(background_image(background, camera)).expand(
-        camera.height, camera.width, 3
-    )
-    rotation = camera.T_camera_world[:3, :3]
-    centre = -rotation.T @ camera.T_camera_world[:3, 3]
-    T_camera_local = np.eye(4)
-    T_camera_local[:3, :3] = rotation
-    splats = Splats.from_cloud(replace(cloud, means=cloud.means - centre))
-    local_camera = replace(camera, T_camera_world=T_camera_local)
-    with torch.no_grad():
-        out = rasterize_gradient(splats, local_camera, background=behind, near_m=near_m)
+    behind = torch.as_tensor(background_image(background, camera))
+    out = rasterize_gradient(Splats.from_cloud(cloud), camera, background=behind, near_m=near_m)
     return RasterOutput(
         out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy(), {"gaussians": len(cloud)}
     )
+
+
+def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
+    """Return the Gaussians ``(M,)`` that can reach the image, nearest first; equal depths keep
+    their order.
+
+    The rows of J R_camera have the lengths ``focal / z sqrt(1 + slope^2)``, so the largest scale
+    bounds the ellipse.
+    """
+    local = _in_camera(splats.means, camera)
+    drawn = (local[2] >= near_m) & (splats.logit_opacities >= logit(np.array(ALPHA_MIN)))
+    index = torch.nonzero(drawn)[:, 0]
+    x, y, z = local[:, index]
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    largest = splats.log_scales.index_select(0, index).amax(dim=1).exp() / z
+    slope_x, slope_y = x / z, y / z
+    steep_x, steep_y = slope_x.clamp(low_x, high_x), slope_y.clamp(low_y, high_y)
+    inside = torch.ones(len(index), dtype=torch.bool)
+    for slope, steep, focal, middle, size in (
+        (slope_x, steep_x, camera.fx, camera.cx, camera.width),
+        (slope_y, steep_y, camera.fy, camera.cy, camera.height),
+    ):
+        square = (focal * largest).square() * (1 + steep.square()) + EPS2D_PX2
+        reach = EXTENT_MAX_SIGMA * square.sqrt() + MARGIN_PX
+        inside &= (slope * focal + middle - 0.5 + reach >= 0) & (
+            slope * focal + middle + 0.5 - reach <= size
+        )
+    index = index[inside]
+    return index[torch.from_numpy(depth_order(z[inside].numpy(), index.numpy()))]
+
+
+# Vectors are tensors (3, N): operations on whole components are several times as fast.
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return torch.stack([x, y, z])
+
+
+def _in_camera(means: Tensor, camera: PinholeCamera) -> Tensor:
+    """Return points ``(3, N)`` in the camera's axes; large coordinates cancel in float64."""
+    relative = means.double() - torch.as_tensor(camera.centre_world)
+    return (torch.as_tensor(camera.T_camera_world[:3, :3].copy()) @ relative.T).float()
+
+
+def _ellipses(
+    local: Tensor, splats: Splats, camera: PinholeCamera
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return centres ``(N, 2)``, pixels, and the rows m, n ``(3, N)`` of ``M = J R_camera R_q
+    diag(s)``: the screen covariance is ``M M^T`` and the low-pass.
+    """
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    right, down, ahead = torch.as_tensor(camera.T_camera_world[:3, :3, None]).float()
+    x, y, z = local
+    slope_x, slope_y = x / z, y / z
+    uv = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=1)
+    j = camera.fx / z * (right - slope_x.clamp(low_x, high_x) * ahead)
+    k = camera.fy / z * (down - slope_y.clamp(low_y, high_y) * ahead)
+    w, *u = torch.nn.functional.normalize(splats.quaternions.double(), dim=1).T
+    axis, scales = torch.stack(u), splats.log_scales.double().T.exp()
+
+    def turned(row: Tensor) -> Tensor:
+        """Return a row times R_q: the row turned by the inverse of q, whose vector part is -u."""
+        across = _cross(axis, row)
+        return row + 2 * (_cross(axis, across) - w * across)
+
+    return uv, turned(j) * scales, turned(k) * scales
+
+
+def _colours(sh: Tensor, local: Tensor, camera: PinholeCamera) -> Tensor:
+    """Return colours ``(N, 3)`` from the camera's side, clamped at 0 below."""
+    world = torch.as_tensor(camera.T_camera_world[:3, :3].T.copy()).float() @ local
+    terms = sh_terms(*(world * _dot(world, world).rsqrt()))
+    constant, *higher = sh.unbind(1)
+    colour = 0.5 + C0 * constant
+    for term, coefficients in zip(terms, higher, strict=False):
+        colour = colour + term[:, None] * coefficients
+    return colour.clamp(min=0)
+
+
+def _covariance(m: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return C11, C12, C22 and the determinant of the screen covariance ``(M,)``.
+
+    The determinant is a sum of squares (Cauchy-Binet), which does not cancel for needles.
+    """
+    c11, c12, c22 = _dot(m, m) + EPS2D_PX2, _dot(m, n), _dot(n, n) + EPS2D_PX2
+    minors = _cross(m, n)
+    return c11, c12, c22, _dot(minors, minors) + EPS2D_PX2 * (c11 + c22 - EPS2D_PX2)
+
+
+def _extent(log_opacity: Tensor) -> Tensor:
+    """Return the standard deviations ``(M,)`` out to the alpha cut."""
+    return (2 * (log_opacity - np.log(ALPHA_MIN))).clamp(min=0).sqrt().clamp(max=EXTENT_MAX_SIGMA)
+
+
+def _records(
+    uv: Tensor, m: Tensor, n: Tensor, log_opacity: Tensor, colour: Tensor, depth: Tensor
+) -> Tensor:
+    """Return projected splats ``(M, RECORD)`` as the kernels read them: see `constants`."""
+    c11, c12, c22, det = _covariance(m, n)
+    extent = _extent(log_opacity)
+    radius_x, radius_y = extent * c11.sqrt(), extent * c22.sqrt()
+    deviation, slope = (det / c22).sqrt(), c12 / c22
+    l11 = EXPONENT_SCALE / deviation
+    l12 = -l11 * slope
+    l22 = EXPONENT_SCALE * c22.rsqrt()
+    peak = (log_opacity / np.log(2) + 4) / 8
+    corner = torch.hypot(BLOCK_HALF * (l11 + l12.abs()), BLOCK_HALF * l22)
+    block = (peak - CUT).clamp(min=0).sqrt() + corner + 1e-3
+    columns = [
+        *(*uv.T, l11, l12, l22, peak, *colour.T, depth),
+        *(radius_x + MARGIN_PX, radius_y + MARGIN_PX, radius_x * c12 / c11, slope),
+        *(extent * deviation + MARGIN_PX, block.square()),
+    ]
+    return torch.stack([column.float() for column in columns], dim=1)
+
+
+class _Composite(torch.autograd.Function):
+    """Colour sum, alpha and depth sum of one view; the background is added outside."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        uv: Tensor,
+        m: Tensor,
+        n: Tensor,
+        log_opacity: Tensor,
+        colour: Tensor,
+        depth: Tensor,
+        records: F32,
+        camera: PinholeCamera,
+        threads: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        tiles = list_per_tile(np.arange(len(uv)), records, camera, threads)
+        kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, np.float32)
+        images = composite(tiles, records, kept, camera, threads)
+        ctx.save_for_backward(m, n, colour)
+        ctx.tiles, ctx.records, ctx.kept, ctx.threads = tiles, records, kept, threads
+        colour_sum, alpha, depth_sum = (torch.from_numpy(image) for image in images)
+        return colour_sum, alpha, depth_sum
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """With W the upper triangular whitening of the screen covariance ``C`` (``W^T W = C^-1``)
+        and moments of ``h = alpha dL/dalpha`` over whitened coordinates w: ``dL/d(u, v) = W^T sum
+        h w`` and ``dL/dM = W^T (sum h w w^T) W M``. ``W M`` has entries of at most 1, so that
+        needles of thousands of pixels lose nothing.
+        """
+        m, n, colour = ctx.saved_tensors
+        g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
+        tiles = ctx.tiles
+        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
+        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, ctx.records)
+        images = (ctx.kept, g_colour, g_alpha, g_depth)
+        run_on_threads(ctx.threads, tile_gradients, *lists, *images, pairs)
+        rows = np.zeros((len(colour), PAIR), np.float32)
+        add_pairs(tiles.lists, pairs, rows)
+        sums = torch.from_numpy(rows).T.contiguous()
+        _, c12, c22, det = _covariance(m, n)
+        # The moments are over whitened coordinates times EXPONENT_SCALE: each w holds one.
+        w11, w22 = (c22 / det).sqrt() / EXPONENT_SCALE, c22.rsqrt() / EXPONENT_SCALE
+        w12 = -w11 * c12 / c22
+        by_u = w11 * sums[PAIR_S]
+        by_v = w12 * sums[PAIR_S] + w22 * sums[PAIR_T]
+        s, t = w11 * m + w12 * n, w22 * n
+        a = sums[PAIR_SS] * s + sums[PAIR_ST] * t
+        b = sums[PAIR_ST] * s + sums[PAIR_TT] * t
+        by_colour = torch.where(colour > 0, sums[PAIR_R : PAIR_R + 3].T, 0.0)
+        return (
+            torch.stack([by_u, by_v], dim=1).float(),
+            w11 * a,
+            w12 * a + w22 * b,
+            sums[PAIR_H],
+            by_colour,
+            sums[PAIR_Z],
+            None,
+            None,
+            None,
+        )
