@@ -228,14 +228,13 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return (a * b).sum(dim=0)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    x = a[1] * b[2] - a[2] * b[1]
-    y = a[2] * b[0] - a[0] * b[2]
-    z = a[0] * b[1] - a[1] * b[0]
-    return torch.stack([x, y, z])
+    ax, ay, az = a
+    bx, by, bz = b
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _in_camera(means: Tensor, camera: PinholeCamera) -> Tensor:
