@@ -4,9 +4,7 @@ relied on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,9 +12,7 @@ from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
 from alpasim_plugin.alpasim.client.preflight import (
     LIMIT_S,
     DriveTimes,
-    Finding,
     findings,
-    outside_view,
     tolerances,
 )
 from alpasim_plugin.cli.options import Json, Run, run_or_newest, typer_of
@@ -33,14 +29,13 @@ from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.tables import again
 from evaluators import reduce_rollout, score
-from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
+from evaluators.metrics.outcomes import OUTCOMES, in_words
 from evaluators.numbers import plural
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 
 BROKEN = 1
-ATTEMPTS = 2  # at a scene in which the driver is lost
 FRAMES = 3  # that a renderer is asked for
 
 RUN_EPILOG = """
@@ -167,35 +162,34 @@ def check_driver(
 ) -> None:
     """Check an AlpaSim driver: order of calls, times, plans, and what it must tolerate."""
     times = DriveTimes()
-    drives: list[Drive] = []
+    ended: dict[str, str] = {}
     policy: AlpasimPolicy | None = None
+    failed: SimrunError | None = None
+    warmup = 0
     for ref in expand(scenario, ("timing.timeline=alpasim",)):
         scene = load_scenario(ref.path, ref.seed, ref.overrides)
-        try:
-            made = AlpasimPolicy(scene, address)
-        except InfrastructureError as error:
-            if policy is None:
-                raise
-            drives.append(Drive(scene.scene_id, 0, lost=1, failed=error))
-            break
         if policy is not None:
             policy.service.close()
-        policy = made
-        drives.append(rehearse(scene, policy, times))
+        policy = AlpasimPolicy(scene, address)
+        times.watch(policy.service)
+        warmup += scene.warmup_us // scene.rates.policy_us + 1
+        try:
+            ended[scene.scene_id] = rehearse(scene, policy)
+        except (PolicyError, InfrastructureError) as error:
+            ended[scene.scene_id], failed = error.message, failed or error
+            if isinstance(error, InfrastructureError):
+                break
     assert policy is not None, "a scenario stands for one scene at least"
-    failed = next((drive.failed for drive in drives if drive.failed is not None), None)
     checks = [
-        *findings(times, failed, sum(drive.warmup for drive in drives), limit_ms / 1000),
-        *over_scenes(drives),
+        *findings(times, failed, warmup, limit_ms / 1000),
         *tolerances(policy.service, scene.scene_id),
-        *outside_view(),
     ]
     code = BROKEN if any(check.result == "failed" for check in checks) else 0
     driver = policy.facts()["driver"]
     facts = {
         "driver": driver,
         "checks": [vars(check) for check in checks],
-        "scenes": [drive.facts() for drive in drives],
+        "scenes": ended,
         "exit_code": code,
     }
     lines = [f"{check.result:7} {check.name}: {check.text}" for check in checks]
@@ -203,73 +197,14 @@ def check_driver(
     raise typer.Exit(code)
 
 
-@dataclass
-class Drive:
-    """A scene of the rehearsal.
-
-    Attributes:
-        scene: Its id.
-        warmup: Queries in which empty plans are accepted.
-        outcomes: How it ended, by name; None where the driver was lost at every attempt.
-        lost: Attempts in which the connection was lost.
-        failed: What ended it early.
-    """
-
-    scene: str
-    warmup: int
-    outcomes: tuple[str, ...] | None = None
-    lost: int = 0
-    failed: SimrunError | None = None
-
-    def facts(self) -> dict[str, Any]:
-        """Return what JSON says of it."""
-        ended = None if self.outcomes is None else in_words(self.outcomes)
-        return {
-            "scene": self.scene,
-            "ended": ended,
-            "lost": self.lost,
-        }
-
-
-def rehearse(scene: Scenario, policy: AlpasimPolicy, times: DriveTimes) -> Drive:
-    """Drive a scene and name its outcomes; where the driver is lost, wait until it is there again
-    and begin anew.
-    """
-    out = Drive(scene.scene_id, scene.warmup_us // scene.rates.policy_us + 1)
-    times.watch(policy.service)
-    for _ in range(ATTEMPTS):
-        try:
-            log = run_rollout(scene, make_renderer("clean", scene), policy).log()
-            values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
-            out.outcomes = tuple(
-                name
-                for name in OUTCOMES
-                if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5
-            )
-            out.failed = None
-        except PolicyError as error:
-            out.outcomes, out.failed = (POLICY_FAULT,), error
-        except InfrastructureError as error:
-            out.lost, out.failed = out.lost + 1, error
-            policy.forget_session()
-        if out.failed is None or out.outcomes is not None or not _is_back(policy):
-            break
-    return out
-
-
-def _is_back(policy: AlpasimPolicy) -> bool:
-    try:
-        policy.service.wait_ready()
-    except InfrastructureError:
-        return False
-    return True
-
-
-def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
-    """Return what the scenes show together: lost connections."""
-    lost = sum(one.lost for one in drives)
-    text = f"{lost} lost connections in {len(drives)} scenes; {sum(one.outcomes is None for one in drives)} scenes without an outcome"
-    return [Finding("the connection lasts", "failed" if lost else "passed", text)]
+def rehearse(scene: Scenario, policy: AlpasimPolicy) -> str:
+    """Drive a scene and return how it ended, in words."""
+    log = run_rollout(scene, make_renderer("clean", scene), policy).log()
+    values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
+    measured = {name: values[name] for name in OUTCOMES if name in values}
+    return in_words(
+        tuple(name for name, one in measured.items() if one["valid"] and one["value"] >= 0.5)
+    )
 
 
 app = typer_of(

@@ -38,14 +38,14 @@ from alpasim_plugin.core.parts import split_names
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.schema import LOCK, OUTPUT_NAME
-from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
+from alpasim_plugin.runs.decide import SequentialTest, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.executors.choice import parse_executor
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
-from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
-from alpasim_plugin.runs.vary import BoundarySearch, Sweep, execute_sweep
+from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
+from alpasim_plugin.runs.vary import BoundarySearch, Sweep
 from evaluators import preset as find_preset
 from evaluators.numbers import plural
 from evaluators.opening import read_run
@@ -203,15 +203,15 @@ def run(
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
-    question = None
+    search: SequentialTest | BoundarySearch | None = None
     if until_decided:
         question = question_of(metric)
-        plan = plan_of_two(plan, question)
+        search = SequentialTest(plan_of_two(plan, question), question)
     elif metric:
         raise InputError("--metric: without --until-decided", "Add --until-decided.")
-    search = None
     if sweep is not None:
         search = BoundarySearch(plan, sweep, planned)
+    if search is not None:
         plan = search.ceiling
     root = out or default_folder(plan)
     if dry_run:
@@ -222,30 +222,7 @@ def run(
     command = ["simrun", *sys.argv[1:]]
     try:
         with Progress(quiet or as_json) as progress:
-            if question is not None:
-                decided = execute_decision(
-                    plan,
-                    question,
-                    root,
-                    workers=workers,
-                    command=command,
-                    progress=progress,
-                    report=report,
-                    limit_s=time_limit,
-                    executor=ray,
-                )
-            elif search is not None:
-                result = execute_sweep(
-                    search,
-                    root,
-                    workers=workers,
-                    command=command,
-                    progress=progress,
-                    report=report,
-                    limit_s=time_limit,
-                    executor=ray,
-                )
-            else:
+            if search is None:
                 result = execute_run(
                     plan,
                     root,
@@ -258,12 +235,23 @@ def run(
                     limit_s=time_limit,
                     executor=ray,
                 )
+            else:
+                result = execute_search(
+                    search,
+                    root,
+                    workers,
+                    command,
+                    progress,
+                    report=report,
+                    limit_s=time_limit,
+                    executor=ray,
+                )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
-    if question is not None:
-        _print_decision(decided, as_json)
-        raise typer.Exit(decided.outcome.exit_code)
+    if isinstance(search, SequentialTest):
+        _print_decision(search, root, as_json)
+        raise typer.Exit(search.outcome.exit_code)
     if as_json:
         facts = {"out": str(root), "exit_code": result.exit_code, "summary": result.summary}
         show(as_json, facts)
@@ -322,10 +310,9 @@ def question_of(metrics: Sequence[str]) -> Question:
     return Question(tuple(questions.values()))
 
 
-def _print_decision(decided: Decided, as_json: bool) -> None:
-    record = decided.record
-    root = decided.run.root
-    facts = {"out": str(root), "exit_code": decided.outcome.exit_code, "decision": record}
+def _print_decision(test: SequentialTest, root: Path, as_json: bool) -> None:
+    record = test.record()
+    facts = {"out": str(root), "exit_code": test.outcome.exit_code, "decision": record}
     lines = [] if as_json else first_screen(read_run(root))
     show(as_json, facts, *decision_lines(record), "", *lines, "", *report_lines(root))
 

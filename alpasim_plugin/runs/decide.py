@@ -7,34 +7,21 @@ interruptions. The same command therefore reaches the same decision after any ki
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
-from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.sides import RolloutTable
-from alpasim_plugin.log.run_folder.writer import rollout_table, writing
-from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor
-from alpasim_plugin.runs.plan import Cell, RunPlan, part_of
-from alpasim_plugin.runs.run import (
-    Progress,
-    RunResult,
-    claim,
-    finish_run,
-    on_done,
-    write_run_info,
-)
-from alpasim_plugin.runs.summary import pool_of
+from alpasim_plugin.log.run_folder.writer import rollout_table
+from alpasim_plugin.runs.plan import RunPlan, part_of
+from alpasim_plugin.runs.run import Progress
 from evaluators.statistics.decision import (
     MOST_SCENES,
     SCHEMA_VERSION,
@@ -59,27 +46,8 @@ from evaluators.statistics.variants import (
 )
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 
-KIND = "decide"  # of run.json
 SCENES_PER_LOOK = 5
 ORDER_SEED = 0
-
-
-class DecisionProgress(Progress, Protocol):
-    """Shows a sequential test to a person or a log file."""
-
-    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
-        """Announce an interim analysis."""
-        ...
-
-
-@dataclass(frozen=True)
-class Decided:
-    """A decision and its run."""
-
-    run: RunResult
-    record: Decision
-    state: State
-    outcome: Outcome
 
 
 def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
@@ -131,73 +99,18 @@ def drawing_order(scenes: Sequence[str]) -> list[str]:
     return [names[number] for number in order]
 
 
-def execute_decision(
-    plan: RunPlan,
-    question: Question,
-    root: Path,
-    workers: int | None,
-    command: Sequence[str],
-    progress: DecisionProgress,
-    *,
-    report: bool = True,
-    limit_s: float | None = None,
-    executor: Executor = LOCAL,
-) -> Decided:
-    """Drive scenes of a plan until the question is decided or all are driven.
-
-    Args:
-        plan: From `plan_of_two`.
-        question: What is to be decided.
-        root: The run folder; one process writes it at a time.
-        workers: As for a run; the results do not depend on them.
-        command: For ``run.json``.
-        progress: Shows rollouts and interim analyses.
-        report: Write ``report.html``.
-        limit_s: Seconds that one rollout may take.
-        executor: As for a run; the decision does not depend on it.
-
-    Raises:
-        InputError: The folder holds another run.
-        InfrastructureError: Another process writes the folder.
-    """
-    test = _SequentialTest(plan, question)
-    threads = thread_budget(workers, SCENES_PER_LOOK * 2 * len(plan.seeds), executor)
-    how = HowToRun(threads, limit_s=limit_s, executor=executor)
-    with writing(root):
-        held = claim(root, plan, command, threads, False, progress.noticed)
-        # The kind is written at once: the plan's scenes are not all wanted.
-        write_run_json(root, read_run_json(root) | {"kind": KIND})
-        progress.started(plan, root, threads)
-        began = time.perf_counter()
-        try:
-            while cells := test.next_cells():
-                part = part_of(plan, cells)
-                manifests = execute(part, root, how, on_done(progress), progress.noticed)
-                test.add(cells, manifests)
-                progress.looked(test.state, len(test.manifests), len(plan.cells))
-                write_decision(root, test.record())
-        finally:
-            end_children()
-        driven = part_of(plan, test.cells)
-        manifests = [test.manifests[cell.folder.as_posix()] for cell in driven.cells]
-        took_s = time.perf_counter() - began
-        pool = {**how.stated, **pool_of(manifests, threads, took_s, held.get("pool"))}
-        write_run_info(root, driven, command, threads)  # again, with the scenes that were driven
-        kept = {"started_at": held["started_at"]} if "started_at" in held else {}
-        write_run_json(root, read_run_json(root) | kept | {"kind": KIND})
-        summary = finish_run(root, manifests, {"pool": pool}, report)
-    result = RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
-    return Decided(result, test.record(), test.state, test.outcome)
-
-
 @dataclass
-class _SequentialTest:
-    """The scenes driven so far, what follows from them, and which come next."""
+class SequentialTest:
+    """The scenes driven so far, what follows from them, and which come next; a
+    `alpasim_plugin.runs.run.Search` of a plan from `plan_of_two`.
+    """
+
+    kind: ClassVar[str] = "decide"
 
     plan: RunPlan
     question: Question
-    driven: int = 0  # scenes, the first of the order
-    manifests: dict[str, JsonObject] = field(default_factory=dict)
+    n_scenes: int = 0  # that were driven, the first of the order
+    driven: dict[str, JsonObject] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)  # binding metrics of which a pair has no value
     state: State = State(0, "open", ())
@@ -210,47 +123,57 @@ class _SequentialTest:
         self.candidate = next(variant for variant in variants if base.of(variant) != variant)
         self.baseline = base.of(self.candidate)
         self.order = drawing_order(list(self.plan.scenarios))
+        self.ceiling, self.at_once = self.plan, SCENES_PER_LOOK * 2 * len(self.plan.seeds)
 
-    @property
-    def cells(self) -> list[Cell]:
-        """Give the cells driven so far, in the plan's order."""
-        return [cell for cell in self.plan.cells if cell.folder.as_posix() in self.manifests]
+    def driven_plan(self) -> RunPlan:
+        """Return the part of the plan that was driven."""
+        done = [cell for cell in self.plan.cells if cell.folder.as_posix() in self.driven]
+        return part_of(self.plan, done)
 
-    def next_cells(self) -> list[Cell]:
-        """Return the cells of the next batch; none where the test has ended, and then ``stopped``
-        says why.
-        """
+    def next_plan(self) -> RunPlan | None:
+        """Return the next batch; None where the test has ended, and then ``stopped`` says why."""
         if self.stopped:
-            return []
-        batch = self.order[self.driven : self.driven + SCENES_PER_LOOK]
+            return None
+        batch = self.order[self.n_scenes : self.n_scenes + SCENES_PER_LOOK]
         if not batch:
             self.stopped = f"all {len(self.order)} scenes are driven"
-        self.driven += len(batch)
-        return [cell for scene in batch for cell in self.plan.cells if cell.scene == scene]
+            return None
+        self.n_scenes += len(batch)
+        cells = [cell for scene in batch for cell in self.plan.cells if cell.scene == scene]
+        return part_of(self.plan, cells)
 
-    def add(self, cells: Sequence[Cell], manifests: Sequence[JsonObject]) -> None:
+    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
         """Take in a batch and analyse all scenes so far."""
-        folders = [cell.folder.as_posix() for cell in cells]
-        self.manifests |= dict(zip(folders, manifests, strict=True))
-        table = RolloutTable.of_table(rollout_table(list(self.manifests.values())))
+        folders = [cell.folder.as_posix() for cell in plan.cells]
+        self.driven |= dict(zip(folders, manifests, strict=True))
+        table = RolloutTable.of_table(rollout_table(list(self.driven.values())))
         self.failed = outcome_of_failures(failures_of(table))
         policy = self.candidate.policy
         candidate = table.sides(policy)[self.candidate.renderer]
         base = table.sides(self.baseline.policy, policy)[self.baseline.renderer]
-        scenes = self.order[: self.driven]
+        scenes = self.order[: self.n_scenes]
         asked = self.question.metrics
         values = {one.metric: scene_harm(candidate, base, one.facts, scenes) for one in asked}
         self.lacking = [
             one.metric for one in asked if one.binding and np.isnan(values[one.metric]).any()
         ]
         self.state = state_after(self.question, values, len(self.order))
-        self.looks.append(look_as_dict(self.state, len(self.manifests)))
+        self.looks.append(look_as_dict(self.state, len(self.driven)))
         if self.failed.cause != "pass":
             self.stopped = "rollouts failed"
         elif self.state.answer != "open":
             self.stopped = "decided"
         elif self.lacking:
             self.stopped = f"pairs lack a value: {', '.join(self.lacking)}"
+
+    def announce(self, root: Path, progress: Progress) -> None:
+        """Show the analysis and write ``decision.json``."""
+        progress.looked(self.state, len(self.driven), len(self.plan.cells))
+        write_decision(root, self.record())
+
+    def facts(self) -> JsonObject:
+        """Return nothing: ``decision.json`` holds the decision."""
+        return {}
 
     @property
     def outcome(self) -> Outcome:
@@ -274,10 +197,10 @@ class _SequentialTest:
             "order_seed": ORDER_SEED,
             "look_every": SCENES_PER_LOOK,
             "ceiling": {"scenes": len(self.order), "rollouts": len(self.plan.cells)},
-            "order": self.order[: self.driven],
+            "order": self.order[: self.n_scenes],
             "looks": self.looks,
             "verdict": words.get(outcome.cause, "undecided"),
             "stopped": self.stopped,
             "outcome": outcome.as_dict(),
-            "rollouts": len(self.manifests),
+            "rollouts": len(self.driven),
         }

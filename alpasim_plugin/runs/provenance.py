@@ -36,8 +36,6 @@ GIT = (
     "-c",
     "core.fsmonitor=false",
     "-c",
-    "log.showSignature=false",
-    "-c",
     "core.hooksPath=/dev/null",
 )
 ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
@@ -87,16 +85,12 @@ class Project(TypedDict):
 
     Attributes:
         commit: Full hash of the commit; None where there is none.
-        committed_at: When it was made, ISO 8601.
-        branch: None where no branch is checked out.
         dirty: Whether a file that git follows differs from the commit; files that it does not
             follow do not count, nor do changes in submodules.
         reason: Why there is no commit, else empty.
     """
 
     commit: str | None
-    committed_at: str | None
-    branch: str | None
     dirty: bool | None
     reason: str
 
@@ -116,15 +110,14 @@ def project(folder: Path | None = None) -> Project:
     if stated:
         if not _COMMIT.fullmatch(stated):
             return _without(f"{VARIABLE} is no commit: {stated[:40]!r}")
-        return {"commit": stated, "committed_at": None, "branch": None, "dirty": None, "reason": ""}
+        return {"commit": stated, "dirty": None, "reason": ""}
     try:
-        last = _git(folder, "log", "-1", "--format=%H %cI")
+        commit = _git(folder, "rev-parse", "--verify", "HEAD").strip()
         state = _git(
             folder,
             *_no_filters(folder),
             "status",
-            "--porcelain=v2",
-            "--branch",
+            "--porcelain",
             "--untracked-files=no",
             "--ignore-submodules=dirty",
         )
@@ -135,28 +128,11 @@ def project(folder: Path | None = None) -> Project:
     except subprocess.CalledProcessError as error:
         said = str(error.stderr or "").strip().splitlines()
         return _without(said[0] if said else f"git ended with {error.returncode}")
-    commit, _, committed_at = last.strip().partition(" ")
-    lines = state.splitlines()
-    branch = next(
-        (
-            line.removeprefix("# branch.head ")
-            for line in lines
-            if line.startswith("# branch.head ")
-        ),
-        "(detached)",
-    )
-    dirty = any(not line.startswith("#") for line in lines)
-    return {
-        "commit": commit,
-        "committed_at": committed_at,
-        "branch": None if branch == "(detached)" else branch,
-        "dirty": dirty,
-        "reason": "",
-    }
+    return {"commit": commit, "dirty": bool(state.strip()), "reason": ""}
 
 
 def _without(reason: str) -> Project:
-    return {"commit": None, "committed_at": None, "branch": None, "dirty": None, "reason": reason}
+    return {"commit": None, "dirty": None, "reason": reason}
 
 
 def _git(folder: Path | None, *words: str) -> str:

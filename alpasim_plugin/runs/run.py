@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
@@ -39,6 +39,7 @@ from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
+from evaluators.statistics.decision import State
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
@@ -68,6 +69,49 @@ class Progress(Protocol):
         """Say in one line what was found damaged and what is done about it, or who is waited
         for.
         """
+        ...
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Announce an interim analysis of a sequential test."""
+        ...
+
+
+class Search(Protocol):
+    """Drives rollouts in rounds: the next follows from the outcomes so far alone, so the same
+    command continues after any interruption.
+
+    Attributes:
+        kind: Of ``run.json``.
+        plan: Holds the key of the command.
+        ceiling: The plan with as many rollouts as are driven at most.
+        at_once: Rollouts of a round, about.
+        driven: Manifests by the cell's folder.
+    """
+
+    kind: ClassVar[str]
+    plan: RunPlan
+    ceiling: RunPlan
+    at_once: int
+    driven: dict[str, JsonObject]
+
+    def next_plan(self) -> RunPlan | None:
+        """Return the rollouts of the next round; None where the search has ended."""
+        ...
+
+    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
+        """Take in the outcomes of a round."""
+        ...
+
+    def announce(self, root: Path, progress: Progress) -> None:
+        """Say and store what follows from the rounds so far."""
+        ...
+
+    def driven_plan(self) -> RunPlan:
+        """Return the plan of what was driven, in the order of the tables."""
+        ...
+
+    def facts(self) -> JsonObject:
+        """Return what ``run.json`` and the summary hold of the search."""
         ...
 
 
@@ -167,6 +211,43 @@ def execute_run(
         finally:
             end_children()
         summary = finish_run(root, manifests, more, report)
+    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+
+
+def execute_search(
+    search: Search,
+    root: Path,
+    workers: int | None,
+    command: Sequence[str],
+    progress: Progress,
+    *,
+    report: bool = True,
+    limit_s: float | None = None,
+    executor: Executor = LOCAL,
+) -> RunResult:
+    """Drive the rounds of a search into a folder; the arguments are those of `execute_run`."""
+    threads = thread_budget(workers, search.at_once, executor)
+    how = HowToRun(threads, limit_s=limit_s, executor=executor)
+    with writing(root):
+        held = claim(root, search.plan, command, threads, False, progress.noticed)
+        # The kind is written at once: the plan's scenes are not all wanted.
+        write_run_json(root, read_run_json(root) | {"kind": search.kind})
+        progress.started(search.ceiling, root, threads)
+        began = time.perf_counter()
+        try:
+            while (plan := search.next_plan()) is not None:
+                search.add(plan, execute(plan, root, how, on_done(progress), progress.noticed))
+                search.announce(root, progress)
+        finally:
+            end_children()
+        driven = search.driven_plan()
+        manifests = [search.driven[cell.folder.as_posix()] for cell in driven.cells]
+        wall_s = time.perf_counter() - began
+        pool = {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))}
+        write_run_info(root, driven, command, threads)  # again, with the scenes that were driven
+        kept = {key: held[key] for key in ("started_at",) if key in held}
+        write_run_json(root, read_run_json(root) | kept | {"kind": search.kind})
+        summary = finish_run(root, manifests, {"pool": pool} | search.facts(), report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 

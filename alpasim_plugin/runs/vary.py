@@ -9,30 +9,17 @@ follows from the outcomes alone, so the same command continues after any interru
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
-from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
-from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
-from alpasim_plugin.log.run_folder.writer import writing
-from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import Cell, RunPlan
-from alpasim_plugin.runs.run import (
-    Progress,
-    RunResult,
-    claim,
-    finish_run,
-    on_done,
-    write_run_info,
-)
-from alpasim_plugin.runs.summary import pool_of
+from alpasim_plugin.runs.run import Progress
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
 from evaluators.report.boundary import sentence_of
 from evaluators.statistics.boundary import (
@@ -47,7 +34,6 @@ from evaluators.statistics.boundary import (
 from evaluators.statistics.variants import Variant, usual_base, variants_of
 from scenarios.suite import ScenarioRef
 
-KIND = "vary"  # of run.json
 UNITS = {"mps": "m/s", "mps2": "m/s\u00b2", "m": "m", "s": "s", "us": "\u00b5s", "rad": "rad"}
 RANGE = re.compile(r"([A-Za-z_][\w.\-]*)=([^=]+?)\.\.([^=]+)")
 MakePlan = Callable[[Sequence[ScenarioRef]], RunPlan]
@@ -98,17 +84,17 @@ class Sweep:
 
 @dataclass
 class BoundarySearch:
-    """The points driven so far, what follows from them, and which come next.
+    """The points driven so far, what follows from them, and which come next; a
+    `alpasim_plugin.runs.run.Search`.
 
     Attributes:
         plan: The scene as written, with the keys of the whole run.
-        ceiling: The same with as many rollouts as the search drives at most.
-        driven: Manifests by the cell's folder.
         cells: The cells driven so far.
         scenes: Point -> plan of the scene with the parameter at that value.
         unreachable: Point -> why the scene cannot be built there.
     """
 
+    kind: ClassVar[str] = "vary"
     plan: RunPlan
     sweep: Sweep
     make: MakePlan
@@ -129,6 +115,7 @@ class BoundarySearch:
         names = [(cell.renderer.name, cell.policy.name) for cell in self.plan.cells]
         self.variants = variants_of(names)
         self.failed = {(one, seed): {} for one in self.variants for seed in self.plan.seeds}
+        self.at_once = len(self.failed) * 2  # two points each
         self.ends = self._reachable_ends()
 
     def _reachable_ends(self) -> tuple[int, int]:
@@ -193,12 +180,23 @@ class BoundarySearch:
         scenarios = {name: known[name] for name in wanted}
         return replace(self.plan, cells=tuple(cells), scenarios=scenarios, whole=self.plan)
 
-    def add(self, cells: Sequence[Cell], manifests: Sequence[JsonView]) -> None:
+    def driven_plan(self) -> RunPlan:
+        """Return the plan of the points driven so far."""
+        return self.plan_of(self.cells)
+
+    def announce(self, root: Path, progress: Progress) -> None:
+        """Say nothing: the record is part of the summary."""
+
+    def facts(self) -> JsonObject:
+        """Return the record."""
+        return {"boundary": self.record()}
+
+    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
         """Take in the outcomes of a round."""
-        points = {plan.cells[0].scene: point for point, plan in self.scenes.items()}
-        for cell, manifest in zip(cells, manifests, strict=True):
+        points = {one.cells[0].scene: point for point, one in self.scenes.items()}
+        for cell, manifest in zip(plan.cells, manifests, strict=True):
             self.cells.append(cell)
-            self.driven[cell.folder.as_posix()] = dict(manifest)
+            self.driven[cell.folder.as_posix()] = manifest
             failed = _has_failed(manifest)
             if failed is None:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"
@@ -271,53 +269,3 @@ def _has_failed(manifest: JsonView) -> bool | None:
         return True
     known = {name: metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")}
     return False if all(known.values()) else None
-
-
-def execute_sweep(
-    search: BoundarySearch,
-    root: Path,
-    workers: int | None,
-    command: Sequence[str],
-    progress: Progress,
-    *,
-    report: bool = True,
-    limit_s: float | None = None,
-    executor: Executor = LOCAL,
-) -> RunResult:
-    """Drive the points of a search until every boundary is enclosed, or none is there.
-
-    Args:
-        search: What is searched for.
-        root: The run folder; one process writes it at a time.
-        workers: As for a run; the results do not depend on them.
-        command: For ``run.json``.
-        progress: Shows rollouts.
-        report: Write ``report.html``.
-        limit_s: Seconds that one rollout may take.
-        executor: As for a run.
-
-    Raises:
-        InputError: The folder holds another run.
-        InfrastructureError: Another process writes the folder.
-    """
-    threads = thread_budget(workers, len(search.failed) * 2, executor)
-    how = HowToRun(threads, limit_s=limit_s, executor=executor)
-    with writing(root):
-        held = claim(root, search.plan, command, threads, False, progress.noticed)
-        progress.started(search.ceiling, root, threads)
-        began = time.perf_counter()
-        try:
-            while (plan := search.next_plan()) is not None:
-                search.add(
-                    plan.cells, execute(plan, root, how, on_done(progress), progress.noticed)
-                )
-        finally:
-            end_children()
-        manifests = list(search.driven.values())
-        took_s = time.perf_counter() - began
-        pool = {**how.stated, **pool_of(manifests, threads, took_s, held.get("pool"))}
-        write_run_info(root, search.plan_of(search.cells), command, threads)
-        write_run_json(root, read_run_json(root) | {"kind": KIND})
-        more = {"pool": pool, "boundary": search.record()}
-        summary = finish_run(root, manifests, more, report)
-    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])

@@ -287,7 +287,7 @@ def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(scene, driver, capsy
     assert run_command(["check", "driver", driver[1], "--scenario", scene, *timing]) == 0
     told = json.loads(capsys.readouterr().out)
     good = {one["name"]: one["result"] for one in told["checks"]}
-    assert [(one["ended"], one["lost"]) for one in told["scenes"]] == [("no event", 0)]
+    assert list(told["scenes"].values()) == ["no event"]
     assert set(good.values()) == {"passed", "noted"}
     assert good["samples for minADE"] == "passed"
     late = egodriver_pb2.DriveResponse()

@@ -33,7 +33,6 @@ class Many:
     name: str
     started_at: str = "2026-03-01T10:00:00+00:00"
     commit: str | None = COMMITS[0]
-    committed_at: str | None = None
     dirty: bool = False
     renderers: Sequence[str] = ("clean", "onefixer")
     policies: Sequence[str] = ("lane-camera",)
@@ -112,8 +111,6 @@ def info_of(one: Many) -> dict[str, Any]:
     """Return ``run.json`` as a run writes it, as far as lists and trends read it."""
     project = {
         "commit": one.commit,
-        "committed_at": one.committed_at,
-        "branch": "main",
         "dirty": one.dirty,
         "reason": "" if one.commit else "none",
     }

@@ -14,8 +14,9 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.schema import MANIFEST, SUMMARY
 from alpasim_plugin.runs import decide as decide_module
-from alpasim_plugin.runs.decide import drawing_order, execute_decision, plan_of_two
+from alpasim_plugin.runs.decide import SequentialTest, drawing_order, plan_of_two
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import execute_search
 from evaluators.opening import read_run
 from evaluators.report.html import render_report
 from evaluators.statistics.decision import (
@@ -62,9 +63,9 @@ def plan_of(
 
 def decide(root, question, plan, workers=1):
     announced = Looks()
-    asked = plan_of_two(plan, question)
-    decided = execute_decision(asked, question, root, workers, ["simrun"], announced, report=False)
-    return decided, announced
+    test = SequentialTest(plan_of_two(plan, question), question)
+    execute_search(test, root, workers, ["simrun"], announced, report=False)
+    return test, announced
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -89,14 +90,14 @@ def told(root):
 
 def test_a_question_is_decided_before_all_scenes_are_driven(decided_run):
     root, decided, announced = decided_run
-    assert (decided.outcome.exit_code, decided.record["verdict"]) == (0, "non-inferior")
-    assert decided.record["stopped"] == "decided"
+    assert (decided.outcome.exit_code, decided.record()["verdict"]) == (0, "non-inferior")
+    assert decided.record()["stopped"] == "decided"
     driven = announced.looks[-1][0]
     assert announced.looks[-1][1] == "good"
     assert driven < 16
-    assert decided.record["order"] == drawing_order(list(plan_of().scenarios))[:driven]
-    assert decided.record["rollouts"] == 2 * driven == len(read_run(root).rollouts)
-    assert decided.record["ceiling"] == {"scenes": 16, "rollouts": 32}
+    assert decided.record()["order"] == drawing_order(list(plan_of().scenarios))[:driven]
+    assert decided.record()["rollouts"] == 2 * driven == len(read_run(root).rollouts)
+    assert decided.record()["ceiling"] == {"scenes": 16, "rollouts": 32}
 
 
 def test_the_order_depends_on_the_names_alone():
@@ -117,7 +118,7 @@ def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp
     decided, announced = decide(root, SAME, plan_of())
     assert sorted(announced.results) == [("ok", False)] * 2 + [("ok", True)] * 6
     assert told(root) == before
-    assert decided.record == before
+    assert decided.record() == before
 
 
 def test_another_question_in_the_same_folder_is_refused(decided_run):
@@ -149,7 +150,7 @@ def test_when_all_scenes_are_driven_the_decision_is_undecided(tmp_path, monkeypa
         decide(tmp_path, CLOSER, plan_of(2))
     monkeypatch.setattr(decide_module, "least_scenes", lambda question, most: most)
     decided, announced = decide(tmp_path, CLOSER, plan_of(2))
-    assert (decided.outcome.exit_code, decided.record["rollouts"]) == (3, 4)
+    assert (decided.outcome.exit_code, decided.record()["rollouts"]) == (3, 4)
     assert announced.looks == [(2, "open")]
 
 
@@ -158,7 +159,7 @@ def test_a_failed_rollout_ends_the_decision(tmp_path):
     decided, announced = decide(tmp_path, SAME, plan_of(policy=broken))
     assert decided.outcome.exit_code == 2  # the policy's own fault
     assert announced.looks == [(2, "open")]
-    assert "rollouts failed" in decided.record["stopped"]
+    assert "rollouts failed" in decided.record()["stopped"]
 
 
 def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path, capsys):

@@ -62,8 +62,6 @@ def test_runs_are_found_at_any_depth_and_the_newest_comes_first(root, capsys):
     assert [one["rollouts"] for one in found.values()] == [24, 48, 2]
     assert found["middle"]["project"] == {
         "commit": COMMITS[1],
-        "committed_at": None,
-        "branch": "main",
         "dirty": True,
         "reason": "",
     }

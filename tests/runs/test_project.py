@@ -25,7 +25,7 @@ def nothing_stated(monkeypatch, tmp_path):
 
 def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
     git(tmp_path, "init", "-q", "-b", "trunk")
-    assert "trunk" in project(tmp_path)["reason"]  # no commit yet
+    assert project(tmp_path)["reason"]  # no commit yet
     (tmp_path / "policy.py").write_text("a")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "-qm", "first")
@@ -34,16 +34,10 @@ def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
     below = tmp_path / "deeper"
     below.mkdir()
     found = project(below)
-    assert found == {
-        "commit": commit,
-        "committed_at": git(tmp_path, "log", "-1", "--format=%cI"),
-        "branch": "trunk",
-        "dirty": False,
-        "reason": "",
-    }
+    assert found == {"commit": commit, "dirty": False, "reason": ""}
     (tmp_path / "policy.py").write_text("b")
     git(tmp_path, "checkout", "-q", "--detach")
-    assert (project(tmp_path)["dirty"], project(tmp_path)["branch"]) == (True, None)
+    assert project(tmp_path)["dirty"]
 
 
 def test_a_program_that_the_repository_names_is_not_run(tmp_path):

@@ -143,10 +143,6 @@ class DriverPolicy(Policy):
         finally:
             self.service.close()
 
-    def forget_session(self) -> None:
-        """Take an open session for lost with its driver: nobody is asked to close it."""
-        self._session = ""
-
     def _end_session(self) -> None:
         if self._session:
             session, self._session = self._session, ""

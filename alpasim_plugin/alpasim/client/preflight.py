@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
@@ -162,12 +162,6 @@ def tolerances(service: Service, scene_id: str) -> list[Finding]:
         )
     )
     return out
-
-
-def outside_view() -> Sequence[Finding]:
-    """Return what no socket shows, and how to see it."""
-    text = "run its container with --read-only --tmpfs /tmp --gpus and a memory limit of the challenge: 16 GiB of GPU memory"
-    return [Finding("read-only root and memory", "noted", text)]
 
 
 def _open_and_close(service: Service, name: str, scene_id: str) -> None:
