@@ -7,21 +7,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import Frame, RenderRequest
-from alpasim_plugin.fixers.loop import BlockRunner, FixedRenderer
+from alpasim_plugin.fixers.loop import BlockRunner, PerFrameRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 
 
-class ChunkRenderer(FixedRenderer):
+class ChunkRenderer(PerFrameRenderer):
     """A session that renders all frames of a block at once, of all cameras.
 
     Args:
         runner: Renders and calls the fixer.
-        make_fixer: Makes a fixer at the start of its history; not used.
-        settings: Not used.
-        first: A fixer that is made already.
+        make_fixer, settings: Not used.
+        first: A fixer at the start of its history.
     """
 
     def __init__(
@@ -31,9 +29,10 @@ class ChunkRenderer(FixedRenderer):
         settings: FixerSettings,
         first: Fixer,
     ) -> None:
-        super().__init__(runner, first, "chunk")
+        super().__init__(runner, first)
+        self.mode = "chunk"
         self.block = first.blocks
-        self.frames = self.blocks = 0
+        self.blocks = 0
 
     def counts(self) -> dict[str, Any]:
         """Return the number of frames and of blocks so far."""
@@ -43,22 +42,8 @@ class ChunkRenderer(FixedRenderer):
         """Return the frames of one block, in the order of the requests.
 
         Raises:
-            RendererError: A camera has another number of frames than the block.
             FixerError: The fixer broke its contract.
         """
-        due = self.fixer.blocks.frames(self.blocks)
-        counts: dict[str, int] = {}
-        for request in requests:
-            counts[request.camera.name] = counts.get(request.camera.name, 0) + 1
-        if set(counts.values()) != {due}:
-            raise RendererError(
-                f"block {self.blocks}: frames by camera: {counts}; the block has {due}",
-                "request whole blocks",
-            )
-        self.runner.reset_times()
-        fixed = self.runner.fix(
-            self.fixer, self.fixer.step, [self.runner.render(request) for request in requests]
-        )
+        fixed = super().render_batch(requests)
         self.blocks += 1
-        self.frames += len(fixed)
         return fixed

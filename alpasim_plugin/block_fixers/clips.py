@@ -69,44 +69,38 @@ def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
     return video[:, :, : size.frames, : size.height, : size.width]
 
 
-def check_frames(video: Tensor, first: bool) -> None:
-    """Refuse clips of an invalid size.
+def check_video(name: str, x: Tensor, channels: int, side: int = 1) -> None:
+    """Refuse other tensors than ``(B, channels, T, H, W)`` floating point, none of the sizes zero,
+    height and width multiples of ``side``.
+
+    Raises:
+        InputError: Another shape or dtype.
+    """
+    fits = x.ndim == 5 and x.shape[1] == channels and x.is_floating_point() and 0 not in x.shape
+    if not fits or x.shape[3] % side or x.shape[4] % side:
+        raise InputError(
+            f"{name}: shape {list(x.shape)} of {x.dtype}",
+            f"give (batch, {channels}, time, height, width) of floats, sides in multiples of {side}",
+        )
+
+
+def check_frames(name: str, video: Tensor, channels: int, first: bool) -> None:
+    """Refuse clips that a codec cannot divide into latents.
 
     Args:
-        video: Meant to be ``(B, 3, T, H, W)`` floating point.
+        name: Of the video, for the error.
+        video: Meant to be ``(B, channels, T, H, W)``, sides in multiples of 8.
+        channels: How many.
         first: Whether these frames start the video (1 + 4k) or continue it (4k).
 
     Raises:
         InputError: Another shape or dtype.
     """
-    if video.ndim != 5 or video.shape[1] != 3 or not video.is_floating_point():
+    check_video(name, video, channels, SIDE)
+    if (video.shape[2] - first) % GROUP:
         raise InputError(
-            f"a tensor {list(video.shape)} of {video.dtype} is not a floating-point video",
-            "give (B, 3, T, H, W) with values in [-1, 1]",
-        )
-    frames, height, width = video.shape[2:]
-    if not height or not width or height % SIDE or width % SIDE:
-        raise InputError(
-            f"frames of {height} x {width} pixels: height and width must be multiples of {SIDE}",
-            "pad them with pad_clip and crop the result with crop_clip",
-        )
-    if frames < 1 or (frames - first) % GROUP:
-        raise InputError(
-            f"{frames} frames at the {'start' if first else 'middle'} of a stream, not {'1 + ' if first else ''}{GROUP}k",
-            "pad them with pad_clip, which repeats the last frame",
-        )
-
-
-def check_latents(z: Tensor, channels: int) -> None:
-    """Refuse other tensors than ``(B, channels, t, h, w)`` floating point with at least one latent.
-
-    Raises:
-        InputError: Another shape or dtype.
-    """
-    if z.ndim != 5 or z.shape[1] != channels or not z.is_floating_point() or 0 in z.shape:
-        raise InputError(
-            f"a tensor {list(z.shape)} of {z.dtype}: not a video latent",
-            f"give (B, {channels}, t, h, w) floating point, t at least 1",
+            f"{name}: {video.shape[2]} frames",
+            f"give {'1 + ' if first else ''}{GROUP}k frames; pad_clip repeats the last",
         )
 
 

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.core import seeding
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import channels_last
 
 WAN_MEAN = (
@@ -83,9 +82,6 @@ class LatentStats(nn.Module):
         mean: One value a channel.
         std: One positive value a channel.
         stored: Whether the statistics are in the state dict (they are not in Wan checkpoints).
-
-    Raises:
-        InputError: Lengths differ or a deviation is not positive.
     """
 
     mean: Tensor
@@ -95,24 +91,17 @@ class LatentStats(nn.Module):
         self, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD, stored: bool = False
     ) -> None:
         super().__init__()
-        if len(mean) != len(std) or not all(s > 0 for s in std):
-            raise InputError(
-                f"{len(mean)} means and {len(std)} standard deviations: standard deviations {list(std)}",
-                "give one mean and one positive standard deviation for each latent channel",
-            )
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32), persistent=stored)
         self.register_buffer("std", torch.tensor(std, dtype=torch.float32), persistent=stored)
 
     def normalise(self, mu: Tensor) -> Tensor:
         """Map encoder means ``(B, C, t, h, w)`` to latents of about unit variance; same dtype."""
-        mean, std = self._broadcast(mu)
-        return ((mu.float() - mean) / std).to(mu.dtype)
+        return ((mu.float() - _by_channel(self.mean)) / _by_channel(self.std)).to(mu.dtype)
 
     def denormalise(self, z: Tensor) -> Tensor:
         """Undo `normalise`."""
-        mean, std = self._broadcast(z)
-        return (z.float() * std + mean).to(z.dtype)
+        return (z.float() * _by_channel(self.std) + _by_channel(self.mean)).to(z.dtype)
 
-    def _broadcast(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        shape = (1, -1) + (1,) * (z.ndim - 2)
-        return self.mean.view(shape), self.std.view(shape)
+
+def _by_channel(values: Tensor) -> Tensor:
+    return values.view(1, -1, 1, 1, 1)

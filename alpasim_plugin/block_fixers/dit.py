@@ -25,8 +25,10 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.attention import Attend, Rope3D, RopeTable, block_causal_attention
 from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues, TimeSignal
+from alpasim_plugin.block_fixers.clips import check_video
 from alpasim_plugin.block_fixers.kv_cache import BlockCache, RollingCache
 from alpasim_plugin.block_fixers.layers import (
+    PATCH,
     PatchEmbed,
     RMSNorm,
     TimeMap,
@@ -151,7 +153,7 @@ class CosmosCausalDiT(nn.Module):
         Returns:
             ``(B, C, T, H, W)`` velocity.
         """
-        self._check(x, t, text, hdmap, block_latents)
+        self._check(x, hdmap)
         frames = x.shape[2]
         rows = x.shape[3] // 2
         columns = x.shape[4] // 2
@@ -190,22 +192,12 @@ class CosmosCausalDiT(nn.Module):
         Returns:
             ``(B, C, T, H, W)`` velocity; without gradients unless the cache keeps them.
         """
-        self._check(x_block, t_block, text, hdmap_block, x_block.shape[2])
-        found = [cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios]
-        expected = [
-            x_block.shape[0],
-            x_block.shape[3],
-            x_block.shape[4],
-            self.sizes.head_width,
-            self.rope_ratios,
-        ]
-        if isinstance(cache, RollingCache):
-            found += cache.layout
-            expected += [self.sizes.blocks, self.sizes.heads, self.dtype]
-        if found != expected:
+        self._check(x_block, hdmap_block)
+        found = [cache.batch, cache.height, cache.width, cache.rope]
+        if found != [x_block.shape[0], x_block.shape[3], x_block.shape[4], self.rope]:
             raise InputError(
-                f"a cache for batch, sizes and network {found}, not {expected}",
-                "make the cache with this network's new_cache for this batch and latent size",
+                f"a cache for batch and sizes {found[:3]}: another is needed",
+                "make it with this network's new_cache for this batch and latent size",
             )
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):
             table = cache.begin(x_block.shape[2])
@@ -251,7 +243,6 @@ class CosmosCausalDiT(nn.Module):
         """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values
         of every block.
         """
-        self._check_text(text, len(text))
         context = self.crossattn_proj(text.to(self.dtype))
         return TextContext(
             tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks)
@@ -285,43 +276,11 @@ class CosmosCausalDiT(nn.Module):
         s = sinusoid(steps, self.sizes.width)
         return self.t_embedding_norm(s), self.t_embedder[1](s)
 
-    def _check(
-        self,
-        x: Tensor,
-        t: Tensor | float,
-        text: Tensor | TextContext,
-        hdmap: Tensor,
-        block_latents: int | None,
-    ) -> None:
-        sizes = self.sizes
-        is_latent = x.ndim == 5 and x.shape[1] == sizes.latent_channels and 0 not in x.shape
-        if not is_latent or x.shape[3] % 2 or x.shape[4] % 2:
-            raise InputError(
-                f"x: shape {list(x.shape)}",
-                f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width",
-            )
-        expected = [x.shape[0], sizes.condition_channels, *x.shape[2:]]
+    def _check(self, x: Tensor, hdmap: Tensor) -> None:
+        check_video("x", x, self.sizes.latent_channels, PATCH)
+        expected = [x.shape[0], self.sizes.condition_channels, *x.shape[2:]]
         if list(hdmap.shape) != expected:
             raise InputError(f"hdmap: shape {list(hdmap.shape)}", f"give {expected}")
-        if isinstance(t, Tensor) and (
-            t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])
-        ):
-            raise InputError(
-                f"t: shape {list(t.shape)}",
-                f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number",
-            )
-        if block_latents is not None and block_latents < 1:
-            raise InputError(f"block_latents: {block_latents}", "give at least one latent, or None")
-        if isinstance(text, Tensor):
-            self._check_text(text, x.shape[0])
-
-    def _check_text(self, text: Tensor, batch: int = 1) -> None:
-        fits = text.ndim == 3 and text.shape[1] > 0 and text.shape[2] == self.sizes.text_width
-        if not fits or text.shape[0] not in (1, batch):
-            raise InputError(
-                f"text: shape {list(text.shape)}",
-                f"give (batch or 1, tokens, {self.sizes.text_width})",
-            )
 
 
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:

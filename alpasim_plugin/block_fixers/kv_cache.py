@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.attention import Rope3D, RopeTable, attend
-from alpasim_plugin.core.errors import InputError
 
 
 class BlockCache(ABC):
@@ -46,16 +45,6 @@ class BlockCache(ABC):
         sink: int,
         device: torch.device,
     ) -> None:
-        if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
-            raise InputError(
-                f"batch, height, width: batch {batch}, latent size {height} x {width}",
-                "give a positive batch and even latent sizes (pixels / 8)",
-            )
-        if sink < 0 or (window is not None and (window < 1 or sink > window)):
-            raise InputError(
-                f"window and sink, in latents: window {window}, sink {sink}",
-                "use window >= 1 and 0 <= sink <= window",
-            )
         self.rope, self.batch, self.height, self.width = rope, batch, height, width
         self.window, self.sink, self.device = window, sink, device
         self.rows, self.columns = height // 2, width // 2
@@ -77,16 +66,7 @@ class BlockCache(ABC):
         return self.rope.table(self.position, latents, self.rows, self.columns, self.device)
 
     def commit(self) -> None:
-        """Keep the keys and values of the last forward and advance by its block.
-
-        Raises:
-            InputError: No forward since the last commit or reset.
-        """
-        if not self.open_latents:
-            raise InputError(
-                f"latent {self.position}: no forward to keep",
-                "run the block first, with write=False if it is not final",
-            )
+        """Keep the keys and values of the last forward and advance by its block."""
         self.position += self.open_latents
         self.filled += self.open_latents
         self.open_latents = 0
@@ -119,7 +99,6 @@ class RollingCache(BlockCache):
     ) -> None:
         super().__init__(rope, batch, height, width, window, sink, device)
         self.size = window
-        self.layout = (layers, heads, dtype)
         shape = (layers, batch, window * self.tokens, heads, rope.head_width)
         with torch.inference_mode(False):
             self.keys = torch.zeros(shape, device=device, dtype=dtype)
@@ -127,24 +106,11 @@ class RollingCache(BlockCache):
         self._rows = self._source = torch.zeros(0, dtype=torch.long, device=device)
         self._fits = True  # whether the open block fits in the window
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the buffers."""
-        return 2 * self.keys.numel() * self.keys.element_size()
-
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
 
-        Raises:
-            InputError: The block is reopened with fewer latents after its first forward overwrote
-                the oldest latents.
+        A block that is opened again has its first length: its forwards share slots.
         """
-        overwritten = self.filled + self.open_latents > self.size
-        if 0 < latents < self.open_latents and overwritten:
-            raise InputError(
-                f"window {self.window}, sink {self.sink}: {latents} latents after a forward with {self.open_latents} at latent {self.position}",
-                "repeat a block with its first length (its forwards share slots), or write it, or reset the cache",
-            )
         table = super().begin(latents)
         ring = self.size - self.sink
         own = range(self.filled, self.filled + latents)

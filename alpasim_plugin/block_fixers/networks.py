@@ -1,12 +1,11 @@
 """The networks of a fixer, from weights or untrained, loaded once per process.
 
-In bf16 and fp16 the token stream and the linear layers have that type; the time embedding, the
+In bf16 the token stream and the linear layers have that type; the time embedding, the
 modulation, the rotary angles and the arithmetic inside norms stay float32.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,14 +35,10 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.network.checkpoints import load_weights
+from alpasim_plugin.fixers.pixel_network import DTYPES
 from alpasim_plugin.fixers.settings import FixerSettings
 
-Precision = Literal["fp32", "bf16", "fp16"]
-DTYPES: Mapping[Precision, torch.dtype] = {
-    "fp32": torch.float32,
-    "bf16": torch.bfloat16,
-    "fp16": torch.float16,
-}
+Precision = Literal["fp32", "bf16"]
 Net = TypeVar("Net", bound=nn.Module)
 TAEHV_WIDTHS = (256, 128, 64, 64)
 LATENT = 16
@@ -51,23 +46,13 @@ Codec = TinyVAE | WanVAE
 
 
 def at_precision(net: Net, precision: Precision, float32: Sequence[str] = ()) -> Net:
-    """Return a frozen copy of a network at another precision; buffers, and parameters whose key
-    contains one of ``float32``, stay float32.
-
-    Raises:
-        InputError: A weight that overflows the precision.
+    """Return the network, frozen, at another precision; buffers, and parameters whose key contains
+    one of ``float32``, stay as they are.
     """
-    copied = copy.deepcopy(net).requires_grad_(False)
-    for key, value in copied.named_parameters():
-        if any(part in key for part in float32):
-            continue
-        value.data = value.data.to(DTYPES[precision])
-        if not value.is_meta and not bool(value.isfinite().all()):
-            raise InputError(
-                f"network: {key} holds values beyond {precision}",
-                "choose bf16 or fp32",
-            )
-    return copied
+    for key, value in net.requires_grad_(False).named_parameters():
+        if not any(part in key for part in float32):
+            value.data = value.data.to(DTYPES[precision])
+    return net
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,22 +154,20 @@ def decode(
 
 @lru_cache(maxsize=4)
 def _load(settings: LatentFixerSettings, device: str) -> Networks:
-    return build_networks(Parts(settings), device, device)
-
-
-def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks:
-    """Build and cast the networks; nothing is kept for the next call."""
-    settings = parts.settings
-    plain = parts.dit().to(dit_device)
+    parts = Parts(settings)
+    plain = parts.dit()
     dtype = DTYPES[settings.precision]
     with torch.no_grad():
-        text = plain.encode_text(parts.prompt(plain.sizes).to(dit_device))
-    text = TextContext(tuple((k.to(dtype), v.to(dtype)) for k, v in text.keys_values))
-    dit = at_precision(plain, settings.precision, FLOAT32_KEYS)
-    vae = at_precision(parts.vae(), settings.codec_precision).to(codec_device)
+        text = plain.encode_text(parts.prompt(plain.sizes))
+    text = TextContext(
+        tuple((k.to(device, dtype), v.to(device, dtype)) for k, v in text.keys_values)
+    )
+    # Cast before it is moved: the device never holds the float32 weights.
+    dit = at_precision(plain, settings.precision, FLOAT32_KEYS).to(device)
+    vae = at_precision(parts.vae(), settings.codec_precision).to(device)
     decoder: Codec | TinyDecoder = vae
     if settings.decoder.kind == "taehv":
-        decoder = at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
+        decoder = at_precision(parts.decoder(), settings.codec_precision).to(device)
     return Networks(dit, vae, decoder, text, parts.trained, parts.note)
 
 

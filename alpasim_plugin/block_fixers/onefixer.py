@@ -24,7 +24,6 @@ from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, group_views
 
 
@@ -68,7 +67,6 @@ class ViewsHistory:
     cameras: tuple[str, ...]
     shape: tuple[int, int]  # height and width of their images
     state: PipelineState
-    last_t_us: tuple[int, ...] = ()  # per camera; empty before the first block
     last_fixed: U8 | None = (
         None  # (B, H, W, 3) as decoded, also if the guard returned the raw frame
     )
@@ -95,22 +93,17 @@ class OneFixer(Fixer):
         threads: Torch threads of this process; None leaves their number.
 
     Raises:
-        InputError: Settings of another fixer, or weights that are missing or do not fit.
+        InputError: Weights that are missing or do not fit.
     """
 
     def __init__(
         self,
-        settings: FixerSettings,
+        settings: OneFixerSettings,
         scene_id: str,
         seed: int = 0,
         device: str = "cpu",
         threads: int | None = None,
     ) -> None:
-        if not isinstance(settings, OneFixerSettings):
-            raise InputError(
-                f"{settings.name}: settings of type {type(settings).__name__}",
-                "take them from fixer_settings(name)",
-            )
         if threads is not None:
             torch.set_num_threads(threads)
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
@@ -189,13 +182,6 @@ class OneFixer(Fixer):
                 f"block {self._done}: cameras and sizes {given} after {known}",
                 "give the same cameras at the same sizes in every block, or reset",
             )
-        for view, history in zip(views, self._history, strict=True) if self._done else ():
-            for camera, times, last in zip(view.cameras, view.t_us, history.last_t_us, strict=True):
-                if times[0] <= last:
-                    raise InputError(
-                        f"camera {camera!r}, block {self._done}: a frame at {times[0]} us after one at {last} us",
-                        "give frames in the order of time, or reset",
-                    )
         return views
 
     def _open(self, view: Views) -> ViewsHistory:
@@ -243,7 +229,6 @@ class OneFixer(Fixer):
             view.cameras,
             view.shape,
             state,
-            tuple(times[-1] for times in view.t_us),
             block.images[:, -1],
             view.rgb[:, -1],
         )

@@ -24,7 +24,6 @@ from alpasim_plugin.block_fixers.sampling import (
 )
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.streaming import State
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import from_names
 
 
@@ -71,7 +70,6 @@ class PipelineState:
     latent: int  # absolute index of the next block's first latent
     encoder: State | None  # render and map views as one batch
     decoder: State | None
-    with_map: bool | None  # None before the first block
     cache: RollingCache
     # adds the block before to the cache, where it is still open; to be called at most once
     write: Callable[[], None] | None = None
@@ -107,7 +105,7 @@ class BlockPipeline:
         cache = self.networks.dit.new_cache(
             batch, height // 8, width // 8, self.settings.window, self.settings.sink
         )
-        return PipelineState(0, None, None, None, cache)
+        return PipelineState(0, None, None, cache)
 
     @torch.inference_mode()
     def run(
@@ -132,21 +130,8 @@ class BlockPipeline:
         Returns:
             ``(B, 3, T, H, W)``, not clipped to [-1, 1], and the state after the block, which is
             still open: give it to `keep`, or run the block again.
-
-        Raises:
-            InputError: A map in some blocks of a rollout only, or another shape.
         """
         settings, nets = self.settings, self.networks
-        if state.with_map not in (None, sdmap is not None):
-            found = (
-                "a map after blocks without one"
-                if sdmap is not None
-                else "no map after blocks with one"
-            )
-            raise InputError(
-                f"latent {state.latent}: {found}",
-                "give the map in every block of a rollout, or in none",
-            )
         is_first = state.latent == 0
         opacity = opacity_input(settings, rgb, alpha, first=is_first)
         shown = map_video(settings, rgb, sdmap)
@@ -174,7 +159,7 @@ class BlockPipeline:
                 cache.commit()
 
         latent = state.latent + z_0.shape[2]
-        return out, PipelineState(latent, encoder, decoder, sdmap is not None, cache, write)
+        return out, PipelineState(latent, encoder, decoder, cache, write)
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:

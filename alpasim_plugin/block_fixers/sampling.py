@@ -14,11 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import check_frames
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import TABLE, NoiseLevel, interpolant, shifted
-from alpasim_plugin.fixers.views import SLACK
 
 CONTEXT_STEP = 128.0
 POOL = (4, 8, 8)  # frames, rows, columns of one latent
@@ -53,7 +52,7 @@ def opacity_mask(opacity: Tensor, first: bool = True) -> Tensor:
         ``(B, 1, latents, H / 8, W / 8)``.
 
     Raises:
-        InputError: Wrong shape, NaN, or values outside [0, 1].
+        InputError: Another shape.
     """
     return F.max_pool3d(_checked_opacity(opacity, first), POOL, POOL)
 
@@ -81,19 +80,7 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
 
 def _checked_opacity(opacity: Tensor, first: bool) -> Tensor:
     """Return opacity in [0, 1], four frames a latent."""
-    fits = opacity.ndim == 5 and opacity.shape[1] == 1 and opacity.shape[2] > 0
-    if not fits or (opacity.shape[2] - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
-        raise InputError(
-            f"opacity: shape {list(opacity.shape)}",
-            f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8",
-        )
-    if not opacity.is_meta:
-        low, high = float(opacity.min()), float(opacity.max())
-        if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN
-            raise InputError(
-                f"opacity: values from {low:.4g} to {high:.4g}",
-                "give accumulated alpha between 0 and 1",
-            )
+    check_frames("opacity", opacity, 1, first)
     video = opacity.clamp(0, 1)
     if first:
         video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
@@ -148,15 +135,7 @@ def sample_block(
 
     Returns:
         ``(B, C, T, H, W)`` clean latents.
-
-    Raises:
-        InputError: Another number of sources than of steps.
     """
-    if len(sources) != len(schedule):
-        raise InputError(
-            f"{len(sources)} sources for {len(schedule)} steps",
-            "give one source for each step",
-        )
     z_0 = sources[0]
     for source, level in zip(sources, schedule, strict=True):
         z_t = interpolant(z_0, source, level.sigma)

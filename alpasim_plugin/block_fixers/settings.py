@@ -80,10 +80,8 @@ class LatentFixerSettings(WeightedSettings):
         default=None,
         description="Command that trains the weights, for the error where there are none.",
     )
-    precision: Literal["fp32", "bf16", "fp16"] = Field(
-        default="fp32", description="Of the transformer."
-    )
-    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(
+    precision: Literal["fp32", "bf16"] = Field(default="fp32", description="Of the transformer.")
+    codec_precision: Literal["fp32", "bf16"] = Field(
         default="fp32", description="Of the autoencoder."
     )
 

@@ -71,15 +71,6 @@ def deviation(predicted: RenderRequest, true: RenderRequest) -> Deviation:
     return Deviation(moved, math.degrees(turned), max(actors))
 
 
-def same_view(predicted: RenderRequest, true: RenderRequest) -> bool:
-    """Return whether two requests give the same image, bit for bit."""
-    return (
-        np.array_equal(predicted.T_world_camera, true.T_world_camera)
-        and predicted.actors.keys() == true.actors.keys()
-        and all(np.array_equal(pose, true.actors[key]) for key, pose in predicted.actors.items())
-    )
-
-
 def rotation_rad(a: F64, b: F64) -> float:
     """Return the angle between the rotations of two transforms ``(4, 4)``, exact to rounding for
     small angles too.
@@ -96,7 +87,6 @@ class SpeculationStats:
     blocks: int = 0  # complete ones
     predicted: int = 0  # frames with a draft
     hits: int = 0  # of these: within tolerance
-    exact: int = 0  # of these: equal bit for bit
     drafts: int = 0
     redrafts: int = 0  # drafts made in the middle of a block
     forecasts: list[Deviation] = field(default_factory=list)  # of predicted frames
@@ -104,14 +94,14 @@ class SpeculationStats:
     shown: list[Deviation] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts and, in metres and degrees, the errors of the forecasts and of the
-        frames shown.
+        """Return the counts and, in metres and degrees, the largest errors of the forecasts and of
+        the frames shown.
         """
         counts = {key: value for key, value in vars(self).items() if isinstance(value, int)}
         return {
             **counts,
-            "forecast_error": _percentiles(self.forecasts),
-            "shown_error": _percentiles(self.shown),
+            "forecast_error": _largest(self.forecasts),
+            "shown_error": _largest(self.shown),
         }
 
 
@@ -200,14 +190,7 @@ class _CameraGroup:
         self._check(requests)
         place = len(self.true)
         predicted = self.draft[place] if place < len(self.draft) else []
-        frames_now = []
-        for i, request in enumerate(requests):
-            if predicted and same_view(predicted[i][0].request, request):
-                frames_now.append(predicted[i][0])
-                self.stats.exact += 1
-            else:
-                frames_now.append(self.runner.render(request))
-        self.true.append(frames_now)
+        self.true.append([self.runner.render(request) for request in requests])
         forecasts = [
             deviation(item.request, request)
             for (item, _), request in zip(predicted, requests, strict=bool(predicted))
@@ -293,16 +276,10 @@ def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Fra
     return replace(frame, facts={**frame.facts, **rounded})
 
 
-def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:
-    """Return median, 95th percentile and maximum of each kind of error; None where no value is
-    finite.
-    """
-    out: dict[str, dict[str, float] | None] = {}
+def _largest(errors: Sequence[Deviation]) -> dict[str, float | None]:
+    """Return the largest of each kind of error; None where no value is finite."""
+    out: dict[str, float | None] = {}
     for name in ("camera_m", "camera_deg", "actor_m"):
-        values = np.array([getattr(error, name) for error in errors])
-        finite = values[np.isfinite(values)]
-        out[name] = None
-        if len(finite):
-            p50, p95, largest = np.percentile(finite, (50, 95, 100)).round(6).tolist()
-            out[name] = {"p50": p50, "p95": p95, "max": largest}
+        values = (getattr(error, name) for error in errors)
+        out[name] = max((round(v, 6) for v in values if math.isfinite(v)), default=None)
     return out

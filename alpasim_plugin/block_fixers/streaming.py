@@ -26,7 +26,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import GROUP, frame_ends, pass_ends
-from alpasim_plugin.core.errors import InputError
 
 State = tuple[Tensor, ...]
 Step = Callable[..., tuple[Tensor, State]]
@@ -63,17 +62,10 @@ class StreamingState:
         Returns:
             ``(B, k + T, ...)`` with ``0 <= k <= frames``; no padding is added at the start of a
             video.
-
-        Raises:
-            InputError: Batch or frame size changed in the middle of a stream.
         """
-        past = x[:, :0] if self._old is None else self._old[len(self._new)].to(x.dtype)
-        if past.shape[0] != x.shape[0] or past.shape[2:] != x.shape[2:]:
-            raise InputError(
-                f"a block whose layers have shape {list(x.shape)}: the stream so far had {list(past.shape)} (batch, frames, then sizes)",
-                "keep batch and frame size for the whole stream, or start a new stream",
-            )
-        joined = torch.cat([past, x], dim=1) if past.shape[1] else x
+        joined = x
+        if self._old is not None:
+            joined = torch.cat([self._old[len(self._new)].to(x.dtype), x], dim=1)
         kept = joined[:, max(0, joined.shape[1] - frames) :]
         self._new.append(kept.clone())  # a view would keep the memory of the whole pass
         return joined

@@ -19,7 +19,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, check_latents
+from alpasim_plugin.block_fixers.clips import GROUP, check_video
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
@@ -182,7 +182,7 @@ class TinyDecoder(StreamingDecoder):
         Raises:
             InputError: Another shape.
         """
-        check_latents(z, self.latent)
+        check_video("latents", z, self.latent)
         video, state = self.decode_in_passes(self._pass, z.to(self.dtype), state)
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
@@ -199,25 +199,14 @@ class TinyDecoder(StreamingDecoder):
 
 
 def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple[int, ...]]:
-    """Read the latent's channels and the four widths, off vectors where there are any."""
+    """Read the latent's channels and the four widths off the kernels' inputs."""
     first_convs = [f"decoder.{FIRST + STAGE * stage}.conv.0.bias" for stage in range(len(GROWTH))]
     stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) + 1}.weight"
     missing = [key for key in (stem, *first_convs, last) if key not in tensors]
     if missing:
         raise InputError(f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", DO)
     widths = [tensors[key].numel() for key in first_convs]
-    latent = _other_side(tensors[stem], widths[0], stem, source)
-    return latent, (*widths, _other_side(tensors[last], COLOURS, last, source))
-
-
-def _other_side(kernel: Tensor, known: int, key: str, source: str) -> int:
-    sides = list(kernel.shape[:2])
-    if kernel.ndim != 4 or known not in sides:
-        raise InputError(
-            f"{source}: wrong shape: {key} is {list(kernel.shape)}, where one side should be {known}",
-            DO,
-        )
-    return int(sides[1] if sides[0] == known else sides[0])
+    return tensors[stem].shape[1], (*widths, tensors[last].shape[1])
 
 
 def _last_rows(tensors: Mapping[str, Tensor], widths: Sequence[int]) -> StateDict:

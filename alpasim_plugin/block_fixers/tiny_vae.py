@@ -35,7 +35,7 @@ from alpasim_plugin.block_fixers.clips import (
     GROUP,
     SIDE,
     check_frames,
-    check_latents,
+    check_video,
     frame_ends,
     pass_ends,
 )
@@ -140,7 +140,7 @@ class TinyVAE(StreamingCodec):
         """Encode the next frames of a stream; a pure function, with the same rules as
         `WanVAE.encode_next`.
         """
-        check_frames(frames, first=state is None)
+        check_frames("frames", frames, COLOURS, first=state is None)
         return self.encode_in_passes(self._encode_pass, frames.float(), state)
 
     def decode_next(
@@ -168,12 +168,18 @@ class TinyVAE(StreamingCodec):
             the next call.
 
         Raises:
-            InputError: Another shape, or an opacity without a render.
+            InputError: Another shape.
         """
-        check_latents(z, LATENT)
+        check_video("latents", z, LATENT)
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
-        _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
+        size = frames, h * SIDE, w * SIDE
+        for given, channels in ((render, COLOURS), (opacity, 1)):
+            if given is not None and given.shape != (b, channels, *size):
+                raise InputError(
+                    f"a render or opacity of shape {list(given.shape)}",
+                    f"give that of the frames that come out, {[b, channels, *size]}",
+                )
         parts = []
         start = 0
         first = 0
@@ -254,20 +260,3 @@ def _whole_groups(frames: Tensor, first: bool) -> Tensor:
         if first
         else frames
     )
-
-
-def _check_condition(
-    render: Tensor | None, opacity: Tensor | None, expected: tuple[int, int, int, int]
-) -> None:
-    b, *size = expected
-    for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
-        if given is not None and tuple(given.shape) != (b, channels, *size):
-            raise InputError(
-                f"a {name} of shape {list(given.shape)}: these latents decode to {[b, channels, *size]}",
-                f"give the {name} of exactly the frames that come out",
-            )
-    if render is None and opacity is not None:
-        raise InputError(
-            "an opacity: no render with it",
-            "give both, or the render alone",
-        )

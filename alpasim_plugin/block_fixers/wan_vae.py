@@ -13,7 +13,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import check_frames, check_latents
+from alpasim_plugin.block_fixers.clips import check_frames, check_video
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
@@ -173,7 +173,7 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: An invalid number of frames or size.
         """
-        check_frames(frames, first=state is None)
+        check_frames("frames", frames, 3, first=state is None)
         return self.encode_in_passes(self._encode_pass, frames.to(self.dtype), state)
 
     def decode_next(
@@ -193,7 +193,7 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: Another shape.
         """
-        check_latents(z, self.layout.latent)
+        check_video("latents", z, self.layout.latent)
         video, state = self.decode_in_passes(self._decode_pass, z.to(self.dtype), state)
         return video.clamp(-1, 1) if clamp else video, state
 

@@ -40,7 +40,7 @@ GIT = (
 )
 ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
 _COMMIT = re.compile(r"[0-9a-f]{7,64}")
-COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
+COUNTS = ("predicted", "hits", "drafts", "redrafts")
 
 
 def versions() -> dict[str, str]:
@@ -207,12 +207,10 @@ def fixers(manifests: Sequence[JsonObject]) -> JsonObject:
     return out
 
 
-def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:
-    """Return the largest value of each kind of error over rollouts; None where there is no finite
-    one.
-    """
+def _largest(errors: Iterable[dict[str, float | None]]) -> dict[str, float | None]:
+    """Return the largest of each kind of error over rollouts; None where there is none."""
     found: dict[str, list[float]] = {}
-    for spread in spreads:
-        for name, values in spread.items():
-            found.setdefault(name, []).extend([] if values is None else [values["max"]])
+    for one in errors:
+        for name, value in one.items():
+            found.setdefault(name, []).extend([] if value is None else [value])
     return {name: max(values, default=None) for name, values in found.items()}

@@ -53,38 +53,12 @@ def test_window_smaller_than_a_block_sees_the_block_and_nothing_else():
         assert furthest(out[:, :, cut], alone) < 1e-5
 
 
-def test_block_opened_again_shorter_after_it_took_old_slots_is_refused():
-    net, (x, t, text, hdmap) = network(), clip(2)
-    cache = net.new_cache(1, 4, 6, window=4)
-    for _ in range(2):
-        net.step(x, t, text, hdmap, cache)
-    net.step(x, t, text, hdmap, cache, write=False)
-    with pytest.raises(InputError):
-        net.step(x[:, :, :1], t[:, :1], text, hdmap[:, :, :1], cache)
-    assert net.step(x, t, text, hdmap, cache).isfinite().all()
-
-
 def test_block_may_be_opened_again_shorter_while_nothing_was_overwritten():
     net, (x, t, text, hdmap) = network(), clip(2)
     tried, quiet = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
     net.step(x, t, text, hdmap, tried, write=False)
     short = (x[:, :, :1], t[:, :1], text, hdmap[:, :, :1])
     assert torch.equal(net.step(*short, tried), net.step(*short, quiet))
-
-
-@pytest.mark.parametrize(
-    ("call", "text"),
-    [
-        (lambda n: n.new_cache(1, 4, 6, window=0), "window 0, sink 0"),
-        (lambda n: n.new_cache(1, 4, 6, window=2, sink=3), "window 2, sink 3"),
-        (lambda n: n.new_cache(1, 4, 6, window=2, sink=-1), "window 2, sink -1"),
-        (lambda n: n.new_cache(1, 5, 6), "latent size 5 x 6"),
-        (lambda n: n.new_cache(0, 4, 6), "batch 0"),
-    ],
-)
-def test_senseless_caches_are_refused(call, text):
-    with pytest.raises(InputError):
-        call(network())
 
 
 def test_cache_of_another_network_or_size_is_refused():
@@ -100,12 +74,7 @@ def test_every_wrong_input_is_refused():
     bad = [
         (x[:, :3], t, text, hdmap),
         (x[..., :5], t, text, hdmap),
-        (x, t[:, :0], text, hdmap),
-        (x, t[0], text, hdmap),
-        (x, t, text[..., :4], hdmap),
-        (x, t, text[0], hdmap),
         (x, t, text, hdmap[:, :, :1]),
-        (x, t, text, hdmap, None, 0),
     ]
     for args in bad:
         with pytest.raises(InputError):

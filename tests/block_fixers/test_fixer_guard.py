@@ -103,10 +103,10 @@ def test_a_previewed_failure_leaves_no_trace(weights, monkeypatch):
     assert np.array_equal(pixels(out), alone)
 
 
-def test_weights_that_overflow_half_precision_are_seen(weights):
-    settings = small_settings("untrained=random", "holes=noise", "precision=fp16")
+def test_weights_that_overflow_are_seen(weights):
+    settings = small_settings("untrained=random", "holes=noise", "precision=bf16")
     session = fixer(settings)
-    session.networks.dit.final_layer.linear.weight.data.mul_(1e3).clamp_(-6e4, 6e4)
+    session.networks.dit.final_layer.linear.weight.data.mul_(1e3)
     try:
         out = session.step(FRAMES[:5], MAPS[:5])
     finally:

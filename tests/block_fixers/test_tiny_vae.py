@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import pytest
@@ -201,12 +202,10 @@ def test_constant_and_saturated_clips_stay_finite(vae, value):
 def test_a_render_of_another_length_is_refused(vae):
     with pytest.raises(InputError):
         vae.decode(noise(1, 16, 2, 2, 2), render=clip(8, 16, 16))
-    with pytest.raises(InputError):
-        vae.decode(noise(1, 16, 1, 2, 2), opacity=torch.ones(1, 1, 1, 16, 16))
 
 
 def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae):
-    half = at_precision(vae, "bf16")
+    half = at_precision(copy.deepcopy(vae), "bf16")
     assert torch.equal(half.stats.mean, vae.stats.mean)
     assert torch.equal(half.transform.kernel, vae.transform.kernel)
     video = clip(5, 16, 16)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
-from alpasim_plugin.block_fixers.networks import DTYPES, at_precision
+from alpasim_plugin.block_fixers.networks import at_precision
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
     WanLayout,
@@ -121,13 +122,6 @@ def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(vae
 def test_sides_that_are_no_multiple_of_eight_are_refused(vae, height, width, good):
     with pytest.raises(InputError):
         vae.encode(clip(1, height, width))
-
-
-def test_a_stream_whose_frame_size_changes_is_refused(vae):
-    stream = encoder_stream(vae)
-    stream.push(clip(1, 16, 16))
-    with pytest.raises(InputError):
-        stream.push(clip(4, 16, 24))
 
 
 @pytest.mark.parametrize(
@@ -242,14 +236,13 @@ def test_half_and_double_precision_tensors_load_into_single(vae, stored):
     }[stored]
 
 
-@pytest.mark.parametrize("precision", ["bf16", "fp16"])
-def test_running_in_half_precision_stays_close(vae, precision):
-    half, dtype = at_precision(vae, precision), DTYPES[precision]
+def test_running_in_half_precision_stays_close(vae):
+    half, dtype = at_precision(copy.deepcopy(vae), "bf16"), torch.bfloat16
     video = clip(9, 16, 16)
     z = half.encode(video)
     assert z.dtype == dtype
     assert half.decode(z).dtype == dtype
-    assert (z.float() - vae.encode(video)).abs().max() < (0.05 if dtype == torch.bfloat16 else 0.01)
+    assert (z.float() - vae.encode(video)).abs().max() < 0.05
     assert half.stats.mean.dtype == torch.float32
 
 
