@@ -76,7 +76,7 @@ def check_scenario(scenario: Scenario, where: str) -> None:
         InputError: More than a scenario may have; the number is named.
     """
     ACTORS.check(len(scenario.actors), where)
-    REACTIVE.check(sum(actor.behaviour.kind == "idm" for actor in scenario.actors), where)
+    REACTIVE.check(sum(actor.behaviour.kind != "replay" for actor in scenario.actors), where)
     b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, where, "length")
     if scenario.background is not None:
         return

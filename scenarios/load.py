@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -268,10 +269,14 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
         content["cameras"].sort(key=lambda camera: camera["name"])
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"
+        _drop(content["log"], ("osi",))
+    for actor in content["actors"]:
+        _drop(actor, ("yields",) if actor.get("role") else ("yields", "role", "gap_m"))
     if spec.map is None:
         del content["map"]
     else:
         content["map"][spec.map.source[0]] = "given by its content"
+        _drop(content["map"], ("lanelet2",))
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
@@ -279,6 +284,13 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
         file = drawn.document.folder_of(("background", "file")) / spec.background.file
         scene.update(bytes.fromhex(file_sha256(file)))
     return scene.hexdigest()
+
+
+def _drop(content: dict[str, Any], keys: Sequence[str]) -> None:
+    """Remove keys without effect, by which a file of before they existed is the scene it was."""
+    for key in keys:
+        if key in content and (key == "gap_m" or not content[key]):
+            del content[key]
 
 
 __all__ = ["find", "load_scenario"]

@@ -289,6 +289,20 @@ class _InLane(_Actor):
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
 
+class _Adversary(_Actor):
+    role: Literal["adversary"] | None = Field(
+        default=None,
+        description="adversary: up to the place where it acts it chooses its speed, half to one and a half times speed_mps, to be gap_m ahead of the ego.",
+    )
+    gap_m: float = within(b.GAP_M, "Of an adversary: from the ego's front to its rear.", 6.0)
+
+
+class _Walker(_Actor):
+    yields: bool = Field(
+        default=False, description="It waits where it would walk into the ego's way."
+    )
+
+
 class ParkedActor(_Actor):
     """A standing vehicle, or a row of them, beside the outer lane."""
 
@@ -305,7 +319,7 @@ class ParkedActor(_Actor):
     )
 
 
-class LoggedActor(_Actor):
+class LoggedActor(_Walker):
     """A track given point by point."""
 
     kind: Literal["logged"]
@@ -369,7 +383,7 @@ class OncomingActor(_Actor):
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
 
-class HardBrakeActor(_InLane):
+class HardBrakeActor(_InLane, _Adversary):
     """A leader who brakes hard."""
 
     kind: Literal["hard_brake"]
@@ -387,7 +401,7 @@ class HardBrakeActor(_InLane):
         return self
 
 
-class CutInActor(_Actor):
+class CutInActor(_Adversary):
     """A vehicle that changes its lane."""
 
     kind: Literal["cut_in"]
@@ -414,7 +428,7 @@ class CutInActor(_Actor):
         return self
 
 
-class CrossingActor(_Actor):
+class CrossingActor(_Walker):
     """A pedestrian (or cyclist) who crosses, timed against the ego."""
 
     kind: Literal["crossing_pedestrian"]

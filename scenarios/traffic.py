@@ -181,7 +181,30 @@ def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
             track = _cut_in(placer, actor, box)
         case _:
             raise AssertionError(f"{actor.kind} is placed elsewhere")
-    return [Actor(actor.id, actor.label, box, track)]
+    behaviour = Behaviour()
+    if isinstance(actor, HardBrakeActor | CutInActor) and actor.role == "adversary":
+        behaviour = _adversary(actor)
+    return [Actor(actor.id, actor.label, box, track, behaviour=behaviour)]
+
+
+def _adversary(actor: HardBrakeActor | CutInActor) -> Behaviour:
+    """Return the behaviour of one that acts where its track brakes, or has changed lanes."""
+    end_mps = actor.end_speed_mps
+    act_us = actor.brake_at_us if actor.kind == "hard_brake" else actor.at_us + actor.change_us
+    return Behaviour(
+        "adversary",
+        {
+            "gap_m": actor.gap_m,
+            "act_us": act_us,
+            "speed_mps": actor.speed_mps,
+            "end_speed_mps": actor.speed_mps if end_mps is None else end_mps,
+            "decel_mps2": actor.decel_mps2,
+        },
+    )
+
+
+def _walking(actor: CrossingActor | LoggedActor) -> Behaviour:
+    return Behaviour("yield" if actor.yields else "replay")
 
 
 def _cut_in(placer: _Placer, actor: CutInActor, box: Box) -> Trajectory:
@@ -207,6 +230,7 @@ def _logged(actor: LoggedActor, box: Box) -> Actor:
         box,
         Trajectory(t_us, xyz, quat_from_yaw(rows[:, 3])),
         is_static=False,
+        behaviour=_walking(actor),
     )
 
 
@@ -330,7 +354,7 @@ def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Act
     walk_us = round(abs(ends[actor.side]) / actor.speed_mps * 1e6)
     begin_us = round(arrival_us - actor.before_ego_s * 1e6) - walk_us
     track = walk_track(start, goal, placer.t_us, begin_us, actor.speed_mps, box)
-    return Actor(actor.id, actor.label, box, track)
+    return Actor(actor.id, actor.label, box, track, behaviour=_walking(actor))
 
 
 def _road_edge(road: Road, path: Path, at: float, side: str) -> float:

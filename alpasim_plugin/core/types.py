@@ -84,12 +84,17 @@ class EgoState:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How an actor moves once the loop is closed."""
+    """How an actor moves once the loop is closed.
 
-    kind: Literal["replay", "idm"] = "replay"
-    params: Mapping[str, float] = field(
-        default_factory=dict
-    )  # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2
+    ``replay``: on its track. ``yield``: on its track, but it waits where it would walk into the
+    ego's way. ``idm``: it follows its lane behind a leader. ``adversary``: along its track at a speed
+    by which it is ahead of the ego at a place; then it takes another speed.
+    """
+
+    kind: Literal["replay", "yield", "idm", "adversary"] = "replay"
+    # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2; adversary: gap_m, act_us,
+    # speed_mps, end_speed_mps, decel_mps2
+    params: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

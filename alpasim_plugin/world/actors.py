@@ -1,7 +1,7 @@
 """Road users while a scene is driven: replay of tracks, and drivers that react once the loop is
 closed.
 
-Replayed actors exist exactly during their track. Reactive ones follow their track until the loop
+Replayed actors exist exactly during their track; some wait for the ego on it. Reactive drivers follow their track until the loop
 closes, then drive along the same line, on along the lanes where it ends, and leave the scene at the
 end of the map.
 """
@@ -40,6 +40,7 @@ from alpasim_plugin.world.idm import (
 from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep
 from alpasim_plugin.world.route import LaneIndex
 from alpasim_plugin.world.signals import lights_on, red_gap_m
+from alpasim_plugin.world.walkers import Walker
 
 MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
 MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows it to its end
@@ -48,6 +49,9 @@ EXTENSION_M = 300.0
 MAX_TURN_RAD = 0.8
 FADE_M, FADE_STEP_M = 20.0, 2.0
 SPEED_SPAN_US = 100_000
+DRIVING = ("idm", "adversary")  # behaviours of those who leave their track
+# An adversary: share of its speed between which it chooses, gain and time of its control.
+SLOWEST, FASTEST, PULL_PER_S, CONTROL_S, MAX_ACCEL_MPS2 = 0.5, 1.5, 1.0, 0.5, 3.0
 
 
 class Actors:
@@ -71,7 +75,7 @@ class Actors:
         ground: HeightField | None = None,
     ) -> None:
         self.vehicle, self.closed_us = vehicle, closed_us
-        reactive = [actor for actor in actors if actor.behaviour.kind == "idm"]
+        reactive = [actor for actor in actors if actor.behaviour.kind in DRIVING]
         index = LaneIndex(lane_map) if lane_map is not None and reactive else None
         signals = lane_map.signals if lane_map is not None else None
         self.drivers = [_Driver(actor, index, ground, signals) for actor in reactive]
@@ -79,12 +83,17 @@ class Actors:
             driver.line = number
         paths = [driver.path for driver in self.drivers if driver.path is not None]
         self._lines = Lines(paths) if paths else None
-        self.replayed = [actor for actor in actors if actor.behaviour.kind != "idm"]
+        self.replayed = [actor for actor in actors if actor.behaviour.kind not in DRIVING]
         self.reset()
 
     def reset(self) -> None:
         """Go back to the beginning of the scene."""
         self.t_us: int | None = None
+        self.walkers = {
+            actor.actor_id: Walker(actor)
+            for actor in self.replayed
+            if actor.behaviour.kind == "yield"
+        }
         for driver in self.drivers:
             driver.motion, driver.present = None, True
 
@@ -102,7 +111,10 @@ class Actors:
                 f"t = {t_us} us: the last time was {self.t_us} us",
                 "step forwards, or reset first",
             )
-        replayed, poses, velocity = _on_tracks(self.replayed, t_us)
+        if self.t_us is not None and t_us > self.closed_us:
+            for walker in self.walkers.values():
+                walker.step(max(self.t_us, self.closed_us), t_us, ego, self.vehicle)
+        replayed, poses, velocity = _on_tracks(self.replayed, t_us, self.walkers)
         out = {actor.actor_id: pose for actor, pose in zip(replayed, poses, strict=True)}
         if self._lines is not None and self.t_us is not None and t_us > self.closed_us:
             bodies = bodies_from(
@@ -137,7 +149,10 @@ class Actors:
         reactive = [
             (d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present
         ]
-        return ActorForecast(tuple(self.replayed), tuple(reactive), self.t_us, self.closed_us)
+        walkers = {key: replace(walker) for key, walker in self.walkers.items()}
+        return ActorForecast(
+            tuple(self.replayed), walkers, tuple(reactive), self.t_us, self.closed_us
+        )
 
     def _advance(self, lines: Lines, from_us: int, to_us: int, others: Bodies) -> None:
         """Move all reactive drivers, who see each other and the others' bodies."""
@@ -168,17 +183,20 @@ class Actors:
                 np.arange(len(others.xy), len(everybody.xy)),
             )
             for (driver, motion), leader in zip(driving, leaders, strict=True):
-                driver.follow(motion, leader, to_us, dt_s)
+                accel_mps2 = driver.accel_mps2(motion, leader, everybody, to_us)
+                driver.move(motion, accel_mps2, dt_s)
 
 
 @dataclass(frozen=True)
 class ActorForecast:
     """Predicted poses of road users, from what is known at one instant.
 
-    Replayed ones follow their track, reactive ones keep their speed along their line.
+    Replayed ones follow their track, those who wait go on waiting, reactive ones keep their speed
+    along their line.
     """
 
     replayed: tuple[Actor, ...]
+    walkers: Mapping[str, Walker]
     reactive: tuple[tuple[_Driver, _Motion | None], ...]
     t_us: int | None
     closed_us: int
@@ -187,7 +205,11 @@ class ActorForecast:
         """Return ``T_world_box`` ``(4, 4)`` of every actor expected at ``t_us``, not earlier than
         the instant of the forecast.
         """
-        replayed, poses, _ = _on_tracks(self.replayed, t_us)
+        waiting = {
+            key: replace(w, lag_us=w.lag_us + (1.0 - w.rate) * (t_us - (self.t_us or t_us)))
+            for key, w in self.walkers.items()
+        }
+        replayed, poses, _ = _on_tracks(self.replayed, t_us, waiting)
         out = {actor.actor_id: pose for actor, pose in zip(replayed, poses, strict=True)}
         for driver, motion in self.reactive:
             if motion is None:
@@ -207,17 +229,29 @@ def make_actors(scenario: Scenario) -> Actors:
     return Actors(scenario.actors, scenario.vehicle, closed_us, scenario.lane_map, scenario.ground)
 
 
-def _on_tracks(actors: Sequence[Actor], t_us: int) -> tuple[list[Actor], F64, F64]:
+def _on_tracks(
+    actors: Sequence[Actor], scene_us: int, walkers: Mapping[str, Walker]
+) -> tuple[list[Actor], F64, F64]:
     """Return the actors whose track covers a time, their poses ``(N, 4, 4)`` there, and their
     velocities ``(N, 2)`` in the track's current piece; those that stand have none.
     """
-    present = [a for a in actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1]]
+    times = [
+        walkers[actor.actor_id].own_us(scene_us) if actor.actor_id in walkers else scene_us
+        for actor in actors
+    ]
+    both = [
+        (actor, own_us)
+        for actor, own_us in zip(actors, times, strict=True)
+        if actor.track.t_us[0] <= own_us <= actor.track.t_us[-1]
+    ]
+    present = [actor for actor, _ in both]
     if not present:
         return [], np.zeros((0, 4, 4)), np.zeros((0, 2))
     pieces = []
-    for actor in present:
+    t_us = np.array([own_us for _, own_us in both])
+    for actor, own_us in both:
         track = actor.track
-        after = min(int(np.searchsorted(track.t_us, t_us, side="right")), len(track) - 1)
+        after = min(int(np.searchsorted(track.t_us, own_us, side="right")), len(track) - 1)
         pieces.append((track, max(after - 1, 0), after))
     begin_us = np.array([track.t_us[i] for track, i, _ in pieces])
     span_us = np.array([max(track.t_us[j] - track.t_us[i], 1) for track, i, j in pieces])
@@ -227,7 +261,12 @@ def _on_tracks(actors: Sequence[Actor], t_us: int) -> tuple[list[Actor], F64, F6
     begin = np.array([track.quat[i] for track, i, _ in pieces])
     end = np.array([track.quat[j] for track, _, j in pieces])
     poses = se3(xyz + share[:, None] * step, slerp(begin, end, share))
-    moving = np.array([not actor.is_static for actor in present])
+    moving = np.array(
+        [
+            walkers[actor.actor_id].rate if actor.actor_id in walkers else not actor.is_static
+            for actor in present
+        ]
+    )
     return present, poses, step[:, :2] * (moving * 1e6 / span_us)[:, None]
 
 
@@ -251,7 +290,8 @@ class _Driver:
         signals: Sequence[Signal] | None,
     ) -> None:
         self.actor, self.ground = actor, ground
-        self.params = IdmParams.from_mapping(actor.behaviour.params)
+        self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
+        self.params = IdmParams.from_mapping({} if self.act else actor.behaviour.params)
         self.path = _driving_line(actor, index)
         self.lights = () if self.path is None else lights_on(self.path, signals)
         self.line = -1
@@ -279,18 +319,39 @@ class _Driver:
         """
         return 20.0 + 2.0 * wanted_gap_m(motion.speed_mps, motion.speed_mps, self.params)
 
-    def follow(self, motion: _Motion, leader: Leader, t_us: int, dt_s: float) -> None:
-        """Drive on behind a leader and before a red light; the driver leaves the scene at the end
-        of its line.
+    def accel_mps2(self, motion: _Motion, leader: Leader, bodies: Bodies, t_us: int) -> float:
+        """Return the acceleration behind a leader and before a red light; of an adversary that by
+        which it acts on the ego, the first of the bodies.
         """
         speed_mps = motion.speed_mps
         red_m = red_gap_m(self.lights, motion.s_m + self.actor.box.length_m / 2, speed_mps, t_us)
         closing_mps = speed_mps - leader.speed_mps
-        accel = min(
-            idm_acceleration(speed_mps, leader.gap_m, closing_mps, self.params),
-            idm_acceleration(speed_mps, red_m, speed_mps, self.params),
-        )
-        motion.s_m, motion.speed_mps = moved_on(motion.s_m, speed_mps, accel, dt_s)
+        behind = idm_acceleration(speed_mps, leader.gap_m, closing_mps, self.params)
+        if self.act is not None:
+            against = self._against_ego_mps2(motion, bodies, self.act)
+            return against if leader.index <= 0 else min(against, behind)
+        return min(behind, idm_acceleration(speed_mps, red_m, speed_mps, self.params))
+
+    def _against_ego_mps2(self, motion: _Motion, bodies: Bodies, act: Mapping[str, float]) -> float:
+        """Return the acceleration of an adversary: up to the place where it acts it tries to be
+        ``gap_m`` ahead of the ego, within bounds of its speed; from there on it takes another speed.
+        """
+        assert self.path is not None
+        there = interpolate(self.actor.track, round(act["act_us"]))[None, :2, 3]
+        act_s_m, ego_s_m = (float(self.path.project(xy)[0][0]) for xy in (there, bodies.xy[:1]))
+        wanted_mps = act["end_speed_mps"]
+        if motion.s_m < act_s_m:
+            front_m = ego_s_m + float(bodies.half_length_m[0]) + act["gap_m"]
+            ahead_m = front_m + self.actor.box.length_m / 2 - motion.s_m
+            ego_mps = float(np.hypot(*bodies.velocity[0]))
+            least_mps, most_mps = SLOWEST * act["speed_mps"], FASTEST * act["speed_mps"]
+            wanted_mps = min(max(ego_mps + PULL_PER_S * ahead_m, least_mps), most_mps)
+        accel = (wanted_mps - motion.speed_mps) / CONTROL_S
+        return min(max(accel, -act["decel_mps2"]), MAX_ACCEL_MPS2)
+
+    def move(self, motion: _Motion, accel_mps2: float, dt_s: float) -> None:
+        """Drive on; the driver leaves the scene at the end of its line."""
+        motion.s_m, motion.speed_mps = moved_on(motion.s_m, motion.speed_mps, accel_mps2, dt_s)
         assert self.path is not None
         if motion.s_m > self.path.length_m:
             self.present, self.motion = False, None
