@@ -83,7 +83,7 @@ def test_an_adversary_acts_at_its_gap_before_the_ego_whatever_its_speed(tmp_path
     assert rear[act] - front[act] == pytest.approx(8.0, abs=1.0)
     assert not np.allclose(x, scripted[2])
     speed = np.diff(x) / np.diff(t)
-    assert speed[:act].min() > 4.4
+    assert speed[:act].min() > 3.7
     assert speed.max() < 13.6
     assert (np.diff(speed) / 0.1).min() > -4.5
     assert speed[-1] == pytest.approx(5.0 if actor is CUT_IN else 0.0, abs=0.3)
