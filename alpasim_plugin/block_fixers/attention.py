@@ -178,46 +178,14 @@ def block_causal_attention(
     return torch.cat(out, dim=1)
 
 
-class SelfAttention(nn.Module):
-    """Attention of latent tokens on latent tokens, with RMS-normed and rotated queries and keys."""
+class Attention(nn.Module):
+    """Projections to heads: RMS-normed queries and keys, values, and the way back.
 
-    def __init__(self, width: int, head_width: int) -> None:
-        super().__init__()
-        self.head_width = head_width
-        self.q_proj = nn.Linear(width, width, bias=False)
-        self.k_proj = nn.Linear(width, width, bias=False)
-        self.v_proj = nn.Linear(width, width, bias=False)
-        self.output_proj = nn.Linear(width, width, bias=False)
-        self.q_norm = RMSNorm(head_width)
-        self.k_norm = RMSNorm(head_width)
-
-    def project(self, x: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads,
-        head_width)``; ``added (B, L, width)`` is added to the tokens.
-        """
-        x = x if added is None else x + added
-        parts = self.q_proj(x), self.k_proj(x), self.v_proj(x)
-        q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
-        return self.q_norm(q), self.k_norm(k), v
-
-    def forward(
-        self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None
-    ) -> Tensor:
-        """Apply self-attention.
-
-        Args:
-            x: ``(B, T, N, width)``.
-            table: Rotation of the ``T * N`` tokens.
-            attention: Attention of the block's q, k, v and the cached past.
-            added: See `project`, ``(B, T, N, ...)``.
-        """
-        q, k, v = self.project(x.flatten(1, 2), None if added is None else added.flatten(1, 2))
-        out: Tensor = self.output_proj(attention(rotate(q, table), rotate(k, table), v))
-        return out.view(x.shape)
-
-
-class CrossAttention(nn.Module):
-    """Attention of latent tokens on text tokens; no positions, no mask."""
+    Args:
+        width: Channels of the queries, and of the result.
+        context_width: Channels of what is attended to.
+        head_width: Channels of a head.
+    """
 
     def __init__(self, width: int, context_width: int, head_width: int) -> None:
         super().__init__()
@@ -229,15 +197,41 @@ class CrossAttention(nn.Module):
         self.q_norm = RMSNorm(head_width)
         self.k_norm = RMSNorm(head_width)
 
+    def queries(self, x: Tensor) -> Tensor:
+        """Map tokens ``(B, L, width)`` to queries ``(B, L, heads, head_width)``."""
+        normed: Tensor = self.q_norm(self.q_proj(x).unflatten(-1, (-1, self.head_width)))
+        return normed
+
     def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
-        """Map the context ``(B, tokens, context_width)`` to keys and values ``(B, tokens, heads,
-        head_width)``; once per prompt.
+        """Map ``(B, L, context_width)`` to keys and values ``(B, L, heads, head_width)``."""
+        keys = self.k_proj(context).unflatten(-1, (-1, self.head_width))
+        values = self.v_proj(context).unflatten(-1, (-1, self.head_width))
+        return self.k_norm(keys), values
+
+
+class SelfAttention(Attention):
+    """Attention of latent tokens on latent tokens, with rotated queries and keys."""
+
+    def forward(
+        self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None
+    ) -> Tensor:
+        """Apply self-attention.
+
+        Args:
+            x: ``(B, T, N, width)``.
+            table: Rotation of the ``T * N`` tokens.
+            attention: Attention of the block's q, k, v and the cached past.
+            added: ``(B, T, N, width)`` that is added to the tokens.
         """
-        k, v = (
-            part.unflatten(-1, (-1, self.head_width))
-            for part in (self.k_proj(context), self.v_proj(context))
-        )
-        return self.k_norm(k), v
+        tokens = (x if added is None else x + added).flatten(1, 2)
+        keys, values = self.keys_values(tokens)
+        attended = attention(rotate(self.queries(tokens), table), rotate(keys, table), values)
+        out: Tensor = self.output_proj(attended)
+        return out.view(x.shape)
+
+
+class CrossAttention(Attention):
+    """Attention of latent tokens on text tokens; no positions, no mask."""
 
     def forward(self, x: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
         """Attend from ``x (B, T, N, width)`` to the text.
@@ -249,6 +243,5 @@ class CrossAttention(nn.Module):
         if k.shape[1] == 1:
             value: Tensor = self.output_proj(v.flatten(2))
             return value[:, :, None].expand(x.shape)
-        q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
-        out: Tensor = self.output_proj(attend(q, k, v))
+        out: Tensor = self.output_proj(attend(self.queries(x.flatten(1, 2)), k, v))
         return out.view(x.shape)

@@ -12,8 +12,18 @@ from typing import cast
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.attention import Attend, CrossAttention, RopeTable, SelfAttention
-from alpasim_plugin.block_fixers.layers import PATCH, Float32Linear, PatchLinear, layer_norm
+from alpasim_plugin.block_fixers.attention import (
+    Attend,
+    CrossAttention,
+    RopeTable,
+    SelfAttention,
+)
+from alpasim_plugin.block_fixers.layers import (
+    PATCH,
+    Float32Linear,
+    PatchLinear,
+    layer_norm,
+)
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 
 TimeSignal = tuple[Tensor, Tensor]  # emb (B, T, width), lora (B, T, 3 * width), both float32
@@ -76,7 +86,7 @@ class Block(nn.Module):
 
     def __init__(self, sizes: DiTSizes) -> None:
         super().__init__()
-        self.self_attn = SelfAttention(sizes.width, sizes.head_width)
+        self.self_attn = SelfAttention(sizes.width, sizes.width, sizes.head_width)
         self.cross_attn = CrossAttention(sizes.width, sizes.context_width, sizes.head_width)
         self.mlp = Mlp(sizes.width, sizes.mlp_width)
         self.opacity_embed = (

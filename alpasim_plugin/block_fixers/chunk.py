@@ -4,7 +4,7 @@ end of each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from alpasim_plugin.core.interfaces import Fixer
@@ -18,17 +18,11 @@ class ChunkRenderer(PerFrameRenderer):
 
     Args:
         runner: Renders and calls the fixer.
-        make_fixer, settings: Not used.
+        settings: Not used.
         first: A fixer at the start of its history.
     """
 
-    def __init__(
-        self,
-        runner: BlockRunner,
-        make_fixer: Callable[[], Fixer],
-        settings: FixerSettings,
-        first: Fixer,
-    ) -> None:
+    def __init__(self, runner: BlockRunner, settings: FixerSettings, first: Fixer) -> None:
         super().__init__(runner, first)
         self.mode = "chunk"
         self.block = first.blocks

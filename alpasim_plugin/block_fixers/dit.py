@@ -23,7 +23,12 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.attention import Attend, Rope3D, RopeTable, block_causal_attention
+from alpasim_plugin.block_fixers.attention import (
+    Attend,
+    Rope3D,
+    RopeTable,
+    block_causal_attention,
+)
 from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues, TimeSignal
 from alpasim_plugin.block_fixers.clips import check_video
 from alpasim_plugin.block_fixers.kv_cache import BlockCache, RollingCache

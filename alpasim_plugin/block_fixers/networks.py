@@ -29,7 +29,6 @@ from alpasim_plugin.block_fixers.taehv import TinyDecoder
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
-from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
@@ -240,10 +239,10 @@ class Parts:
         is_tiny = self.settings.vae.kind == "tiny"
         if weights is not None:
             return (TinyVAE if is_tiny else WanVAE).from_state_dict(weights, source=source)
-        self.allow_untrained("vae", always_random=not is_tiny)
+        self.allow_untrained("vae", is_identity=is_tiny)
         if is_tiny:
             return TinyVAE.random(TinySizes(*self.settings.vae.widths), self.seed)
-        return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
+        return WanVAE.random(self.settings.vae.base, self.seed)
 
     def decoder(self) -> TinyDecoder:
         """Build the tiny Wan decoder."""
@@ -251,15 +250,14 @@ class Parts:
         scaled = self.settings.decoder.scaled
         if weights is not None:
             return TinyDecoder.from_state_dict(weights, scaled=scaled, source=source)
-        self.allow_untrained("decoder", always_random=True)
+        self.allow_untrained("decoder", is_identity=False)
         return TinyDecoder.random(LATENT, TAEHV_WIDTHS, scaled, self.seed)
 
-    def allow_untrained(self, part: str, always_random: bool = False) -> None:
+    def allow_untrained(self, part: str, is_identity: bool = True) -> None:
         """Raise the error for missing weights unless the settings allow an untrained part."""
-        if self.settings.untrained == "refuse":
-            self.refuse(part, "no weights, and settings.untrained is 'refuse'")
-        if always_random and self.settings.untrained == "identity":
-            self.refuse(part, "no weights, and an untrained one is not an identity")
+        untrained = self.settings.untrained
+        if untrained == "refuse" or (untrained == "identity" and not is_identity):
+            self.refuse(part, f"no weights, and settings.untrained is {untrained!r}")
 
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""

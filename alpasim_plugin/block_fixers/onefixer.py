@@ -15,7 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.clips import SIDE, TOKEN_PX, crop_clip, to_clip, to_images
+from alpasim_plugin.block_fixers.clips import (
+    SIDE,
+    TOKEN_PX,
+    crop_clip,
+    to_clip,
+    to_images,
+)
 from alpasim_plugin.block_fixers.networks import LATENT, load_networks
 from alpasim_plugin.block_fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
@@ -67,10 +73,8 @@ class ViewsHistory:
     cameras: tuple[str, ...]
     shape: tuple[int, int]  # height and width of their images
     state: PipelineState
-    last_fixed: U8 | None = (
-        None  # (B, H, W, 3) as decoded, also if the guard returned the raw frame
-    )
-    last_raw: U8 | None = None  # (B, H, W, 3)
+    # per camera the last frame as decoded, also if the guard returned the raw one, and the raw one
+    last: tuple[tuple[U8, U8], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -204,11 +208,7 @@ class OneFixer(Fixer):
         images = to_images(video, view.size)
         events = []
         for b in range(len(view.cameras)):
-            before = (
-                None
-                if history.last_fixed is None or history.last_raw is None
-                else (history.last_fixed[b], history.last_raw[b])
-            )
+            before = history.last[b] if history.last else None
             events.append(
                 tuple(guard.check_frames(video[b].transpose(0, 1), images[b], view.rgb[b], before))
             )
@@ -229,8 +229,7 @@ class OneFixer(Fixer):
             view.cameras,
             view.shape,
             state,
-            block.images[:, -1],
-            view.rgb[:, -1],
+            tuple(zip(block.images[:, -1], view.rgb[:, -1], strict=True)),
         )
 
     def _frames(self, block: Sequence[Frame]) -> tuple[Frame, ...]:

@@ -17,7 +17,12 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.clips import check_frames
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
-from alpasim_plugin.fixers.network.schedule import TABLE, NoiseLevel, interpolant, shifted
+from alpasim_plugin.fixers.network.schedule import (
+    TABLE,
+    NoiseLevel,
+    interpolant,
+    shifted,
+)
 
 CONTEXT_STEP = 128.0
 POOL = (4, 8, 8)  # frames, rows, columns of one latent

@@ -11,8 +11,8 @@ frame is shown.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,11 @@ class Deviation:
     def within(self, tolerance_m: float, tolerance_deg: float) -> bool:
         """Return whether camera and actors are within tolerance."""
         return max(self.camera_m, self.actor_m) <= tolerance_m and self.camera_deg <= tolerance_deg
+
+    def largest(self, others: Sequence[Deviation]) -> Deviation:
+        """Return the largest of each kind of error, of those that are finite."""
+        columns = zip(*(vars(error).values() for error in (self, *others)), strict=True)
+        return Deviation(*(max(filter(math.isfinite, column)) for column in columns))
 
 
 EXACT = Deviation(0.0, 0.0, 0.0)
@@ -89,50 +94,41 @@ class SpeculationStats:
     hits: int = 0  # of these: within tolerance
     drafts: int = 0
     redrafts: int = 0  # drafts made in the middle of a block
-    forecasts: list[Deviation] = field(default_factory=list)  # of predicted frames
-    # between the pose of the frame shown and the true one
-    shown: list[Deviation] = field(default_factory=list)
+    # largest errors of predicted frames, and between the pose of the frame shown and the true one
+    forecast_error: Deviation = EXACT
+    shown_error: Deviation = EXACT
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts and, in metres and degrees, the largest errors of the forecasts and of
-        the frames shown.
-        """
-        counts = {key: value for key, value in vars(self).items() if isinstance(value, int)}
-        return {
-            **counts,
-            "forecast_error": _largest(self.forecasts),
-            "shown_error": _largest(self.shown),
+        """Return the counts and errors, in metres and degrees."""
+        errors = {
+            "forecast_error": _rounded(vars(self.forecast_error))
+            if self.predicted
+            else dict.fromkeys(vars(EXACT)),
+            "shown_error": _rounded(vars(self.shown_error)),
         }
+        return vars(self) | errors
 
 
 class SpeculativeRenderer(FixedRenderer):
-    """A session whose frames are fixed block by block and returned one by one.
-
-    Cameras with the same frame times are one group and go through the fixer together, as views of
-    one batch; every group has its own fixer.
+    """A session whose frames are fixed block by block and returned one by one; its cameras have
+    the same frame times and go through the fixer together, as views of one batch.
 
     Args:
         runner: Renders and calls the fixer.
-        make_fixer: Makes a fixer at the start of its history.
         settings: Tolerances.
-        first: The fixer of the first group.
+        first: A fixer at the start of its history.
     """
 
-    def __init__(
-        self,
-        runner: BlockRunner,
-        make_fixer: Callable[[], Fixer],
-        settings: FixerSettings,
-        first: Fixer,
-    ) -> None:
+    def __init__(self, runner: BlockRunner, settings: FixerSettings, first: Fixer) -> None:
         super().__init__(runner, first, "speculative")
         self.settings = settings
-        self._make = make_fixer
-        # At least the next frame, which distinguishes cameras of other rates.
         self.lookahead = max(1, first.blocks.first - 1, first.blocks.then - 1)
-        self._groups: dict[tuple[int, ...], _CameraGroup] = {}
-        self._group_of: dict[str, _CameraGroup] = {}
         self.stats = SpeculationStats()
+        self.cameras: list[str] = []
+        self.last_us: int | None = None
+        # Instants of the block so far, and of its draft; each a frame per camera, by name.
+        self.true: list[list[ConditionedFrame]] = []
+        self.draft: list[list[tuple[ConditionedFrame, Frame]]] = []
 
     def counts(self) -> dict[str, Any]:
         """Return the counts so far."""
@@ -142,83 +138,43 @@ class SpeculativeRenderer(FixedRenderer):
         """Return the frames of one instant, in the order of the requests.
 
         Raises:
-            RendererError: A camera without the others of its group, or time that does not increase.
+            RendererError: Other cameras than before, or time that does not increase.
             FixerError: The fixer broke its contract.
         """
         self.runner.reset_times()
-        groups: dict[int, list[RenderRequest]] = {}
-        for request in requests:
-            groups.setdefault(id(self._group(request)), []).append(request)
-        made: dict[str, Frame] = {}
-        for group in groups.values():
-            made |= self._group_of[group[0].camera.name].emit(group)
-        return [made[request.camera.name] for request in requests]
-
-    def _group(self, request: RenderRequest) -> _CameraGroup:
-        name = request.camera.name
-        if name not in self._group_of:
-            times = (request.t_us, *(coming.t_us for coming in request.ahead))
-            if times not in self._groups:
-                fixer = self._make() if self._groups else self.fixer
-                self._groups[times] = _CameraGroup(self.runner, fixer, self.settings, self.stats)
-            self._group_of[name] = self._groups[times]
-            self._groups[times].cameras.append(name)
-        return self._group_of[name]
-
-
-@dataclass
-class _CameraGroup:
-    """Cameras with the same frame times, and the block in progress."""
-
-    runner: BlockRunner
-    fixer: Fixer
-    settings: FixerSettings
-    stats: SpeculationStats
-    cameras: list[str] = field(default_factory=list)
-    done: int = 0  # complete blocks
-    last_us: int | None = None
-    true: list[list[ConditionedFrame]] = field(
-        default_factory=list
-    )  # instants of the block so far, a frame per camera each
-    draft: list[list[tuple[ConditionedFrame, Frame]]] = field(
-        default_factory=list
-    )  # instants of the block, each per camera
-
-    def emit(self, requests: Sequence[RenderRequest]) -> dict[str, Frame]:
-        """Return the frames of one instant by camera."""
-        requests = sorted(requests, key=lambda request: request.camera.name)
-        self._check(requests)
+        ordered = sorted(requests, key=lambda request: request.camera.name)
+        self._check(ordered)
         place = len(self.true)
         predicted = self.draft[place] if place < len(self.draft) else []
-        self.true.append([self.runner.render(request) for request in requests])
+        self.true.append([self.runner.render(request) for request in ordered])
         forecasts = [
             deviation(item.request, request)
-            for (item, _), request in zip(predicted, requests, strict=bool(predicted))
+            for (item, _), request in zip(predicted, ordered, strict=bool(predicted))
         ]
         limits = self.settings.tolerance_m, self.settings.tolerance_deg
         is_hit = bool(predicted) and all(error.within(*limits) for error in forecasts)
-        shown = [EXACT] * len(requests)
-        if place + 1 == self.fixer.blocks.frames(self.done):
+        shown = [EXACT] * len(ordered)
+        if place + 1 == self.fixer.blocks.frames(self.stats.blocks):
             frames = self._complete()
         elif is_hit:
             frames = [frame for _, frame in predicted]
             shown = forecasts
         else:
-            frames = self._make_draft(requests)
-        self.stats.frames += len(requests)
+            frames = self._make_draft(ordered)
+        self.stats.frames += len(ordered)
         self.stats.predicted += len(forecasts)
-        self.stats.hits += len(requests) if is_hit else 0
-        self.stats.forecasts += forecasts
-        self.stats.shown += shown
-        return {
+        self.stats.hits += len(ordered) if is_hit else 0
+        self.stats.forecast_error = self.stats.forecast_error.largest(forecasts)
+        self.stats.shown_error = self.stats.shown_error.largest(shown)
+        made = {
             frame.camera: _measured(frame, shown[i], forecasts[i] if forecasts else None)
             for i, frame in enumerate(frames)
         }
+        return [made[request.camera.name] for request in requests]
 
     def _complete(self) -> list[Frame]:
         """Add the block of true poses to the history and return its last frames."""
         fixed = self._fix(self.fixer.step, self.true)
-        self.done += 1
         self.stats.blocks += 1
         self.true = []
         self.draft = []
@@ -228,7 +184,7 @@ class _CameraGroup:
         """Fix the true frames so far with the predicted rest of the block and return the newest
         true ones.
         """
-        left = self.fixer.blocks.frames(self.done) - len(self.true)
+        left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
         coming = min(left, *(len(request.ahead) for request in requests))
         block = list(self.true)
         block += [
@@ -250,10 +206,11 @@ class _CameraGroup:
     def _check(self, requests: Sequence[RenderRequest]) -> None:
         names = [request.camera.name for request in requests]
         times = sorted({request.t_us for request in requests})
-        if names != sorted(self.cameras) or len(times) > 1:
+        self.cameras = self.cameras or names
+        if names != self.cameras or len(times) > 1:
             raise RendererError(
-                f"cameras {', '.join(names)} at {times} us: the block in progress belongs to {', '.join(self.cameras)} at one instant",
-                "request cameras with the same frame times together",
+                f"cameras {', '.join(names)} at {times} us, after {', '.join(self.cameras)} at one instant",
+                "Give the policy's cameras one rate, or take a fixer of single frames",
             )
         if self.last_us is not None and times[0] <= self.last_us:
             raise RendererError(
@@ -272,14 +229,8 @@ def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Fra
     }
     if forecast is not None:
         facts |= {"forecast_error_m": forecast.camera_m, "forecast_error_deg": forecast.camera_deg}
-    rounded = {name: round(value, 6) for name, value in facts.items()}
-    return replace(frame, facts={**frame.facts, **rounded})
+    return replace(frame, facts={**frame.facts, **_rounded(facts)})
 
 
-def _largest(errors: Sequence[Deviation]) -> dict[str, float | None]:
-    """Return the largest of each kind of error; None where no value is finite."""
-    out: dict[str, float | None] = {}
-    for name in ("camera_m", "camera_deg", "actor_m"):
-        values = (getattr(error, name) for error in errors)
-        out[name] = max((round(v, 6) for v in values if math.isfinite(v)), default=None)
-    return out
+def _rounded(values: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(value, 6) for name, value in values.items()}

@@ -37,15 +37,12 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     FrameAttention,
     ResidualBlock,
     Upsample,
-    WanLayout,
-    read_layout,
 )
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
 
-
-def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
-    """Return the residual blocks of one stage; the first changes the width."""
-    return [ResidualBlock(inputs if i == 0 else outputs, outputs) for i in range(count)]
+COLOURS, LATENT = 3, 16
+STEM = "encoder.conv1.bias"
 
 
 class Coder(nn.Module):
@@ -65,14 +62,13 @@ class Coder(nn.Module):
 class Encoder(Coder):
     """Frames to means and log-variances of the latent."""
 
-    def __init__(self, layout: WanLayout) -> None:
-        last = layout.encoder[-1]
-        super().__init__((layout.colours, layout.stem), last, (last, 2 * layout.latent))
+    def __init__(self, base: int) -> None:
+        super().__init__((COLOURS, base), 4 * base, (4 * base, 2 * LATENT))
         blocks: list[nn.Module] = []
-        for stage, (inputs, outputs) in enumerate(
-            zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)
-        ):
-            blocks += residual_blocks(inputs, outputs, layout.blocks)
+        inputs = base
+        for stage, outputs in enumerate((base, 2 * base, 4 * base, 4 * base)):
+            blocks += [ResidualBlock(inputs, outputs), ResidualBlock(outputs, outputs)]
+            inputs = outputs
             if stage < len(ENCODER_TIME):
                 blocks.append(Downsample(outputs, ENCODER_TIME[stage]))
         self.downsamples = nn.ModuleList(blocks)
@@ -85,16 +81,16 @@ class Encoder(Coder):
 class Decoder(Coder):
     """Latents to frames."""
 
-    def __init__(self, layout: WanLayout) -> None:
-        first = layout.decoder_in[0]
-        super().__init__((layout.latent, first), first, (layout.decoder_out[-1], layout.colours))
+    def __init__(self, base: int) -> None:
+        super().__init__((LATENT, 4 * base), 4 * base, (base, COLOURS))
         blocks: list[nn.Module] = []
-        for stage, (inputs, outputs) in enumerate(
-            zip(layout.decoder_in, layout.decoder_out, strict=True)
-        ):
-            blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
+        inputs = 4 * base
+        for stage, outputs in enumerate((4 * base, 4 * base, 2 * base, base)):
+            blocks += [ResidualBlock(inputs, outputs)]
+            blocks += [ResidualBlock(outputs, outputs) for _ in range(2)]
             if stage < len(DECODER_TIME):
-                blocks.append(Upsample(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
+                inputs = outputs // 2
+                blocks.append(Upsample(outputs, inputs, DECODER_TIME[stage]))
         self.upsamples = nn.ModuleList(blocks)
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
@@ -107,20 +103,23 @@ class WanVAE(StreamingCodec):
 
     Weights are frozen; gradients with respect to the input flow.
 
+    Args:
+        base: Channels of the first stage; the others have 2, 4 and 4 times as many.
+
     Example:
-        >>> vae = WanVAE.random(WanLayout.of_base(8))
+        >>> vae = WanVAE.random(8)
         >>> z = vae.encode(torch.zeros(1, 3, 5, 16, 24))
         >>> tuple(z.shape), tuple(vae.decode(z).shape)
         ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24))
     """
 
-    def __init__(self, layout: WanLayout) -> None:
+    def __init__(self, base: int) -> None:
         super().__init__()
-        self.layout = layout
-        self.encoder = Encoder(layout)
-        self.conv1 = PointwiseConv(2 * layout.latent, 2 * layout.latent, axes=3)
-        self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
-        self.decoder = Decoder(layout)
+        self.base = base
+        self.encoder = Encoder(base)
+        self.conv1 = PointwiseConv(2 * LATENT, 2 * LATENT, axes=3)
+        self.conv2 = PointwiseConv(LATENT, LATENT, axes=3)
+        self.decoder = Decoder(base)
         self.stats = LatentStats()
         self.eval().requires_grad_(False)
 
@@ -143,18 +142,19 @@ class WanVAE(StreamingCodec):
             InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
         tensors = unwrap(sd, source)
-        layout = read_layout(tensors, source)
+        if STEM not in tensors:
+            raise InputError(f"{source} ({len(tensors)} tensors): missing: {STEM}", DO)
         with torch.device("meta"):
-            vae = cls(layout)
+            vae = cls(tensors[STEM].numel())
         load_checked(vae, tensors, source, DO)
         vae.stats = LatentStats()
         return vae
 
     @classmethod
-    def random(cls, layout: WanLayout, seed: int = 0) -> Self:
+    def random(cls, base: int, seed: int = 0) -> Self:
         """Build an untrained network, for tests and timing."""
         with torch.device("meta"):
-            vae = cls(layout)
+            vae = cls(base)
         fill_random(vae, seed, "wan_vae")
         vae.stats = LatentStats()
         return vae
@@ -193,16 +193,14 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: Another shape.
         """
-        check_video("latents", z, self.layout.latent)
+        check_video("latents", z, LATENT)
         video, state = self.decode_in_passes(self._decode_pass, z.to(self.dtype), state)
         return video.clamp(-1, 1) if clamp else video, state
 
     def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
         streaming = StreamingState(state)
         moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
-        return self.stats.normalise(
-            channels_first(moments[..., : self.layout.latent])
-        ), streaming.state
+        return self.stats.normalise(channels_first(moments[..., :LATENT])), streaming.state
 
     def _decode_pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:
         streaming = StreamingState(state)

@@ -1,11 +1,4 @@
-"""Sizes of a Wan 2.1 autoencoder, read from its tensors.
-
-The graph is fixed: four stages, one residual block more per stage in the decoder than in the
-encoder, time halved after the second and third encoder stage. The widths of the stages vary (96,
-192, 384, 384 in the published network, a quarter of that in LightVAE) and so may the number of
-blocks (2).
-
-Layers of the Wan 2.1 video autoencoder, with its parameter names and shapes.
+"""Layers of the Wan 2.1 video autoencoder, with its parameter names and shapes.
 
 Inside, a video is ``(B, T, H, W, C)``. Every layer is causal in time. The first frame of a video is
 special in the two layers that change the frame rate: it passes unchanged, and later frames are
@@ -17,8 +10,6 @@ Source: Wan 2.1 ``wan/modules/vae.py`` (graph, keys, cache rules).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -33,94 +24,11 @@ from alpasim_plugin.block_fixers.streaming import (
     conv_frames,
     run_layers,
 )
-from alpasim_plugin.core.errors import InputError
 
-STAGES = 4
 ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
 DECODER_TIME = (True, True, False)
 DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix)"
 TAPS = 3  # of every temporal kernel: the frame and its two predecessors
-
-
-@dataclass(frozen=True)
-class WanLayout:
-    """Widths of one autoencoder.
-
-    Args:
-        colours: Channels of the video.
-        latent: Channels of the latent.
-        stem: Channels after the encoder's first convolution.
-        encoder: Channels of the four encoder stages.
-        decoder_in: Channels that enter each of the four decoder stages.
-        decoder_out: Channels that leave the residual blocks of each decoder stage.
-        blocks: Residual blocks of an encoder stage; a decoder stage has one more.
-    """
-
-    colours: int
-    latent: int
-    stem: int
-    encoder: tuple[int, ...]
-    decoder_in: tuple[int, ...]
-    decoder_out: tuple[int, ...]
-    blocks: int = 2
-
-    @classmethod
-    def of_base(cls, base: int, latent: int = 16) -> WanLayout:
-        """Return the published proportions: base 96 is the Wan 2.1 autoencoder, 24 is LightVAE.
-
-        Example:
-            >>> WanLayout.of_base(96).encoder
-            (96, 192, 384, 384)
-        """
-        one = base
-        two = 2 * base
-        four = 4 * base
-        return cls(
-            3, latent, one, (one, two, four, four), (four, two, two, one), (four, four, two, one)
-        )
-
-
-def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
-    """Read the widths from vectors (biases and norm gains), which cannot be transposed.
-
-    Raises:
-        InputError: A key that gives a width is missing.
-    """
-    halvings = [
-        int(key.split(".")[2])
-        for key in sd
-        if key.startswith("encoder.downsamples.") and ".resample." in key
-    ]
-    if not halvings:
-        raise InputError(
-            f"{source} ({len(sd)} tensors): missing: encoder.downsamples.2.resample.1.weight",
-            DO,
-        )
-    blocks = min(halvings)
-    encoder_starts = [stage * (blocks + 1) for stage in range(STAGES)]
-    decoder_starts = [stage * (blocks + 2) for stage in range(STAGES)]
-    return WanLayout(
-        colours=_length(sd, source, "decoder.head.2.bias"),
-        latent=_length(sd, source, "conv2.bias"),
-        stem=_length(sd, source, "encoder.conv1.bias"),
-        encoder=tuple(
-            _length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in encoder_starts
-        ),
-        decoder_in=tuple(
-            _length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in decoder_starts
-        ),
-        decoder_out=tuple(
-            _length(sd, source, f"decoder.upsamples.{i + blocks}.residual.3.gamma")
-            for i in decoder_starts
-        ),
-        blocks=blocks,
-    )
-
-
-def _length(sd: Mapping[str, Tensor], source: str, key: str) -> int:
-    if key not in sd:
-        raise InputError(f"{source} ({len(sd)} tensors): missing: {key}", DO)
-    return sd[key].numel()
 
 
 def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:

@@ -215,8 +215,7 @@ def fixed_renderer(
 
     Args:
         render: The base renderer of the same rollout; its frames are checked.
-        make_fixer: Makes a fixer without history; called once, and again for every further group of
-            cameras with other frame times.
+        make_fixer: Makes a fixer without history.
         settings: Mode, tolerances, and whether the fixer wants semantic maps.
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
@@ -232,10 +231,7 @@ def fixed_renderer(
         references = ReferenceSession(*of, threads=thread_count(threads))
     runner = BlockRunner(render, scene_map, scenario.actors, threads, references)
 
-    def make() -> Fixer:
-        return complete(make_fixer(), Fixer)
-
-    first = make()
+    first = complete(make_fixer(), Fixer)
     if first.blocks == ONE_BY_ONE:
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)
@@ -244,5 +240,5 @@ def fixed_renderer(
             f"{settings.name}, fixer.mode={settings.mode}: no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}",
             "install simrun with its block fixers, or take a fixer of single frames, such as onefixer",
         )
-    renderer: Renderer = modes[settings.mode].load()(runner, make, settings, first)
+    renderer: Renderer = modes[settings.mode].load()(runner, settings, first)
     return renderer

@@ -10,20 +10,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core import seeding
 
-SMALL = WanLayout.of_base(8)
-UNEVEN = WanLayout(
-    colours=3,
-    latent=16,
-    stem=4,
-    encoder=(8, 12, 20, 24),
-    decoder_in=(28, 12, 8, 6),
-    decoder_out=(20, 16, 10, 4),
-)
-
-DEEPER = WanLayout(3, 16, 4, (4, 8, 8, 12), (12, 8, 8, 4), (12, 12, 8, 4), blocks=3)
+SMALL = 8  # base width
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:

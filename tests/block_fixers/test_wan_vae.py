@@ -16,15 +16,11 @@ from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.networks import at_precision
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
-    WanLayout,
     causal_conv,
-    read_layout,
 )
 from alpasim_plugin.core.errors import InputError
 from tests.block_fixers.codec_cases import (
-    DEEPER,
     SMALL,
-    UNEVEN,
     clip,
     decoder_stream,
     encoder_stream,
@@ -62,9 +58,8 @@ def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
     assert torch.equal(push_all(decoder_stream(vae), z, counts), vae.decode(z))
 
 
-@pytest.mark.parametrize("layout", first_of([UNEVEN, SMALL]), ids=["uneven", "small"])
-def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout):
-    whole, steps = WanVAE.random(layout), WanVAE.random(layout)
+def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass():
+    whole, steps = WanVAE.random(SMALL), WanVAE.random(SMALL)
     whole.latents_per_pass = None
     video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
     torch.testing.assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
@@ -188,20 +183,16 @@ def test_summed_2d_convolutions_equal_the_3d_one(past, frames, inputs, outputs, 
 # Checkpoints
 
 
-@pytest.mark.parametrize("layout", [SMALL, UNEVEN, DEEPER], ids=["small", "uneven", "deeper"])
-def test_sizes_are_read_off_the_tensors(layout):
-    sd = WanVAE.random(layout).state_dict()
-    assert read_layout(sd) == layout
+def test_sizes_are_read_off_the_tensors():
+    made = WanVAE.random(12)
     video = clip(5, 16, 16)
-    assert torch.equal(
-        WanVAE.from_state_dict(sd).encode(video), WanVAE.random(layout).encode(video)
-    )
+    assert torch.equal(WanVAE.from_state_dict(made.state_dict()).encode(video), made.encode(video))
 
 
 @pytest.mark.parametrize(("base", "millions"), [(96, 126.9), (24, 8.04)])
 def test_published_widths_have_the_published_number_of_weights(base, millions):
     with torch.device("meta"):
-        count = sum(p.numel() for p in WanVAE(WanLayout.of_base(base)).parameters())
+        count = sum(p.numel() for p in WanVAE(base).parameters())
     assert count / 1e6 == pytest.approx(millions, abs=0.06)
 
 
