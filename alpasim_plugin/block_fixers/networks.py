@@ -214,22 +214,18 @@ class Parts:
         weights.
 
         Raises:
-            InputError: The weights have no prompt of the name that the settings ask for.
+            InputError: The weights have no prompt of that width.
         """
-        settings = self.settings
-        name = settings.prompt if isinstance(settings, OneFixerSettings) else None
         prompts, source = self.tensors("prompt")
-        if prompts is None and name is None:
+        if prompts is None:
             if self.trained and self.bundle is None:
                 self.refuse("prompt", "its transformer needs the features of its prompt")
             return torch.zeros(1, 1, sizes.text_width)
-        prompts = prompts or {}
-        text = prompts.get(name or "text")
+        text = prompts.get("text")
         if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
-            known = ", ".join(sorted(prompts)) or "none"
             raise InputError(
-                f"{source}: no prompt {name or 'text'} of shape [tokens, {sizes.text_width}]; prompts: {known}",
-                "choose a prompt by --set fixer.prompt=NAME, or give weights that have learned it",
+                f"{source}: no 'text' of shape [tokens, {sizes.text_width}]",
+                "give the features of the prompt that the weights were trained with",
             )
         return text.float()[None]
 

@@ -120,8 +120,7 @@ class OneFixer(Fixer):
         )
         self.trained = self.networks.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
-        prompt = "" if settings.prompt is None else f", prompt {settings.prompt}"
-        self.label = f"{settings.name}{at}, {self.networks.note}{prompt}"
+        self.label = f"{settings.name}{at}, {self.networks.note}"
         self.reset(seed)
 
     def reset(self, seed: int) -> None:

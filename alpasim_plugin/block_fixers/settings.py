@@ -1,6 +1,4 @@
-"""The block generators before they are loaded: settings, kind of bundle, factory, and the
-appearances that learned prompts ask for.
-"""
+"""The block generators before they are loaded: settings and kind of bundle."""
 
 from __future__ import annotations
 
@@ -19,9 +17,6 @@ from alpasim_plugin.fixers.settings import (
     check_steps,
     counted_steps,
 )
-
-CLEAR = "clear"  # the appearance of the render: the identity
-STYLES = (CLEAR, "night", "fog", "snow")
 
 
 class DiTSettings(Part):
@@ -173,27 +168,11 @@ class OneFixerSettings(LatentFixerSettings):
         default=False,
         description="Whether every block of the transformer embeds the opacity (ArtiFixer).",
     )
-    prompt: str | None = Field(
-        default=None,
-        description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow.",
-    )
 
     @property
     def network_times(self) -> tuple[float, ...]:
         """Time inputs of the network's denoising steps, 0 to 1000."""
         return tuple(level.t for level in schedule.from_names(self.steps))
-
-    @property
-    def shows_render(self) -> bool:
-        """Whether the decoder sees the render; in another appearance than the render's, its detail
-        would show the clear day through.
-        """
-        return super().shows_render and self.keeps_appearance
-
-    @property
-    def keeps_appearance(self) -> bool:
-        """Whether no prompt asks for another appearance than the render's."""
-        return self.prompt in (None, CLEAR)
 
     @property
     def finalises(self) -> bool:

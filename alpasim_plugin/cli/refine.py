@@ -62,7 +62,7 @@ def refine(
             warn(f"UNTRAINED: {made.label}. The result only shows that the pipeline runs.")
         return made
 
-    limited = settings.keeps_appearance and not (anyway or opacity or sdmap)
+    limited = not (anyway or opacity or sdmap)
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
         with Progress(as_json) as progress:

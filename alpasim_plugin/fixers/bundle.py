@@ -3,7 +3,7 @@ with.
 
 Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers
 (``block``, ``render-step``, ``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is
-not the autoencoder's) and ``prompt.text``, or ``prompt.NAME`` for each of several learned prompts.
+not the autoencoder's) and ``prompt.text``.
 The header holds ``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the
 settings that the weights were trained with. Only safetensors is read: a pickle is refused.
 """
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration, Fixer
-from alpasim_plugin.core.reading.arrays import read_metadata, read_weight_names
+from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.core.reading.files import parse_json
 from alpasim_plugin.fixers.settings import WeightedSettings
 
@@ -64,7 +64,7 @@ class FixerFactory(Generic[S]):
         """Say whose weights the settings name.
 
         Raises:
-            InputError: Weights that are named but not there, or a prompt that they did not learn.
+            InputError: Weights that are named but not there.
         """
         files = {}
         for part in FILES:
@@ -77,7 +77,6 @@ class FixerFactory(Generic[S]):
                     f"{settings.name}: {key} = {path}: no such file",
                     f"correct --set fixer.{key}, or where it is written",
                 )
-        _check_prompt(settings, files)
         if "weights.bundle" in files:
             trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
             return Declaration(files, trained, "trained" if trained else "untrained")
@@ -89,21 +88,6 @@ class FixerFactory(Generic[S]):
         note = f"weights missing: {lacking[0]}" if files else "weights missing"
         do = weights_to_give(lacking[0], getattr(settings, "trained_by", None))
         return Declaration(files, trained, note, missing=do)
-
-
-def _check_prompt(settings: WeightedSettings, files: Mapping[str, Path]) -> None:
-    wanted = getattr(settings, "prompt", None)
-    path = files.get("weights.bundle", files.get("weights.prompt"))
-    if wanted is None or path is None:
-        return
-    names = read_weight_names(path)
-    if "weights.bundle" in files:
-        names = [name.removeprefix("prompt.") for name in names if name.startswith("prompt.")]
-    if wanted not in names:
-        raise InputError(
-            f"{settings.name}: {path} has learned no prompt {wanted!r}; its prompts: {', '.join(sorted(names)) or 'none'}",
-            "name one of them by --set fixer.prompt=NAME, or give weights that have learned it",
-        )
 
 
 def weights_to_give(part: str, trained_by: str | None = None) -> str:
@@ -140,8 +124,7 @@ def save_bundle(
     Args:
         path: A ``.safetensors`` file.
         parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any
-            ``decoder`` and ``prompt`` (``text``, or a name for each of several: tokens,
-            text_width).
+            ``decoder`` and ``prompt`` (``text``: tokens, text_width).
         settings: What the weights were trained with.
         trained: Whether they were learned.
         note: Description for labels.

@@ -83,13 +83,6 @@ class FixerSettings(Part):
         return False
 
     @property
-    def keeps_appearance(self) -> bool:
-        """Whether the output is meant to look like the render; a fixer asked for another appearance
-        changes every pixel.
-        """
-        return True
-
-    @property
     def unit(self) -> Unit | None:
         """What the fixer makes at a time and what that costs, for tables; None where it does not
         say.
@@ -125,7 +118,7 @@ class WeightsSettings(Part):
     decoder: str | None = Field(default=None, description="The tiny Wan decoder.")
     prompt: str | None = Field(
         default=None,
-        description="Safetensors with 'text' (tokens, text_width), or with a prompt under each name.",
+        description="Safetensors with 'text' (tokens, text_width).",
     )
     sha256: DigestSettings = Field(
         default=DigestSettings(), description="Expected digests by the keys above."

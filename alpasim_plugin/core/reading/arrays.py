@@ -83,17 +83,3 @@ def read_metadata(
     check_regular(path, WEIGHT_BYTES)
     with parsing(path, do_this, "not safetensors"), safe_open(path, framework="np") as file:
         return dict(file.metadata() or {})
-
-
-def read_weight_names(path: str | Path) -> list[str]:
-    """Return the names of the tensors in a safetensors file, of its header alone; see
-    `read_metadata`.
-    """
-    from safetensors import safe_open
-
-    check_regular(path, WEIGHT_BYTES)
-    with (
-        parsing(path, "give a whole .safetensors file", "not safetensors"),
-        safe_open(path, framework="np") as file,
-    ):
-        return list(file.keys())
