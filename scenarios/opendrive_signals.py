@@ -27,6 +27,7 @@ from scenarios.street_map import Head
 
 PEDESTRIAN_LIGHT = "1000002"
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
+LOWEST_HEAD_M = 2.2  # of the middle of the lamps above the road, where the map has them lower
 PLATE_M = 0.1  # what is lower than this is painted on the road
 
 
@@ -112,6 +113,9 @@ def _heads(
                 ends, _heading_rad(road, s_m, along, T_local_map), (), 0, one.signal_id,
                 tuple(key for key, _, _ in held),
             )  # fmt: skip
+        place = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
+        place[2] += max(one.above_m + one.height_m / 2, LOWEST_HEAD_M)
+        signal = replace(signal, head=place)
         group = controllers.get(one.signal_id, f"road {road.road_id}")
         heads.append(Head(signal, junction, group, road.road_id))
     return heads

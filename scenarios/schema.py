@@ -86,6 +86,10 @@ class EnvironmentSpec(Part):
         le=100_000,
         description="Distance at which fog leaves 2 % of a contrast.",
     )
+    time: Literal["day", "low_sun", "night"] = Field(
+        default="day", description="Light: of day, of a low sun ahead, or of lamps."
+    )
+    rain: float = Field(default=0.0, ge=0, le=200, description="Rain, mm/h; 0: dry.")
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -462,7 +466,9 @@ class ScenarioSpec(Part):
             built = {
                 "degradation": self.degradation,
                 "background": self.background,
-                "environment": self.environment.model_copy(update={"fog_visibility_m": None}),
+                "environment": self.environment.model_copy(
+                    update={"fog_visibility_m": None, "time": "day", "rain": 0.0}
+                ),
             }
             fields = type(self).model_fields
             given = [key for key, value in built.items() if value != fields[key].default]

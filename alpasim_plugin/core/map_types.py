@@ -69,6 +69,7 @@ class Signal:
     name: str = ""
     lanes: tuple[str, ...] = ()  # that it holds back, or that people cross
     pedestrians: bool = False  # it holds back people who cross, and no vehicle
+    head: F64 | None = None  # (3,) metres, world: the middle of its lamps; None: not known
 
     def colour_at(self, t_us: int) -> str:
         """Return the colour at a time.

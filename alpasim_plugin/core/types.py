@@ -368,7 +368,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class Environment:
-    """What is built around the road when a scene is dressed in Gaussians."""
+    """What is built around the road when a scene is dressed in Gaussians, and its weather."""
 
     buildings: float = 0.7  # share of free roadside frontage covered by facades, 0..1
     building_height_m: tuple[float, float] = (6.0, 18.0)
@@ -379,6 +379,13 @@ class Environment:
     fog_visibility_m: float | None = (
         None  # distance at which 2 % of a contrast is left; None: clear
     )
+    time: Literal["day", "low_sun", "night"] = "day"
+    rain: float = 0.0  # mm/h
+
+    @property
+    def in_clear_day(self) -> Environment:
+        """Return the same surroundings without weather: what is built and reconstructed."""
+        return replace(self, fog_visibility_m=None, time="day", rain=0.0)
 
 
 @dataclass(frozen=True)

@@ -30,4 +30,4 @@ def make_renderer(
     renderer: Renderer = build(
         unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads
     )
-    return in_weather(renderer, scenario.environment)
+    return in_weather(renderer, scenario, seed)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -77,7 +76,7 @@ def scene_key(scenario: Scenario) -> str:
         scenario.scene_id,
         scenario.seed,
         scenario.content_hash,
-        replace(scenario.environment, fog_visibility_m=None),
+        scenario.environment.in_clear_day,
         scenario.background,
         scenario.vehicle.box,
     ):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,7 +130,6 @@ _NO_MATTER = frozenset(
         "warmup_us",
         "latency",
         "degradation",
-        "fog_visibility_m",
         "world_origin",
         "content_hash",
         "notes",
@@ -157,7 +156,8 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
         InputError: The scenario's background file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
-    content = [package_digest(), _content(recipe), _content(scenario)]
+    clear = replace(scenario, environment=scenario.environment.in_clear_day)
+    content = [package_digest(), _content(recipe), _content(clear)]
     digest.update(json.dumps(content, sort_keys=True).encode())
     if scenario.background is not None:
         digest.update(bytes.fromhex(file_sha256(scenario.background.path)))

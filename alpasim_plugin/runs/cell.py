@@ -421,7 +421,7 @@ def _renderer_of_pinholes(
 ) -> Renderer:
     session = {"seed": seed, "device": device, "threads": threads}
     built: Renderer = build(spec.base, scenario=scenario, **session)
-    base = in_weather(built, scenario.environment)
+    base = in_weather(built, scenario, seed)
     if spec.fixer is None:
         return base
     from alpasim_plugin.fixers.loop import fixed_renderer

@@ -1,42 +1,81 @@
-"""Fog: its transmittance at known distances, what it does to images, and who is shown it."""
+"""Weather: what distance, water and lamps do to light, and who is shown it."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from alpasim_plugin import load_scenario, make_renderer
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import Frame
+from alpasim_plugin.core.types import Actor, Box, Frame, Signal, Trajectory
 from alpasim_plugin.renderers import weather
 from alpasim_plugin.renderers.gaussian import clear_cache
-from alpasim_plugin.renderers.weather import FogRenderer, in_fog, transmittance
+from alpasim_plugin.renderers.lights import STREET_CD, SceneLights, drawn
+from alpasim_plugin.renderers.rain import mirrored_share, streaks, wet_albedo
+from alpasim_plugin.renderers.view import view_of
+from alpasim_plugin.renderers.weather import Moment, Weather, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
+from alpasim_plugin.world.ground import flat
 
 K = np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]])
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+RIG = np.eye(4)
+GREY = np.full((60, 100, 3), 120, np.uint8)
 
 
 def depth_of_wall(distance_m):
     return np.full((60, 100), distance_m, np.float32)
 
 
+def depth_of_road():
+    """Level ground 1.5 m below the camera, and sky."""
+    rows = (np.arange(60) + 0.5 - 30) / 100
+    depth = np.where(rows > 0, 1.5 / np.maximum(rows, 1e-6), 0).astype(np.float32)
+    return np.repeat(depth[:, None], 100, axis=1)
+
+
+def view(depth):
+    return view_of(depth, K, AHEAD, flat())
+
+
+def scene(*overrides, actors=(), signals=None):
+    loaded = load_scenario("smoke/straight", overrides=[f"environment.{one}" for one in overrides])
+    return replace(
+        loaded, ground=flat(), actors=actors, lane_map=replace(loaded.lane_map, signals=signals)
+    )
+
+
+def shown(scenario, depth, rgb=GREY, actors=None, t_us=0):
+    moment = Moment(t_us, "front", RIG, actors or {})
+    return Weather(scenario, 0).shown(rgb, depth, K, AHEAD, moment)
+
+
 @pytest.mark.parametrize("distance_m", [5.0, 20.0, 60.0, 150.0])
-def test_transmittance_falls_by_the_distance_along_the_ray(distance_m):
-    found = transmittance(depth_of_wall(distance_m), K, AHEAD, 120.0)
+@pytest.mark.parametrize(
+    ("overrides", "per_m"),
+    [
+        (("fog_visibility_m=120",), 3.912 / 120),
+        (("rain=25",), 1.076 * 25**0.67 / 4343),
+        (("fog_visibility_m=120", "rain=25"), 3.912 / 120 + 1.076 * 25**0.67 / 4343),
+    ],
+)
+def test_transmittance_falls_by_the_distance_along_the_ray(distance_m, overrides, per_m):
+    found = Weather(scene(*overrides), 0).transmittance(view(depth_of_wall(distance_m)))
     for row, column in ((30, 50), (0, 0), (59, 99)):
         ray = np.array([(column + 0.5 - 50) / 100, (row + 0.5 - 30) / 100, 1.0])
-        due = np.exp(-3.912 / 120.0 * distance_m * np.linalg.norm(ray))
+        due = np.exp(-per_m * distance_m * np.linalg.norm(ray))
         assert found[row, column] == pytest.approx(due, rel=0.02)
 
 
 def test_fog_mixes_linear_light_and_hides_the_sky():
-    dark = np.zeros((60, 100, 3), np.uint8)
+    scenario = scene("fog_visibility_m=100")
     depth = depth_of_wall(50.0)
     depth[:20] = 0
-    found = in_fog(dark, depth, K, AHEAD, 100.0)
+    found = shown(scenario, depth, np.zeros_like(GREY))
     assert (found[:20] == weather.FOG_SRGB).all()
-    through = transmittance(depth, K, AHEAD, 100.0)[40, 50]
+    through = Weather(scenario, 0).transmittance(view(depth))[40, 50]
     fog = ((np.array(weather.FOG_SRGB) / 255 + 0.055) / 1.055) ** 2.4
     due = 255 * (1.055 * (fog * (1 - through)) ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(found[40, 50], due, atol=1.0)
@@ -45,9 +84,143 @@ def test_fog_mixes_linear_light_and_hides_the_sky():
 def test_a_hole_in_the_ground_is_as_far_as_the_ground_around_it():
     depth = depth_of_wall(10.0)
     depth[45:50, 40:60] = 0
-    found = transmittance(depth, K, AHEAD, 100.0)
+    found = view(depth).distance_m
     assert found[47, 50] == pytest.approx(found[44, 50], rel=0.02)
-    assert not transmittance(depth_of_wall(0.0), K, AHEAD, 100.0).any()
+    assert np.isinf(view(depth_of_wall(0.0)).distance_m).all()
+
+
+def test_ground_that_a_model_shows_too_near_is_put_on_the_ground():
+    true, near = view(depth_of_road()), view(0.9 * depth_of_road())
+    below = slice(36, None)
+    assert (true.ground[below] == 1).all()
+    assert (near.ground[below] == 1).all()
+    assert np.abs(near.points[below, :, 2] + 1.5).max() < 1e-3
+    assert not view(depth_of_wall(20.0)).ground[:31].any()
+
+
+def test_wet_ground_is_darker_and_a_mirror_at_grazing_angles():
+    dry = np.linspace(0, 1, 11, dtype=np.float32)
+    wet = wet_albedo(dry)
+    assert wet[0] == 0
+    assert (np.diff(wet) > 0).all()
+    assert (wet[1:-1] < dry[1:-1]).all()
+    assert wet_albedo(np.float32(0.2)) == pytest.approx(0.109, abs=0.002)  # by hand
+    steep, grazing = mirrored_share(np.array([1.0, 0.05], np.float32))
+    assert grazing > 20 * steep
+    road = shown(scene("rain=10"), depth_of_road())
+    assert road[55].mean() < GREY.mean() - 15
+
+
+def test_drops_are_drawn_by_their_stream_and_by_the_rate():
+    down = np.array([0.0, 1.0, 0.0])
+    once, again, other = (
+        streaks((60, 100), K, down, 20.0, np.random.default_rng(key)) for key in (1, 1, 2)
+    )
+    assert np.array_equal(once, again)
+    assert not np.array_equal(once, other)
+    heavy = streaks((60, 100), K, down, 80.0, np.random.default_rng(1))
+    assert 0 < once.mean() < heavy.mean() < 0.2
+    assert heavy.max() <= 1
+    scenario = scene("rain=20")
+    first, same, later = (shown(scenario, depth_of_road(), t_us=t) for t in (0, 0, 100_000))
+    assert np.array_equal(first, same)
+    assert not np.array_equal(first, later)
+
+
+def test_a_street_lamp_lights_by_cosine_over_the_square_of_the_distance():
+    scenario = scene("time=night")
+    lamps = SceneLights(scenario, is_night=True)
+    assert len(lamps.street)
+    assert len(lamps.windows)
+    lamps.street = np.array([[10.0, 0.0, 6.0]])
+    seen = view(depth_of_road())
+    far_away = np.eye(4)
+    far_away[0, 3] = 1e4  # the ego's own beams light nothing here
+    lux = lamps.lux(seen, far_away, {})
+    d = seen.points - np.array([10.0, 0.0, 4.5])
+    r = np.linalg.norm(d, axis=2)
+    np.testing.assert_allclose(lux[40:], (STREET_CD * -d[..., 2] / r**3)[40:], rtol=0.01)
+    assert not lux[:30].any()
+
+
+def test_night_is_dark_but_for_the_beams_of_the_ego():
+    lamps = Weather(scene("time=night", "poles_spacing_m=0", "buildings=0"), 0)
+    moment = Moment(0, "front", RIG, {})
+    road = lamps.shown(GREY, depth_of_road(), K, AHEAD, moment).astype(float).mean(axis=2)
+    assert road[:30].max() < 60
+    assert GREY.mean() > road[40].max() > road[40, 0] + 5
+    wall = lamps.shown(GREY, depth_of_wall(10.0), K, AHEAD, moment).astype(float).mean(axis=2)
+    assert wall[38, 50] > 2 * wall[20, 50]  # the upper edge of a low beam
+
+
+def car(heading_x, is_static=False):
+    pose = np.eye(4)
+    pose[:3, 3] = 15.0, 0.0, 0.75
+    pose[:2, :2] *= heading_x
+    track = Trajectory(np.array([0, 1]), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    return Actor("car", "car", Box(4.5, 1.8, 1.5), track, is_static), {"car": pose}
+
+
+@pytest.mark.parametrize(("heading_x", "is_red"), [(1.0, True), (-1.0, False)])
+def test_lamps_of_road_users_are_red_from_behind_and_white_from_ahead(heading_x, is_red):
+    actor, poses = car(heading_x)
+    none = ("time=night", "poles_spacing_m=0", "buildings=0")
+    image = shown(scene(*none, actors=(actor,)), depth_of_wall(13.0), actors=poses).astype(int)
+    brightest = image.reshape(-1, 3)[image.max(axis=2).argmax()]
+    assert brightest[0] == 255
+    assert (brightest[2] < 120) == is_red
+    hidden = shown(scene(*none, actors=(actor,)), depth_of_wall(8.0), actors=poses)
+    assert hidden.max() < 255
+    parked, _ = car(heading_x, is_static=True)
+    assert not np.array_equal(
+        shown(scene(*none, actors=(parked,)), depth_of_wall(13.0), actors=poses), image
+    )
+
+
+def test_a_low_sun_ahead_veils_the_image_unless_it_is_hidden():
+    scenario = scene("time=low_sun")
+    weather_ = Weather(scenario, 0)
+    to_camera = np.eye(4)
+    heading = scenario.ego_log.quat[0]
+    yaw = 2 * np.arctan2(heading[3], heading[0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    to_camera[:2, :2] = [[c, -s], [s, c]]
+    pose = to_camera @ AHEAD
+    moment = Moment(0, "front", RIG, {})
+    open_sky, walled = (
+        weather_.shown(GREY, depth, K, pose, moment).astype(int)
+        for depth in (depth_of_wall(0.0), depth_of_wall(20.0))
+    )
+    assert open_sky.max() == 255
+    assert open_sky[20, 20].mean() > walled[20, 20].mean() + 10
+    assert walled[..., 0].mean() > walled[..., 2].mean() + 15
+
+
+def signal(phases, heading_rad=0.0):
+    stop = np.array([[10.0, -2, 0], [10.0, 2, 0]])
+    return Signal(stop, heading_rad, phases, head=np.array([12.0, -2.0, 3.0]))
+
+
+@pytest.mark.parametrize(("t_us", "channel"), [(0, 0), (1_500_000, 1)])
+def test_a_traffic_light_shows_its_state_by_clear_day(t_us, channel):
+    phases = (("red", 1_000_000), ("green", 1_000_000))
+    scenario = scene(signals=(signal(phases),))
+    changed = shown(scenario, depth_of_wall(40.0), t_us=t_us).astype(int)
+    lit = changed[..., channel] - changed[..., 1 - channel] > 100
+    assert lit.any()
+    assert (changed == GREY).all(axis=2).mean() > 0.9
+    assert (changed.max(axis=2) < 40).any()  # the housing
+    away = scene(signals=(signal(phases, np.pi),))
+    assert (shown(away, depth_of_wall(40.0), t_us=t_us) == GREY).all()
+    assert (shown(scenario, depth_of_wall(5.0), t_us=t_us) == GREY).all()
+
+
+def test_panels_behind_the_camera_are_not_drawn():
+    lamps = SceneLights(scene(signals=(signal((("red", 1),)),)), is_night=False)
+    seen = view(depth_of_wall(0.0))
+    panels = lamps.panels(seen, {}, 0)
+    _, depth = drawn(replace(panels, corners=panels.corners - [30.0, 0, 0]), seen)
+    assert np.isinf(depth).all()
 
 
 @pytest.mark.parametrize("renderer", ["clean", "onefixer"])  # the fixer repairs what 3dgs shows
@@ -68,23 +241,37 @@ def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer):
     clear_cache()
 
 
-def test_a_renderer_without_depth_cannot_be_put_into_fog():
-    scenario = load_scenario("smoke/curve")
-    request = frame_request(scenario, 32, 16)
+class Flat:
+    lookahead = 0
+    block = None
+    has_history = False
 
-    class Flat:
-        lookahead = 0
-        block = None
-        has_history = False
+    def render(self, request):
+        return Frame(request.t_us, request.camera.name, np.zeros((16, 32, 3), np.uint8))
 
-        def render(self, request):
-            return Frame(request.t_us, request.camera.name, np.zeros((16, 32, 3), np.uint8))
 
+def test_a_renderer_without_depth_cannot_be_put_into_weather():
+    clear = scene()
+    assert type(in_weather(Flat(), clear, 0)) is Flat
+    request = frame_request(clear, 32, 16)
     with pytest.raises(RendererError):
-        FogRenderer(Flat(), 100.0).render(request)
+        in_weather(Flat(), scene("time=night"), 0).render(request)
+    with_signal = scene(signals=(signal((("red", 1),)),))
+    assert not in_weather(Flat(), with_signal, 0).render(request).rgb.any()
 
 
-@pytest.mark.parametrize("visibility_m", ["0", "-5", "nan", "thick"])
-def test_a_visibility_that_is_none_is_refused(visibility_m):
+@pytest.mark.parametrize(
+    "given",
+    [
+        "fog_visibility_m=0",
+        "fog_visibility_m=nan",
+        "fog_visibility_m=thick",
+        "time=noon",
+        "rain=-1",
+        "rain=nan",
+        "rain=heavy",
+    ],
+)
+def test_weather_that_is_none_is_refused(given):
     with pytest.raises(InputError):
-        load_scenario("smoke/curve", overrides=[f"environment.fog_visibility_m={visibility_m}"])
+        load_scenario("smoke/curve", overrides=[f"environment.{given}"])

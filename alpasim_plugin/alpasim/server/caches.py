@@ -223,7 +223,7 @@ class SceneCache:
         renderer, references = None, None
         if self._spec is not None:
             built = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
-            renderer = in_weather(built, scenario.environment)
+            renderer = in_weather(built, scenario, self._session["seed"])
             settings = self._spec.fixer and self._spec.fixer.settings
             recorded = (
                 renderer.recorded()

@@ -32,6 +32,7 @@ FLOOR_M, BAY_M = 3.1, 3.0
 WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
+LIT_SHARE = 0.3  # of windows at night
 # Cells per bay and floor, and the cell size at which the level is chosen. Each level is the average
 # of the first.
 CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))
@@ -145,6 +146,24 @@ def place_houses(site: Site) -> Houses:
     if not fronts:
         return Houses(np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros(0))
     return Houses(np.stack(fronts), np.stack(aways), np.array(heights))
+
+
+def lit_windows(site: Site, houses: Houses) -> F64:
+    """Return the corners ``(N, 4, 3)`` of the windows above shops that have light at night."""
+    right, left = houses.front[:, 0], houses.front[:, 1]
+    bays = cell_counts(np.linalg.norm(left - right, axis=1), BAY_M)
+    floors = cell_counts(houses.height_m, FLOOR_M)
+    house, u, v = grid_cells(bays, floors)
+    is_lit = (site.rng("lit-windows").random(len(house)) < LIT_SHARE) & (v * floors[house] > 1)
+    house, u, v = house[is_lit], u[is_lit], v[is_lit]
+    foot = np.minimum(site.world(right)[:, 2], site.world(left)[:, 2])
+    corners = []
+    for bay, floor in ((-0.17, -0.17), (0.33, -0.17), (0.33, 0.33), (-0.17, 0.33)):
+        across = (u + bay / bays[house])[:, None]
+        plan = right[house] + across * (left - right)[house] - 0.05 * houses.away[house]
+        height_m = (v + floor / floors[house]) * (houses.height_m[house] + 0.2) - 0.2
+        corners.append(np.column_stack([site.frame.to_world(plan), foot[house] + height_m]))
+    return np.stack(corners, axis=1)
 
 
 def _claim(free: U8, ring: F64, site: Site) -> bool:

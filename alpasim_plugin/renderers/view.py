@@ -1,0 +1,90 @@
+"""An image's depth as directions and distances from the camera, and what of it is ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.types import F32, F64, HeightField
+from alpasim_plugin.world.ground import height_at
+
+# What is less than this above the ground, and so much more with distance, is ground that the model
+# shows too near; what is twice as high is none.
+GROUND_M, GROUND_PER_M = 0.25, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees.
+
+    Attributes:
+        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        T_world_camera: ``(4, 4)`` its pose.
+        rays: ``(H, W, 3)`` unit, world.
+        depth_m: ``(H, W)`` along the optical axis; infinite in the sky.
+        distance_m: ``(H, W)`` along the rays; infinite in the sky.
+        ground: ``(H, W)`` how much a pixel belongs to the ground, 0 to 1.
+        points: ``(H, W, 3)`` world, relative to the camera; on the ground where they belong to it, 0
+            in the sky.
+    """
+
+    K: F64
+    T_world_camera: F64
+    rays: F32
+    depth_m: F32
+    distance_m: F32
+    ground: F32
+    points: F32
+
+    @property
+    def place(self) -> F64:
+        """Return the camera's position ``(3,)``, world."""
+        return self.T_world_camera[:3, 3]
+
+
+def view_of(depth: F32, K: F64, T_world_camera: F64, ground: HeightField) -> View:
+    """Return the view of a depth image.
+
+    Args:
+        depth: ``(H, W)`` metres along the optical axis; 0 where there is no surface. Above the
+            horizon that is the sky; below it is a hole of the model, which is as far away as the
+            nearest surface in the image.
+        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        T_world_camera: ``(4, 4)`` its pose.
+        ground: Heights of the ground.
+    """
+    height, width = depth.shape
+    local = np.ones((height, width, 3), np.float32)
+    local[..., 0] = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    local[..., 1] = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
+    along = np.sqrt(np.einsum("...i,...i->...", local, local))
+    rays = (local / along[..., None]) @ T_world_camera[:3, :3].T.astype(np.float32)
+    filled = _nearest_surface(depth)
+    is_sky = (filled == 0) | ((depth == 0) & (rays[..., 2] > 0))
+    depth_m = np.where(is_sky, np.float32(np.inf), filled)
+    distance_m = depth_m * along
+    points = rays * np.where(is_sky, np.float32(0), distance_m)[..., None]
+    is_low = ~is_sky & (rays[..., 2] < 0)
+    low = points[is_low] + T_world_camera[:3, 3]
+    above_m = low[:, 2] - height_at(ground, low)
+    limit_m = GROUND_M + GROUND_PER_M * distance_m[is_low]
+    belongs = np.zeros(depth.shape, np.float32)
+    belongs[is_low] = np.clip(2 - above_m / limit_m, 0, 1)
+    points[is_low, 2] -= belongs[is_low] * above_m
+    return View(K, T_world_camera, rays, depth_m, distance_m, belongs, points)
+
+
+def _nearest_surface(depth: F32) -> F32:
+    """Return a depth image with holes filled by the nearest pixel that has a surface."""
+    surfaces = np.flatnonzero(depth)
+    if surfaces.size in (0, depth.size):
+        return depth
+    holes = (depth == 0).astype(np.uint8)
+    _, labels = cv2.distanceTransformWithLabels(
+        holes, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, np.float32)
+    of_label[labels.reshape(-1)[surfaces]] = depth.reshape(-1)[surfaces]
+    return of_label[labels]
