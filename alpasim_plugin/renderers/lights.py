@@ -1,28 +1,26 @@
 """What shines in a scene: street lamps, lit windows, lamps of road users and of traffic lights.
 
 A lamp lights what is around it by its intensity over the square of the distance; it casts no
-shadow. What is seen of it is a panel, a small square of one colour that hides and is hidden by
-depth.
+shadow. What is seen of it is a spot of one colour, which depth hides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.types import F32, F64, Scenario, Signal
+from alpasim_plugin.core.types import F32, F64, Scenario
 from alpasim_plugin.gaussians.scene.build_facades import lit_windows, place_houses
 from alpasim_plugin.gaussians.scene.build_street import lamp_posts
 from alpasim_plugin.gaussians.scene.site import make_site, path_of, section_of
 from alpasim_plugin.renderers.view import View
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, height_at
 
-SIGHT_M, BEAM_M = 150.0, 80.0
-NEAREST_M = 0.3
+SIGHT_M, NEAREST_M = 150.0, 0.3
 STREET_CD = 1000.0
 HEAD_CD = 20_000.0  # both low beams of a vehicle
 # Tangents: where a beam has fallen to 1/e sideways and below, its upper edge (ECE R112), and how
@@ -38,205 +36,139 @@ HEAD_RGB = (8.0, 8.0, 7.4)
 TAIL_RGB = (1.5, 0.03, 0.02)
 SIGNAL_RGB = {"red": (2.0, 0.04, 0.02), "yellow": (2.0, 1.0, 0.0), "green": (0.0, 1.8, 0.7)}
 DARK_RGB = (0.01, 0.01, 0.01)
-SUBPIXEL_BITS = 4
+SIGNAL_STEP_M = 0.35  # between the lamps of a traffic light
+SUBPIXEL_BITS = 4  # sixteenths
 
 
 @dataclass(frozen=True, eq=False)
-class Panels:
-    """Squares that shine: corners ``(N, 4, 3)``, metres, world, and linear colours ``(N, 3)``."""
+class Spot:
+    """A square that shines to one side, ``facing (3,)``, or to all sides if that is 0."""
 
-    corners: F64
-    rgb: F64
-
-    @classmethod
-    def facing(
-        cls, middle: F64, half_m: float, rgb: tuple[float, float, float], eye: F64
-    ) -> Panels:
-        """Return upright squares that face a camera."""
-        towards = eye - middle
-        across = np.cross(towards, [0.0, 0.0, 1.0])
-        across *= half_m / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-        up = np.array([0.0, 0.0, half_m])
-        corners = np.stack([-across - up, across - up, across + up, -across + up], axis=1)
-        return cls(middle[:, None] + corners, np.tile(rgb, (len(middle), 1)))
-
-    @classmethod
-    def joined(cls, parts: list[Panels]) -> Panels:
-        """Return the panels of all parts."""
-        none = cls(np.zeros((0, 4, 3)), np.zeros((0, 3)))
-        together = [none, *parts]
-        return cls(
-            np.concatenate([one.corners for one in together]),
-            np.concatenate([one.rgb for one in together]),
-        )
+    middle: F64  # (3,) metres, world
+    facing: F64
+    half_m: float
+    rgb: tuple[float, float, float]
 
 
 class SceneLights:
-    """The lamps of a scene.
+    """The lamps of a scene at night; by day, traffic lights alone shine.
 
-    Args:
-        scenario: A scene; of an imported drive, whose houses are not known, only road users and the
-            ego shine.
-        is_night: By day, traffic lights alone shine.
+    Of a scene whose street was not built, lamps and windows are not known.
     """
 
-    def __init__(self, scenario: Scenario, *, is_night: bool) -> None:
-        self.scenario, self.is_night = scenario, is_night
-        self.actors = {actor.actor_id: actor for actor in scenario.actors}
-        self.street, self.windows = np.zeros((0, 3)), np.zeros((0, 4, 3))
-        if is_night and scenario.model is None and scenario.background is None:
-            self.street, self.windows = _roadside(scenario)
-        vehicle = scenario.vehicle
-        front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-        self.T_rig_lamp = np.eye(4)
-        self.T_rig_lamp[:3, 3] = front_m, 0.0, LAMP_HEIGHT_M
+    def __init__(self, scenario: Scenario) -> None:
+        self.signals = [s for s in scenario.lane_map.signals or () if s.head is not None]
+        self.is_night = scenario.environment.time == "night"
+        self.tips = np.zeros((0, 3))
+        self.windows: list[Spot] = []
+        if self.is_night and scenario.model is None and scenario.background is None:
+            self.tips, self.windows = _roadside(scenario)
+        driven = [one for one in scenario.actors if one.label in WITH_LAMPS and not one.is_static]
+        self.boxes = {one.actor_id: one.box for one in driven}
+        self.ego_front_m = (
+            scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
+        )
 
-    def lux(self, view: View, T_world_rig: F64, actors: Mapping[str, F64]) -> F32:
-        """Return the light ``(H, W)``, lux, that lamps throw on what a camera sees."""
+    def lux(self, view: View, T_world_rig: F64) -> F32:
+        """Return the light ``(H, W)``, lux, that street lamps and the ego's beams throw on what a
+        camera sees.
+        """
+        total = np.zeros(view.ground.shape, np.float32)
         is_surface = np.isfinite(view.distance_m)
-        points, ground = view.points[is_surface], view.ground[is_surface]
-        lux = np.zeros(len(points), np.float32)
-        for tip in _near(self.street, view.place):
-            lux += _street_lux(points - (tip - view.place).astype(np.float32))
-        beams = [T_world_rig @ self.T_rig_lamp]
-        beams += [T @ self._T_box_lamp(name, 1) for name, T in self._lit(actors).items()]
-        for T_world_lamp in beams:
-            offset = T_world_lamp[:3, 3] - view.place
-            if np.linalg.norm(offset) < SIGHT_M:
-                from_lamp = points - offset.astype(np.float32)
-                local = from_lamp @ T_world_lamp[:3, :3].astype(np.float32)
-                lit = np.flatnonzero((local[:, 0] > NEAREST_M) & (local[:, 0] < BEAM_M))
-                lux[lit] += _beam_lux(local[lit], from_lamp[lit, 2], ground[lit])
-        total = np.zeros(is_surface.shape, np.float32)
+        points = view.points[is_surface]
+        beam = view.place - _moved(T_world_rig, self.ego_front_m, LAMP_HEIGHT_M)[:3, 3]
+        lux = _beam_lux(points + beam, T_world_rig[:3, :3], view.ground[is_surface])
+        for tip in self.tips[np.linalg.norm(self.tips - view.place, axis=1) < SIGHT_M]:
+            lux += _street_lux(points + (view.place - tip))
         total[is_surface] = lux
         return total
 
-    def panels(self, view: View, actors: Mapping[str, F64], t_us: int) -> Panels:
-        """Return what is seen of the lamps."""
-        signals = self._signals(view, t_us)
+    def spots(self, actors: Mapping[str, F64], t_us: int) -> list[Spot]:
+        """Return what is seen of the lamps but for windows, and of the dark lamps of traffic
+        lights.
+        """
+        spots = []
+        for signal in self.signals:
+            facing = -np.array([np.cos(signal.heading_rad), np.sin(signal.heading_rad), 0.0])
+            state = signal.colour_at(t_us).split("_")
+            for row, (colour, rgb) in enumerate(SIGNAL_RGB.items()):
+                middle = signal.head + np.array([0.0, 0.0, (1 - row) * SIGNAL_STEP_M])
+                shown = rgb if colour in state else DARK_RGB
+                spots.append(Spot(middle, facing, SIGNAL_STEP_M / 2, shown))
         if not self.is_night:
-            return Panels.joined(signals)
-        windows = self.windows[np.linalg.norm(self.windows[:, 0] - view.place, axis=1) < SIGHT_M]
-        parts = [
-            *signals,
-            Panels(windows, np.tile(WINDOW_RGB, (len(windows), 1))),
-            Panels.facing(_near(self.street, view.place), 0.25, STREET_RGB, view.place),
-        ]
-        for name, T in self._lit(actors).items():
+            return spots
+        spots += [Spot(tip, np.zeros(3), 0.25, STREET_RGB) for tip in self.tips]
+        for name in self.boxes.keys() & actors.keys():
+            box, T = self.boxes[name], actors[name]
             for end, rgb in ((1, HEAD_RGB), (-1, TAIL_RGB)):
-                T_world_lamp = T @ self._T_box_lamp(name, end)
-                if (view.place - T_world_lamp[:3, 3]) @ T_world_lamp[:3, 0] * end > 0:
-                    aside = 0.36 * self.actors[name].box.width_m * T_world_lamp[:3, 1]
-                    both = T_world_lamp[:3, 3] + np.stack([-aside, aside])
-                    parts.append(Panels.facing(both, 0.09, rgb, view.place))
-        return Panels.joined(parts)
-
-    def _signals(self, view: View, t_us: int) -> list[Panels]:
-        """Return the housings and the lit lamps of the traffic lights that face a camera."""
-        parts: list[Panels] = []
-        for signal in self.scenario.lane_map.signals or ():
-            if signal.head is not None and np.linalg.norm(signal.head - view.place) < SIGHT_M:
-                parts += _signal_panels(signal, signal.head, t_us, view.place)
-        return parts
-
-    def _lit(self, actors: Mapping[str, F64]) -> Mapping[str, F64]:
-        """Return the poses of the road users whose lamps are on; who is parked has none."""
-        return {
-            name: T
-            for name, T in actors.items()
-            if name in self.actors
-            and self.actors[name].label in WITH_LAMPS
-            and not self.actors[name].is_static
-        }
-
-    def _T_box_lamp(self, name: str, end: int) -> F64:
-        """Return the middle between the lamps at the front (1) or the rear (-1) of a vehicle."""
-        box = self.actors[name].box
-        T = np.eye(4)
-        T[0, 3] = end * (box.length_m / 2 + 0.02)
-        T[2, 3] = LAMP_HEIGHT_M - box.height_m / 2
-        return T
+                middle = _moved(T, end * box.length_m / 2, LAMP_HEIGHT_M - box.height_m / 2)[:3, 3]
+                for aside_m in (-0.36 * box.width_m, 0.36 * box.width_m):
+                    spots.append(Spot(middle + aside_m * T[:3, 1], end * T[:3, 0], 0.09, rgb))
+        return spots
 
 
-def _roadside(scenario: Scenario) -> tuple[F64, F64]:
-    """Return the street lamps ``(N, 3)`` and the lit windows ``(M, 4, 3)`` of a built scene."""
+def _moved(T: F64, ahead_m: float, up_m: float) -> F64:
+    """Return a pose farther ahead and up in its own frame."""
+    moved = T.copy()
+    moved[:3, 3] += ahead_m * T[:3, 0] + up_m * T[:3, 2]
+    return moved
+
+
+def _roadside(scenario: Scenario) -> tuple[F64, list[Spot]]:
+    """Return the street lamps ``(N, 3)`` and the lit windows of a built scene."""
     metres = len(path_of(scenario))
-    sections: list[int | None] = [None]
-    if metres > BUILT_WHOLE_M:
-        sections = list(range(int(section_of(np.array(metres - 1))) + 1))
+    last = int(section_of(np.array(metres - 1)))
     tips, windows = [], []
-    for section in sections:
+    for section in range(last + 1) if metres > BUILT_WHOLE_M else (None,):
         site = make_site(scenario, partial(height_at, scenario.ground), section)
         houses = place_houses(site)
         posts = lamp_posts(site, houses)
         tips.append(posts.tip[site.owns(posts.plan)])
-        windows.append(lit_windows(site, houses))
-    return np.concatenate(tips), np.concatenate(windows)
+        half_m, places, facing = lit_windows(site, houses)
+        windows += [Spot(*one, half_m, WINDOW_RGB) for one in zip(places, facing, strict=True)]
+    return np.concatenate(tips), windows
 
 
-def _near(points: F64, place: F64) -> F64:
-    return points[np.linalg.norm(points - place, axis=1) < SIGHT_M]
-
-
-def _street_lux(from_lamp: F32) -> F32:
+def _street_lux(from_lamp: F64) -> F64:
     """Return the light of a street lamp at points ``(N, 3)`` relative to it."""
-    square = np.einsum("ni,ni->n", from_lamp, from_lamp) + np.float32(1e-3)
-    downward = np.maximum(-from_lamp[:, 2], 0) / np.sqrt(square)
-    return np.float32(STREET_CD) * downward / square
+    distance = np.linalg.norm(from_lamp, axis=1)
+    return STREET_CD * np.maximum(-from_lamp[:, 2], 0) / np.maximum(distance, 0.1) ** 3
 
 
-def _beam_lux(local: F32, upwards_m: F32, ground: F32) -> F32:
-    """Return the light of a vehicle's low beams; on the ground it falls aslant.
-
-    Args:
-        local: ``(N, 3)`` points in the lamp's frame, x ahead.
-        upwards_m: ``(N,)`` their heights above the lamp, world.
-        ground: ``(N,)`` how much they belong to the ground.
+def _beam_lux(from_lamp: F64, R_world_rig: F64, ground: F32) -> F64:
+    """Return the light of low beams at points ``(N, 3)`` relative to them; on the ground it falls
+    aslant.
     """
-    sideways, upwards = local[:, 1] / local[:, 0], local[:, 2] / local[:, 0]
+    local = from_lamp @ R_world_rig
+    ahead = np.maximum(local[:, 0], NEAREST_M)
+    sideways, upwards = local[:, 1] / ahead, local[:, 2] / ahead
     below = np.exp(-((upwards / BEAM_DEPTH) ** 2))
     above = np.exp(-np.maximum(upwards - CUT_OFF, 0) / EDGE) + ABOVE_CUT_OFF
     shape = np.exp(-((sideways / BEAM_WIDTH) ** 2)) * np.minimum(below, above)
-    square = np.einsum("ni,ni->n", local, local)
-    aslant = np.abs(upwards_m) / np.sqrt(square)
-    return np.float32(HEAD_CD) * shape * (1 - ground * (1 - aslant)) / np.maximum(square, 1)
+    distance = np.maximum(np.linalg.norm(local, axis=1), 1)
+    aslant = 1 - ground * (1 - np.abs(from_lamp[:, 2]) / distance)
+    return HEAD_CD * shape * aslant * (local[:, 0] > 0) / distance**2
 
 
-def _signal_panels(signal: Signal, head: F64, t_us: int, eye: F64) -> list[Panels]:
-    facing = -np.array([np.cos(signal.heading_rad), np.sin(signal.heading_rad), 0.0])
-    if (eye - head) @ facing <= 0:
-        return []
-    across = 0.2 * np.array([-facing[1], facing[0], 0.0])
-    up = np.array([0.0, 0.0, 0.55])
-    ring = head + np.stack([-across - up, across - up, across + up, -across + up])
-    housing = Panels(ring[None], np.array([DARK_RGB]))
-    lit = []
-    for colour in signal.colour_at(t_us).split("_"):
-        if colour in SIGNAL_RGB:
-            above_m = {"red": 0.35, "yellow": 0.0, "green": -0.35}[colour]
-            middle = head + 0.05 * facing + np.array([0.0, 0.0, above_m])
-            lit.append(Panels.facing(middle[None], 0.14, SIGNAL_RGB[colour], eye))
-    return [housing, *lit]
-
-
-def drawn(panels: Panels, view: View) -> tuple[F32, F32]:
-    """Draw panels, the nearest on top.
+def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
+    """Draw spots as upright rectangles, the nearest on top.
 
     Returns:
         Their colours ``(H, W, 3)``, and their depths ``(H, W)``, infinite where there is none.
     """
-    shape = view.distance_m.shape
-    light, front = np.zeros((*shape, 3), np.float32), np.full(shape, np.inf, np.float32)
-    R = view.T_world_camera[:3, :3]
-    local = (panels.corners - view.place) @ R  # (N, 4, 3) camera frame
-    nearest = local[..., 2].min(axis=1)
-    pixels = local @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = pixels[..., :2] / pixels[..., 2:] - 0.5
-    limit = 2.0 * max(shape)
-    seen = (nearest > NEAREST_M) & (np.abs(pixels).max(axis=(1, 2), initial=0) < limit)
-    for i in np.flatnonzero(seen)[np.argsort(-nearest[seen], kind="stable")]:
-        ring = np.rint(pixels[i] * (1 << SUBPIXEL_BITS)).astype(np.int32)
-        cv2.fillConvexPoly(light, ring, panels.rgb[i].tolist(), cv2.LINE_8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(front, ring, float(nearest[i]), cv2.LINE_8, SUBPIXEL_BITS)
+    light = np.zeros(view.rays.shape, np.float32)
+    front = np.full(view.depth_m.shape, np.inf, np.float32)
+    offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - view.place
+    local = offsets @ view.T_world_camera[:3, :3]
+    distance = np.linalg.norm(offsets, axis=1)
+    for i in np.argsort(-distance):
+        spot, depth = spots[i], float(local[i, 2])
+        facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
+        if depth < NEAREST_M or distance[i] > SIGHT_M or facing <= 0:
+            continue
+        centre = (view.K @ local[i] / depth)[:2] - 0.5
+        half = view.K[0, 0] * spot.half_m / depth * np.array([facing, 1.0])
+        low, high = (np.rint(16 * (centre + side * half)).astype(int).tolist() for side in (-1, 1))
+        cv2.rectangle(light, low, high, spot.rgb, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
+        cv2.rectangle(front, low, high, depth, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
     return light, front

@@ -11,7 +11,7 @@ the pixel's ray. Of fog ``beta = 3.912 / visibility``: at the visibility, 2 % of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -23,27 +23,28 @@ from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Frame, RecordedFrame, RenderRequest, Scenario
-from alpasim_plugin.renderers.lights import Panels, SceneLights, drawn
+from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn
 from alpasim_plugin.renderers.rain import extinction, mirrored_share, streaks, wet_albedo
 from alpasim_plugin.renderers.view import View, view_of
-from alpasim_plugin.world.ground import height_at
 
 KOSCHMIEDER = 3.912  # -ln(0.02)
 FOG_SRGB = (202, 206, 210)  # light of the air itself, by day
 STEPS = 4095  # of the table from linear light to bytes
-
-# by night, in lux: what a camera shows as white, and the light of the sky over a town
-NIGHT_WHITE_LUX, NIGHT_SKY_LUX = 6.0, 0.25
-BRIGHTEST = 3.0  # in white: what a camera compresses any light of lamps to
-NIGHT_RGB = np.array([0.8, 0.9, 1.25], np.float32)
+# At night, in lux: what a camera shows as white, and the light of the sky over a town; in white:
+# what it compresses any light of lamps to.
+WHITE_LUX, SKY_LUX, BRIGHTEST = 6.0, 0.25, 3.0
+LIGHT_RGB = {
+    "day": (1.0, 1.0, 1.0),
+    "low_sun": (1.0, 0.76, 0.54),  # about 3500 K
+    "night": tuple(share * SKY_LUX / WHITE_LUX for share in (0.8, 0.9, 1.25)),
+}
 LAMP_RGB = np.array([1.0, 0.88, 0.7], np.float32)
-LOW_SUN_RGB = np.array([1.0, 0.76, 0.54], np.float32)  # about 3500 K
-SUN_ELEVATION_RAD, SUN_RADIUS_DEG = np.radians(6.0), 0.7
-# Veiling light of a lens about the sun, in white times square degrees: a tenth of what Stiles and
-# Holladay found for the eye (CIE 146).
-VEIL_DEG2, VEIL_LEAST_DEG = 9.0, 1.5
-PANEL_M, PANEL_PER_M = 0.5, 0.03  # a lamp so much behind what is rendered is seen
-BLOOM_SHARE, BLOOM_WIDTHS = 0.3, 0.008  # of a lamp's light about it, and how far, in image widths
+SUN_TANGENT = 0.1  # of its height
+# Veiling light of a lens about the sun, in white times square degrees, about a tenth of what Stiles
+# and Holladay found for the eye (CIE 146).
+VEIL_DEG2 = 6.0
+SEEN_M, SEEN_PER_M = 0.5, 0.03  # a lamp so much behind what is rendered is seen
+GLOW_SHARE, GLOW_WIDTHS = 0.3, 0.008  # of a lamp's light about it, and how far, in image widths
 SMEAR_HEIGHTS = 0.06  # of a lamp's reflection on a rough wet road, in image heights
 
 
@@ -59,133 +60,6 @@ def _encoded(light: F64) -> F64:
 
 LIGHT_OF_BYTE = _linear(np.arange(256) / 255.0).astype(np.float32)
 BYTE_OF_STEP = np.rint(255 * _encoded(np.arange(STEPS + 1) / STEPS)).astype(np.uint8)
-AIR_RGB = LIGHT_OF_BYTE[list(FOG_SRGB)]
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """When an image was taken, by which camera, and what stood where: ``T_world_rig (4, 4)`` and
-    the boxes of road users.
-    """
-
-    t_us: int
-    camera: str
-    T_world_rig: F64
-    actors: Mapping[str, F64]
-
-
-class Weather:
-    """The weather of a scene.
-
-    Args:
-        scenario: Its ``environment``, and what shines there.
-        seed: The rollout's, of the drops.
-    """
-
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        self.scenario, self.seed = scenario, seed
-        self.environment = scenario.environment
-        self.is_clear = self.environment == self.environment.in_clear_day
-        self.is_night = self.environment.time == "night"
-        self.lights = SceneLights(scenario, is_night=self.is_night)
-        heading = scenario.ego_log.quat[0]
-        azimuth = 2 * np.arctan2(heading[3], heading[0])
-        level = np.cos(SUN_ELEVATION_RAD)
-        self.to_sun = np.array(
-            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(SUN_ELEVATION_RAD)]
-        )
-        skies = {"day": 1.0, "low_sun": LOW_SUN_RGB}
-        night = NIGHT_RGB * np.float32(NIGHT_SKY_LUX / NIGHT_WHITE_LUX)
-        self.sky_rgb = np.float32(skies.get(self.environment.time, night))
-
-    @property
-    def changes_images(self) -> bool:
-        """Whether an image shows anything of it."""
-        signals = self.scenario.lane_map.signals or ()
-        return not self.is_clear or any(signal.head is not None for signal in signals)
-
-    def shown(self, rgb: U8, depth: F32, K: F64, T_world_camera: F64, moment: Moment) -> U8:
-        """Return an image in this weather.
-
-        Args:
-            rgb: ``(H, W, 3)`` sRGB of the clear day.
-            depth: ``(H, W)`` metres along the optical axis; 0 where there is no surface.
-            K: ``(3, 3)`` intrinsics of the pinhole, pixels.
-            T_world_camera: ``(4, 4)`` its pose.
-            moment: What stood where.
-        """
-        view = view_of(depth, K, T_world_camera, self.scenario.ground)
-        rain = self.environment.rain
-        light = LIGHT_OF_BYTE[rgb]
-        if rain:
-            light += view.ground[..., None] * (wet_albedo(light) - light)
-        if self.is_night:
-            lux = self.lights.lux(view, moment.T_world_rig, moment.actors)
-            lamps = lux / np.float32(NIGHT_WHITE_LUX)
-            light *= self.sky_rgb + (lamps / (1 + lamps / BRIGHTEST))[..., None] * LAMP_RGB
-        else:
-            light *= self.sky_rgb
-        panels = self.lights.panels(view, moment.actors, moment.t_us)
-        if rain:
-            light += self._mirrored(view, panels)
-        glow = _draw_lamps(light, view, panels)
-        if not self.is_clear:
-            through = self.transmittance(view)[..., None]
-            light = light * through + AIR_RGB * self.sky_rgb * (1 - through)
-        if self.is_night:
-            light += glow
-        if self.environment.time == "low_sun":
-            light += self._sun(view)
-        if rain:
-            rng = stream(self.scenario.scene_id, self.seed, f"rain.{moment.camera}", moment.t_us)
-            down = -T_world_camera[2, :3]
-            covered = streaks(depth.shape, K, down, rain, rng)[..., None]
-            light += covered * (AIR_RGB * self.sky_rgb - light)
-        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)]
-
-    def transmittance(self, view: View) -> F32:
-        """Return the share of light ``(H, W)`` that reaches the camera; 0 from the sky."""
-        beta = extinction(self.environment.rain)
-        if self.environment.fog_visibility_m is not None:
-            beta += KOSCHMIEDER / self.environment.fog_visibility_m
-        is_sky = np.isinf(view.distance_m)
-        sky = np.float32(0 if beta else 1)
-        return np.where(
-            is_sky, sky, np.exp(np.where(is_sky, 0, view.distance_m) * -np.float32(beta))
-        )
-
-    def _mirrored(self, view: View, panels: Panels) -> F32:
-        """Return what wet ground reflects of the sky and, smeared, of lamps ``(H, W, 3)``."""
-        share = view.ground * mirrored_share(-view.rays[..., 2])
-        corners = panels.corners.copy()
-        foot = height_at(self.scenario.ground, corners.reshape(-1, 3)).reshape(-1, 4)
-        corners[..., 2] = 2 * foot - corners[..., 2]
-        lamps, _ = drawn(Panels(corners, panels.rgb), view)
-        lamps = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
-        return share[..., None] * (AIR_RGB * self.sky_rgb + lamps)
-
-    def _sun(self, view: View) -> F32:
-        """Return the sun ahead and its veil in the lens ``(H, W, 1)``, as much as is not hidden."""
-        cosine = np.clip(view.rays @ self.to_sun.astype(np.float32), -1, 1)
-        angle_deg = np.degrees(np.arccos(cosine))
-        about = angle_deg < 2 * SUN_RADIUS_DEG
-        if not about.any():
-            return np.zeros((*angle_deg.shape, 1), np.float32)
-        is_sky = np.isinf(view.distance_m)
-        seen = np.float32(is_sky[about].mean())
-        veil = seen * np.float32(VEIL_DEG2) / np.maximum(angle_deg, VEIL_LEAST_DEG) ** 2
-        return (veil + 10 * (is_sky & (angle_deg < SUN_RADIUS_DEG)))[..., None]
-
-
-def _draw_lamps(light: F32, view: View, panels: Panels) -> F32:
-    """Draw panels that nothing hides into an image, and return their glow."""
-    colours, depth = drawn(panels, view)
-    seen = depth < view.depth_m * (1 + PANEL_PER_M) + PANEL_M
-    seen &= np.isfinite(depth)
-    light[seen] = colours[seen]
-    colours[~seen] = 0
-    sigma = BLOOM_WIDTHS * light.shape[1]
-    return cv2.GaussianBlur(colours, (0, 0), sigma) * np.float32(BLOOM_SHARE)
 
 
 class WeatherRenderer(Renderer):
@@ -194,17 +68,24 @@ class WeatherRenderer(Renderer):
 
     Args:
         base: Its frames need depth.
-        weather: Of the scene.
+        scenario: Its ``environment``, and what shines there.
+        seed: The rollout's, of the drops.
 
     Raises:
         RendererError: A frame without depth.
     """
 
-    def __init__(self, base: Renderer, weather: Weather) -> None:
-        self.base, self.weather = base, weather
+    def __init__(self, base: Renderer, scenario: Scenario, seed: int) -> None:
+        self.base, self.scenario, self.seed = base, scenario, seed
         self.lookahead = base.lookahead
         self.block = base.block
         self.has_history = base.has_history
+        self.is_clear = scenario.environment == scenario.environment.in_clear_day
+        self.lights = SceneLights(scenario)
+        self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], np.float32)
+        self.air_rgb = LIGHT_OF_BYTE[list(FOG_SRGB)] * self.light_rgb
+        visibility_m = scenario.environment.fog_visibility_m or np.inf
+        self.extinction = KOSCHMIEDER / visibility_m + extinction(scenario.environment.rain)
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # that of the base
@@ -222,41 +103,96 @@ class WeatherRenderer(Renderer):
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the base renderer's recorded frames in the weather, with the ego where it was."""
-        return [
-            replace(frame, read=partial(_read_in, self.weather, frame))
-            for frame in self.base.recorded()
-        ]
+        return [replace(one, read=partial(self._read, one)) for one in self.base.recorded()]
 
     def facts(self) -> Mapping[str, Any]:
         """Return the base renderer's facts and the weather."""
-        environment = self.weather.environment
-        keys = ("fog_visibility_m", "time", "rain")
-        return {**self.base.facts(), **{key: getattr(environment, key) for key in keys}}
+        return {**self.base.facts(), "environment": asdict(self.scenario.environment)}
 
     def _shown(self, request: RenderRequest, frame: Frame) -> Frame:
-        if frame.depth is None and self.weather.is_clear:
+        if frame.depth is None and self.is_clear:
             return frame
         if frame.depth is None:
             raise RendererError(
                 f"weather over {type(self.base).__name__}: its frame has no depth",
-                "Drive by clear day (environment.time, rain, fog_visibility_m), or let the renderer return depth",
+                "Remove environment.time, rain and fog_visibility_m, or let the renderer return depth",
             )
-        camera, pose = request.camera, request.T_world_camera[-1]
-        T_world_rig = pose @ inverse(camera.T_rig_camera)
-        moment = Moment(request.t_us, camera.name, T_world_rig, request.actors)
-        return replace(
-            frame, rgb=self.weather.shown(frame.rgb, frame.depth, camera.K, pose, moment)
+        image, camera = (frame.rgb, frame.depth), request.camera
+        taken = RecordedFrame(
+            request.t_us,
+            camera.name,
+            camera.K,
+            request.T_world_camera[-1],
+            request.actors,
+            lambda: image,
         )
+        return replace(frame, rgb=self._read(taken)[0])
+
+    def _read(self, frame: RecordedFrame) -> tuple[U8, F32]:
+        """Return an image in this weather, and its depth."""
+        rgb, depth = frame.read()
+        environment = self.scenario.environment
+        view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground)
+        cameras = {one.name: one for one in self.scenario.cameras}
+        camera = cameras.get(frame.camera, self.scenario.cameras[0])
+        T_world_rig = frame.T_world_camera @ inverse(camera.T_rig_camera)
+        spots = self.lights.spots(frame.actors, frame.t_us)
+        light = LIGHT_OF_BYTE[rgb]
+        if environment.rain:
+            light += view.ground[..., None] * (wet_albedo(light) - light)
+        illumination = self.light_rgb
+        if self.lights.is_night:
+            lamps = self.lights.lux(view, T_world_rig) / np.float32(WHITE_LUX)
+            illumination = illumination + (lamps / (1 + lamps / BRIGHTEST))[..., None] * LAMP_RGB
+        light *= illumination
+        if environment.rain:
+            light += self._mirrored(view, spots, T_world_rig[2, 3])
+        glow = _draw_lamps(light, view, [*self.lights.windows, *spots])
+        if self.extinction:
+            through = np.exp(-np.float32(self.extinction) * view.distance_m)[..., None]
+            light = light * through + self.air_rgb * (1 - through)
+        if self.lights.is_night:
+            light += glow
+        if environment.time == "low_sun":
+            light += self._veil(view)
+        if environment.rain:
+            key = (self.scenario.scene_id, self.seed, f"rain.{frame.camera}", frame.t_us)
+            covered = streaks(depth.shape, frame.K, environment.rain, stream(*key))
+            light += covered[..., None] * (self.air_rgb - light)
+        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
+
+    def _mirrored(self, view: View, spots: Sequence[Spot], ground_m: float) -> F32:
+        """Return what wet ground reflects of the sky and, smeared, of lamps ``(H, W, 3)``."""
+        flip = np.array([1.0, 1.0, -1.0])
+        below = [replace(one, middle=one.middle * flip + [0, 0, 2 * ground_m]) for one in spots]
+        lamps, _ = drawn(below, view)
+        smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
+        share = view.ground * mirrored_share(-view.rays[..., 2])
+        return share[..., None] * (self.air_rgb + smeared)
+
+    def _veil(self, view: View) -> F32:
+        """Return the sun above the drive's first heading and its veil in the lens ``(H, W, 1)``, as
+        much as is not hidden.
+        """
+        start = interpolate(self.scenario.ego_log, self.scenario.ego_log.t_us[0])
+        to_sun = start[:3, 0] + np.array([0, 0, SUN_TANGENT])
+        cosine = view.rays @ (to_sun / np.linalg.norm(to_sun)).astype(np.float32)
+        angle_deg = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1)
+        is_seen = np.isinf(view.distance_m) & (angle_deg == 1)
+        share = is_seen.sum() / max(np.sum(angle_deg == 1), 1)
+        return np.float32(share * VEIL_DEG2) / angle_deg[..., None] ** 2
 
 
-def _read_in(weather: Weather, frame: RecordedFrame) -> tuple[U8, F32]:
-    rgb, depth = frame.read()
-    T_world_rig = interpolate(weather.scenario.ego_log, frame.t_us)
-    moment = Moment(frame.t_us, frame.camera, T_world_rig, frame.actors)
-    return weather.shown(rgb, depth, frame.K, frame.T_world_camera, moment), depth
+def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:
+    """Draw spots that nothing hides into an image, and return their glow."""
+    colours, depth = drawn(spots, view)
+    seen = (depth < view.depth_m * (1 + SEEN_PER_M) + SEEN_M) & np.isfinite(depth)
+    light[seen] = colours[seen]
+    colours[~seen] = 0
+    return cv2.GaussianBlur(colours, (0, 0), GLOW_WIDTHS * light.shape[1]) * np.float32(GLOW_SHARE)
 
 
 def in_weather(renderer: Renderer, scenario: Scenario, seed: int) -> Renderer:
     """Return a renderer in the weather of a scene; itself where nothing of it is seen."""
-    weather = Weather(scenario, seed)
-    return WeatherRenderer(renderer, weather) if weather.changes_images else renderer
+    shown = WeatherRenderer(renderer, scenario, seed)
+    return renderer if shown.is_clear and not shown.lights.signals else shown

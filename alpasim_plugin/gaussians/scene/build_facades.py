@@ -148,22 +148,19 @@ def place_houses(site: Site) -> Houses:
     return Houses(np.stack(fronts), np.stack(aways), np.array(heights))
 
 
-def lit_windows(site: Site, houses: Houses) -> F64:
-    """Return the corners ``(N, 4, 3)`` of the windows above shops that have light at night."""
-    right, left = houses.front[:, 0], houses.front[:, 1]
-    bays = cell_counts(np.linalg.norm(left - right, axis=1), BAY_M)
+def lit_windows(site: Site, houses: Houses) -> tuple[float, F64, F64]:
+    """Return half the size of the windows that have light at night, their middles ``(N, 3)`` and
+    where they face ``(N, 3)``; shops are dark.
+    """
+    start, end = houses.front[:, 0], houses.front[:, 1]
     floors = cell_counts(houses.height_m, FLOOR_M)
+    bays = cell_counts(np.linalg.norm(end - start, axis=1), BAY_M)
     house, u, v = grid_cells(bays, floors)
     is_lit = (site.rng("lit-windows").random(len(house)) < LIT_SHARE) & (v * floors[house] > 1)
-    house, u, v = house[is_lit], u[is_lit], v[is_lit]
-    foot = np.minimum(site.world(right)[:, 2], site.world(left)[:, 2])
-    corners = []
-    for bay, floor in ((-0.17, -0.17), (0.33, -0.17), (0.33, 0.33), (-0.17, 0.33)):
-        across = (u + bay / bays[house])[:, None]
-        plan = right[house] + across * (left - right)[house] - 0.05 * houses.away[house]
-        height_m = (v + floor / floors[house]) * (houses.height_m[house] + 0.2) - 0.2
-        corners.append(np.column_stack([site.frame.to_world(plan), foot[house] + height_m]))
-    return np.stack(corners, axis=1)
+    house, u, v = house[is_lit], u[is_lit, None], v[is_lit]
+    middle = site.world(start[house] + u * (end - start)[house], v * houses.height_m[house])
+    facing = -site.frame.turned(houses.away[house])
+    return BAY_M / 4, middle + 0.05 * facing, facing
 
 
 def _claim(free: U8, ring: F64, site: Site) -> bool:
