@@ -7,6 +7,7 @@ Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
