@@ -10,15 +10,16 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry import interpolate, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import ROAD_M
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile
-from alpasim_plugin.world.roads import Road, build_road
+from alpasim_plugin.world.roads import build_road
 from scenarios.budget import ACTORS
-from scenarios.ego_path import EgoPath, LaneChange, LateralShift, make_ego_path
+from scenarios.ego_path import make_ego_path
+from scenarios.expert import drive
 from scenarios.recorded import RecordedLog
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_parts import (
@@ -62,25 +63,27 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
             elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg))
         )
     with drawn.at("ego"):
-        ego_path = _ego_path(spec, spec.road, road)
+        ego_path = make_ego_path(road, spec.ego, spec.road.segments)
     length_m = ego_path.path.length_m
     if spec.ego.start_m >= length_m:
         with drawn.at("ego", "start_m"):
             raise _too_short(length_m, spec.ego.start_m)
     end_us = spec.built_until_us
-    traffic = place_actors(drawn, road, ego_path, vehicle, end_us + TAIL_US)
-    run = traffic.drive(spec.ego, ego_path, vehicle, end_us)
-    reached_us = int(run.ego_log.t_us[-1])
+    scripted, followers = place_actors(drawn, road, ego_path, vehicle, end_us + TAIL_US)
+    ego_log, driven = drive(
+        ego_path.path, spec.ego.start_m, vehicle, spec.ego, scripted, followers, end_us
+    )
+    reached_us = int(ego_log.t_us[-1])
     if reached_us < end_us:
-        driven_m, _ = ego_path.path.project(run.ego_log.xyz[-1:, :2])
+        reached_m, _ = ego_path.path.project(ego_log.xyz[-1:, :2])
         with drawn.at("road", "segments"):
             raise _too_short(
                 length_m,
-                float(driven_m[0]),
+                float(reached_m[0]),
                 f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s",
             )
-    actors = traffic.actors(run)
-    _check_drive(drawn, road.lane_map, run.ego_log, vehicle, actors)
+    actors = (*scripted, *driven)
+    _check_drive(drawn, road.lane_map, ego_log, vehicle, actors)
     route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
     origin = (0.0, 0.0, 0.0)
     return RecordedLog(
@@ -88,7 +91,7 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         "yaml",
         road.lane_map,
         flat(0.0),
-        run.ego_log,
+        ego_log,
         vehicle,
         actors,
         (),
@@ -96,27 +99,6 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         "",
         route=route,
     )
-
-
-def _ego_path(spec: ScenarioSpec, written: RoadSpec, road: Road) -> EgoPath:
-    """Return the ego's line, moved aside in narrow gaps."""
-    ego = spec.ego
-    changes = [
-        LaneChange(ego.start_m + change.at_m, change.to_lane, change.length_m)
-        for change in ego.lane_changes
-    ]
-    plain = make_ego_path(road, ego.lane, changes)
-    shifts = []
-    for i, segment in enumerate(written.segments):
-        if isinstance(segment, NarrowGapSegment) and segment.shift_m:
-            begin, end = plain.stretch_s[i], plain.stretch_s[i + 1]
-            quarter = (end - begin) / 4
-            shifts.append(
-                LateralShift(
-                    begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m
-                )
-            )
-    return make_ego_path(road, ego.lane, changes, shifts)
 
 
 def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:
@@ -174,7 +156,7 @@ def _check_drive(
     """
     last_us = min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
     t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US)
-    ego = _footprints(interpolate(ego_log, t_us), vehicle.box, vehicle.rear_axle_to_centre_m)
+    ego = _footprints(ego_log, t_us, vehicle.box, vehicle.rear_axle_to_centre_m)
     lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
     road = shapely.union_all([shapely.buffer(lane_polygon(lane), SEAM_M) for lane in lanes])
     shapely.prepare(road)
@@ -210,20 +192,16 @@ def _key_of(spec: ScenarioSpec, name: str) -> tuple[str | int, ...]:
     return ("road", "segments")
 
 
-def _footprints(poses: F64, box: Box, ahead_m: float = 0.0) -> F64:
-    """Return rectangles (object array of polygons) of bodies at poses ``(T, 4, 4)``, their middle
+def _footprints(track: Trajectory, t_us: I64, box: Box, ahead_m: float = 0.0) -> F64:
+    """Return rectangles (object array of polygons) of a body at times ``(T,)``, its middle
     ``ahead_m`` in front of the pose.
     """
-    x, y = box.length_m / 2, box.width_m / 2
-    corners = np.array(
-        [
-            [ahead_m + x, y, 0, 1],
-            [ahead_m - x, y, 0, 1],
-            [ahead_m - x, -y, 0, 1],
-            [ahead_m + x, -y, 0, 1],
-        ]
+    poses = interpolate(track, t_us)
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    xy = poses[:, :2, 3] + ahead_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    rings: F64 = shapely.polygons(
+        rectangle_corners(xy, yaw, np.array([[box.length_m, box.width_m]]))
     )
-    rings: F64 = shapely.polygons((corners @ np.swapaxes(poses, -1, -2))[..., :2])
     return rings
 
 
@@ -234,8 +212,7 @@ def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:
     there = np.flatnonzero((t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1]))
     if len(there) == 0:
         return float("inf"), 0
-    distance = shapely.distance(
-        ego[there], _footprints(interpolate(actor.track, t_us[there]), actor.box)
-    )
+    body = _footprints(actor.track, t_us[there], actor.box)
+    distance = shapely.distance(ego[there], body)
     k = int(np.argmin(distance))
     return float(distance[k]), int(t_us[there[k]])

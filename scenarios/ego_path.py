@@ -15,29 +15,10 @@ from alpasim_plugin.core.geometry import arc_lengths, quat_from_yaw
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 from alpasim_plugin.world.roads import Road
+from scenarios.schema import EgoSpec, LaneChangeSpec
+from scenarios.schema_parts import NarrowGapSegment, Part
 
 STEP_US = 50_000  # a 20 Hz track: linear interpolation errs by less than 3 mm at 7 m/s^2
-
-
-@dataclass(frozen=True)
-class LaneChange:
-    """A change of the ego's lane."""
-
-    at_m: float
-    to_lane: int
-    length_m: float
-
-
-@dataclass(frozen=True)
-class LateralShift:
-    """A lateral shift of the ego's line and back: full from ``begin_m`` to ``end_m``, ``ramp_m`` on
-    either side.
-    """
-
-    begin_m: float
-    end_m: float
-    ramp_m: float
-    shift_m: float
 
 
 @dataclass(frozen=True)
@@ -56,54 +37,58 @@ class EgoPath:
         return int(np.clip(i, 0, len(self.stretch_s) - 2))
 
 
-def make_ego_path(
-    road: Road, lane: int, changes: Sequence[LaneChange] = (), shifts: Sequence[LateralShift] = ()
-) -> EgoPath:
-    """Return the rear axle's line from forward lane ``lane`` at the road's beginning.
+def make_ego_path(road: Road, ego: EgoSpec, segments: Sequence[Part]) -> EgoPath:
+    """Return the rear axle's line from the ego's lane at the road's beginning, moved aside in narrow
+    gaps.
 
     Raises:
         InputError: A lane that does not exist, or that ends before the road or the lane change
             does.
     """
-    chain = road.forward_chain(lane)
+    chain = road.forward_chain(ego.lane)
     if not chain:
         raise InputError(
-            f"lane {lane}: the road has no such forward lane",
+            f"lane {ego.lane}: the road has no such forward lane",
             "choose a smaller lane number",
         )
     parts = [road.lane_map.lanes[i].centre for i, _ in chain]
-    for change in changes:
-        parts, chain = _change(road, parts, chain, change)
+    for change in ego.lane_changes:
+        parts, chain = _change(road, parts, chain, change, ego.start_m + change.at_m)
     if len(chain) < len(road.stretches):
         raise InputError(
-            f"lane {lane}: that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})",
+            f"lane {ego.lane}: that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})",
             "start in a lane that goes on, or change lanes before",
         )
     line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
     s = arc_lengths(line)
-    begins = np.cumsum([0] + [len(p) - 1 for p in parts])
-    for shift in shifts:
-        share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep(
-            (shift.end_m + shift.ramp_m - s) / shift.ramp_m
-        )
-        d = np.gradient(line[:, :2], s, axis=0)
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        out = line.copy()
-        out[:, 0] -= shift.shift_m * share * d[:, 1]
-        out[:, 1] += shift.shift_m * share * d[:, 0]
-        line = out
-    return EgoPath(
-        smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins)
-    )
+    begins = s[np.cumsum([0] + [len(p) - 1 for p in parts])]
+    for segment, begin, end in zip(segments, begins, begins[1:], strict=False):
+        if isinstance(segment, NarrowGapSegment) and segment.shift_m:
+            quarter = (end - begin) / 4
+            ramp_m = max(2 * quarter, 12.0)
+            share = smoothstep((s - (begin + quarter) + ramp_m) / ramp_m) * smoothstep(
+                (end - quarter + ramp_m - s) / ramp_m
+            )
+            d = np.gradient(line[:, :2], s, axis=0)
+            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            out = line.copy()
+            out[:, 0] -= segment.shift_m * share * d[:, 1]
+            out[:, 1] += segment.shift_m * share * d[:, 0]
+            line = out
+    return EgoPath(smooth_path(line), tuple(i for i, _ in chain), tuple(begins.tolist()))
 
 
 def _change(
-    road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange
+    road: Road,
+    parts: list[F64],
+    chain: list[tuple[str, int]],
+    change: LaneChangeSpec,
+    at_m: float,
 ) -> tuple[list[F64], list[tuple[str, int]]]:
     lengths = np.array([arc_lengths(p)[-1] for p in parts])
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
-    first = int(np.searchsorted(begin, change.at_m, side="right")) - 1
-    where = f"lane change at {change.at_m:.0f} m to lane {change.to_lane}"
+    first = int(np.searchsorted(begin, at_m, side="right")) - 1
+    where = f"lane change at {at_m:.0f} m to lane {change.to_lane}"
     if first >= len(parts):
         raise InputError(f"{where}: the road ends at {begin[-1]:.0f} m", "change lanes earlier")
     stretch = road.stretches[first]
@@ -117,15 +102,13 @@ def _change(
     for n, (lane_id, k) in enumerate(target):
         i = first + n
         goal = road.lane_map.lanes[lane_id].centre
-        if begin[min(i, len(begin) - 1)] < change.at_m + change.length_m:
+        if begin[min(i, len(begin) - 1)] < at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
                 raise InputError(
                     f"{where}: the lanes part at element {i}",
                     "change lanes earlier or within a shorter length",
                 )
-            share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[
-                :, None
-            ]
+            share = smoothstep((begin[i] + arc_lengths(parts[i]) - at_m) / change.length_m)[:, None]
             goal = (1 - share) * parts[i] + share * goal
         out.append(goal)
         new_chain.append((lane_id, k))
@@ -198,25 +181,19 @@ def _follow(road: Road, lane_id: str) -> list[str]:
     return out
 
 
-def grid(start_us: int, end_us: int, step_us: int = STEP_US) -> I64:
-    """Return times from start to end in steps; the last one is the end itself."""
-    t = np.arange(start_us, end_us, step_us)
-    return np.append(t, np.int64(end_us))
+def grid(end_us: int) -> I64:
+    """Return times from 0 in steps; the last one is the end itself."""
+    return np.append(np.arange(0, end_us, STEP_US), np.int64(end_us))
 
 
-def speed_profile(t_us: I64, rows: Sequence[tuple[float, float]]) -> F64:
-    """Return speeds ``(T,)`` of rows (time in seconds after ``t_us[0]``, m/s), linear in between,
-    constant outside.
+def driven_m(t_us: I64, rows: Sequence[tuple[float, float]], s0_m: float) -> F64:
+    """Return arc lengths ``(T,)`` of a body whose speed is given by rows (time in seconds after
+    ``t_us[0]``, m/s), linear in between, constant outside.
     """
-    t_s = (t_us - t_us[0]) * 1e-6
-    times, values = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
-    return np.interp(t_s, times, values)
-
-
-def integrate(t_us: I64, speed_mps: F64, s0_m: float) -> F64:
-    """Return arc lengths ``(T,)`` of a speed that is linear between samples."""
+    times, values = np.array(rows).T
+    speed = np.interp((t_us - t_us[0]) * 1e-6, times, values)
     dt = np.diff(t_us) * 1e-6
-    return np.concatenate([[s0_m], s0_m + np.cumsum(dt * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
+    return np.concatenate([[s0_m], s0_m + np.cumsum(dt * 0.5 * (speed[1:] + speed[:-1]))])
 
 
 def track_on_path(
@@ -237,26 +214,6 @@ def track_on_path(
         yaw = yaw + np.arctan2(dd, np.maximum(ds, 1e-6))
     xyz = xyz + np.array([0.0, 0.0, box.height_m / 2])
     return Trajectory(t_us[keep], xyz[keep], quat_from_yaw(yaw[keep]))
-
-
-def cut_in_track(
-    path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, at_us: int, change_us: int
-) -> Trajectory:
-    """Return the track of a lane change: quintic in time between two neighbouring paths.
-
-    Args:
-        path_from: Middle of the lane at the start.
-        path_to: Middle of the lane afterwards.
-        t_us: ``(T,)`` times; ``at_us`` counts from the first.
-        s_m: ``(T,)`` arc lengths on ``path_from``.
-        box: Size of the vehicle.
-        at_us: Start of the lateral motion.
-        change_us: Its duration.
-    """
-    points, _ = path_from.at(s_m)
-    _, distance = path_to.project(points[:, :2])
-    share = smoothstep((t_us - t_us[0] - at_us) / change_us)
-    return track_on_path(path_from, t_us, s_m, box, -distance * share)
 
 
 def walk_track(
@@ -284,10 +241,7 @@ def walk_track(
     return Trajectory(t_us, xyz, quat_from_yaw(np.full(len(t_us), yaw)))
 
 
-def standing_track(
-    x_m: float, y_m: float, z_m: float, yaw_rad: float, t_us: I64, box: Box
-) -> Trajectory:
+def standing_track(xyz: F64, yaw_rad: float, t_us: I64, box: Box) -> Trajectory:
     """Return the track of a body that never moves: two poses, at the first and the last time."""
-    ends = np.array([t_us[0], t_us[-1]], dtype=np.int64)
-    xyz = np.tile([x_m, y_m, z_m + box.height_m / 2], (2, 1))
-    return Trajectory(ends, xyz, quat_from_yaw(np.full(2, yaw_rad)))
+    middle = xyz + np.array([0.0, 0.0, box.height_m / 2])
+    return Trajectory(t_us[[0, -1]], np.tile(middle, (2, 1)), quat_from_yaw(np.full(2, yaw_rad)))

@@ -13,7 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_yaw, yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, Actor, Bool, Box, Signal, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Actor,
+    Behaviour,
+    Bool,
+    Box,
+    Signal,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.idm import (
     BEHIND_M,
     Bodies,
@@ -30,9 +40,9 @@ from alpasim_plugin.world.idm import (
 from alpasim_plugin.world.path import Lines, Path
 from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
 from scenarios.ego_path import track_on_path
+from scenarios.schema import EgoSpec
 
-LOOKAHEAD_S = tuple(float(t) for t in np.arange(0.5, 4.01, 0.5))
-TIMES_S = np.array([0.0, *LOOKAHEAD_S])
+TIMES_S = np.arange(0.0, 4.01, 0.5)  # now and ahead
 HORIZON_M = 80.0
 FOLLOWED_M = 120.0  # reactive traffic looks so far ahead
 SIDE_M = 0.3
@@ -55,60 +65,48 @@ class ScriptedTracks:
     Args:
         scripts: Tracks.
         end_us: Last queried time, before the look-ahead.
-        step_us: Grid.
     """
 
-    def __init__(self, scripts: Sequence[Actor], end_us: int, step_us: int) -> None:
-        self.step_us = step_us
-        self.times = np.arange(0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us)
-        still = [
-            s
-            for s in scripts
-            if np.ptp(s.track.xyz[:, :2], axis=0).max() < STANDING_M and s.track.t_us[-1] >= end_us
-        ]
-        going = [s for s in scripts if not any(s is other for other in still)]
-        xy = np.array([s.track.xyz[0, :2] for s in still])
-        yaw = np.array([float(yaw_from_quat(s.track.quat[0])) for s in still])
-        self.standing = bodies_from(xy, yaw, [s.box for s in still], np.zeros((len(still), 2)))
+    def __init__(self, scripts: Sequence[Actor], end_us: int) -> None:
+        lookahead_us = int(TIMES_S[-1] * 1e6)
+        self.times = np.arange(0, end_us + lookahead_us + DECISION_US, DECISION_US)
+        still, going = [], []
+        for script in scripts:
+            reach_m = np.ptp(script.track.xyz[:, :2], axis=0).max()
+            stands = reach_m < STANDING_M and script.track.t_us[-1] >= end_us
+            (still if stands else going).append(script)
+        xy = np.array([script.track.xyz[0, :2] for script in still])
+        yaw = np.array([float(yaw_from_quat(script.track.quat[0])) for script in still])
+        boxes = [script.box for script in still]
+        self.standing = bodies_from(xy, yaw, boxes, np.zeros((len(still), 2)))
         n = len(self.times)
-        self.boxes = [s.box for s in going]
+        self.boxes = [script.box for script in going]
         self.xy = np.zeros((n, len(going), 2))
         self.yaw = np.zeros((n, len(going)))
         self.velocity = np.zeros((n, len(going), 2))
         self.present = np.zeros((n, len(going)), dtype=np.bool_)
         for j, script in enumerate(going):
             track = script.track
-            t = np.clip(self.times, track.t_us[0], track.t_us[-1])
+            first_us, last_us = int(track.t_us[0]), int(track.t_us[-1])
+            t = np.clip(self.times, first_us, last_us)
             for d in range(2):
                 self.xy[:, j, d] = np.interp(t, track.t_us, track.xyz[:, d])
             self.yaw[:, j] = np.interp(t, track.t_us, np.unwrap(yaw_from_quat(track.quat)))
-            self.velocity[:, j] = np.gradient(self.xy[:, j], step_us * 1e-6, axis=0)
+            self.velocity[:, j] = np.gradient(self.xy[:, j], DECISION_US * 1e-6, axis=0)
             # A track that ends with the scene (and not by leaving the road) goes on standing in the
             # look-ahead.
-            self.present[:, j] = (self.times >= track.t_us[0]) & (
-                (self.times <= track.t_us[-1]) | (track.t_us[-1] >= end_us)
-            )
-
-    def moving(self, t_us: int) -> Bodies:
-        """Return the moving bodies present at a time on the grid."""
-        i = min(t_us // self.step_us, len(self.times) - 1)
-        keep = np.flatnonzero(self.present[i])
-        return bodies_from(
-            self.xy[i, keep],
-            self.yaw[i, keep],
-            [self.boxes[k] for k in keep],
-            self.velocity[i, keep],
-        )
+            ends = last_us < end_us
+            self.present[:, j] = (self.times >= first_us) & (not ends or self.times <= last_us)
 
     def rows(self, t_us: int) -> I64:
         """Return the grid rows of now and of the look-ahead."""
-        rows = (t_us + np.round(TIMES_S * 1e6).astype(np.int64)) // self.step_us
+        rows = (t_us + np.round(TIMES_S * 1e6).astype(np.int64)) // DECISION_US
         return np.minimum(rows, len(self.times) - 1)
 
 
 @dataclass(frozen=True)
 class PredictedBodies:
-    """Road users now (first row) and after each time of `LOOKAHEAD_S`."""
+    """Road users now (first row) and after each further time of `TIMES_S`."""
 
     xy: F64  # (1 + n, K, 2)
     yaw: F64  # (1 + n, K)
@@ -117,8 +115,9 @@ class PredictedBodies:
     boxes: tuple[Box, ...]
     yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
 
-    def now(self, columns: I64) -> Bodies:
-        """Return some of the road users as they are now."""
+    def now(self) -> Bodies:
+        """Return the road users that are there now."""
+        columns = np.flatnonzero(self.present[0])
         boxes = [self.boxes[k] for k in columns]
         return bodies_from(
             self.xy[0, columns], self.yaw[0, columns], boxes, self.velocity[0, columns]
@@ -131,12 +130,12 @@ def yielding_acceleration(
     speed_mps: float,
     box: Box,
     ahead: PredictedBodies,
-    min_gap_m: float,
 ) -> float:
     """Return the largest acceleration that keeps behind everyone who will come into the corridor;
     infinite without such a one.
 
-    For a body that will be in the corridor after ``tau`` seconds with its rear at ``r``, the own
+    `MIN_GAP_M` is kept from a standing body; half a second is added for a moving one. For a body that
+    will be in the corridor after ``tau`` seconds with its rear at ``r``, the own
     front must then not be beyond ``r - gap``: with constant acceleration ``a <= 2 (r - gap - front
     - v tau) / tau^2``. Not counted are bodies that are in the corridor already (they are followed,
     or come from behind), bodies that the ego will have passed by then, and reactive cars that are
@@ -148,7 +147,6 @@ def yielding_acceleration(
         speed_mps: Own speed.
         box: Ego body.
         ahead: Everyone who moves.
-        min_gap_m: Gap to keep from a standing body; half a second is added for a moving one.
     """
     n, k = ahead.yaw.shape
     everybody = bodies_from(
@@ -172,79 +170,64 @@ def yielding_acceleration(
     counts[0] = False
     if not counts.any():
         return float("inf")
-    allowed = rear - (min_gap_m + 0.5 * speed) - front_s - speed_mps * tau
+    allowed = rear - (MIN_GAP_M + 0.5 * speed) - front_s - speed_mps * tau
     return float(np.min(2.0 * allowed[counts] / np.broadcast_to(tau, counts.shape)[counts] ** 2))
-
-
-@dataclass(frozen=True)
-class ExpertStyle:
-    """How the expert drives."""
-
-    speed_mps: float
-    cruise_mps: float
-    max_lateral_accel_mps2: float
-    headway_s: float
 
 
 @dataclass(frozen=True)
 class Follower:
     """A reactive driver that is simulated together with the expert."""
 
+    actor_id: str
+    label: str
     path: Path
     s_m: float  # of the box centre
     speed_mps: float
     box: Box
-    params: IdmParams
+    params: dict[str, float]  # see `IdmParams`
     offset_m: float = 0.0
-
-
-@dataclass(frozen=True)
-class Drive:
-    """What came out: the ego's log and one track per follower."""
-
-    ego_log: Trajectory  # rig poses
-    followers: tuple[Trajectory, ...]  # box centres
 
 
 def drive(
     path: Path,
     s0_m: float,
     vehicle: Vehicle,
-    style: ExpertStyle,
+    ego: EgoSpec,
     scripts: Sequence[Actor],
     followers: Sequence[Follower],
     end_us: int,
     signals: Sequence[Signal] | None = None,
-) -> Drive:
+) -> tuple[Trajectory, tuple[Actor, ...]]:
     """Drive from time 0 to ``end_us``, or to the end of the path.
 
     Args:
         path: Line of the rear axle.
         s0_m: Where the rear axle starts.
         vehicle: Ego body.
-        style: Speeds and limits.
+        ego: Speeds and limits.
         scripts: Tracks known in advance.
         followers: Drivers that react to the ego and to each other.
         end_us: Last time.
         signals: Traffic lights, at which all stop.
+
+    Returns:
+        The ego's log (rig poses), and the followers as they drove.
     """
-    table = ScriptedTracks(scripts, end_us, DECISION_US)
-    expert = _Expert(path, s0_m, vehicle, style, table, lights_on(path, signals))
+    table = ScriptedTracks(scripts, end_us)
+    expert = _Expert(path, s0_m, vehicle, ego, table, lights_on(path, signals))
     cars = [_Car(follower, lights_on(follower.path, signals)) for follower in followers]
     lines = Lines([car.f.path for car in cars]) if cars else None
     half_widths = np.array([car.f.box.width_m / 2 for car in cars])
     log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
-        driving = [i for i, car in enumerate(cars) if car.s <= car.f.path.length_m]
-        scripted = table.moving(t)
         ahead = _predicted(table, cars, lines, t)
-        first = len(table.boxes) + np.array(driving, dtype=np.int64)
-        moving = concatenate([scripted, ahead.now(first)])
+        moving = ahead.now()
         wanted = expert.decide(moving, ahead, t)
         if lines is not None:
             everybody = concatenate([table.standing, expert.bodies(), moving])
             own_row = np.full(len(cars), -1)
+            driving = np.flatnonzero(ahead.present[0, len(table.boxes) :])
             own_row[driving] = np.arange(len(everybody.xy) - len(driving), len(everybody.xy))
             fronts = np.array([car.front_s for car in cars])
             horizons = np.full(len(cars), FOLLOWED_M)
@@ -265,17 +248,16 @@ def drive(
     times = t_us[:: DECISION_US // LOG_STEP_US]
     keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
     xyz, yaw = path.at(np.array(log_s)[keep])
-    return Drive(
-        Trajectory(t_us[keep], xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars)
-    )
+    ego_log = Trajectory(t_us[keep], xyz, quat_from_yaw(yaw))
+    return ego_log, tuple(car.driven(times) for car in cars)
 
 
-def speed_limits(path: Path, style: ExpertStyle) -> F64:
+def speed_limits(path: Path, cruise_mps: float, max_lateral_accel_mps2: float) -> F64:
     """Return the speed ``(N,)`` that bends allow, reachable with a comfortable brake from
     everywhere before them.
     """
     k = np.abs(path.curvature)
-    v2 = np.minimum(style.cruise_mps**2, style.max_lateral_accel_mps2 / np.maximum(k, 1e-6))
+    v2 = np.minimum(cruise_mps**2, max_lateral_accel_mps2 / np.maximum(k, 1e-6))
     # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
     rising = v2 + 2 * COMFORT_BRAKE_MPS2 * path.s
     return np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
@@ -289,17 +271,17 @@ class _Expert:
         path: Path,
         s0_m: float,
         vehicle: Vehicle,
-        style: ExpertStyle,
+        ego: EgoSpec,
         table: ScriptedTracks,
         lights: Sequence[LightAhead],
     ) -> None:
         self.path, self.vehicle, self.table, self.lights = path, vehicle, table, lights
         self.line = Lines([path])
-        self.limit = speed_limits(path, style)
+        self.limit = speed_limits(path, ego.cruise_mps, ego.max_lateral_accel_mps2)
         self.s, self.a, self.cap = s0_m, 0.0, float("inf")
-        self.v = min(style.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
+        self.v = min(ego.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
         self.params = IdmParams(
-            style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2
+            ego.cruise_mps, ego.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2
         )
         self.front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
 
@@ -333,7 +315,7 @@ class _Expert:
             wanted = min(wanted, idm_acceleration(self.v, red_m, self.v, self.params))
         if t_us % LOOKAHEAD_US == 0:
             self.cap = yielding_acceleration(
-                self.line, self.front_s, self.v, self.vehicle.box, ahead, MIN_GAP_M
+                self.line, self.front_s, self.v, self.vehicle.box, ahead
             )
         return max(min(wanted, self.cap), -MAX_BRAKE_MPS2)
 
@@ -351,6 +333,7 @@ class _Car:
 
     def __init__(self, f: Follower, lights: Sequence[LightAhead]) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
+        self.params = IdmParams(**f.params)
         self.lights = lights
         self.log_s = [self.s]
 
@@ -362,18 +345,19 @@ class _Car:
         closing = self.v - leader.speed_mps
         red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
         self.a = min(
-            idm_acceleration(self.v, leader.gap_m, closing, self.f.params),
-            idm_acceleration(self.v, red_m, self.v, self.f.params),
+            idm_acceleration(self.v, leader.gap_m, closing, self.params),
+            idm_acceleration(self.v, red_m, self.v, self.params),
         )
 
     def advance(self, dt_s: float) -> None:
         self.s, self.v = moved_on(self.s, self.v, self.a, dt_s)
         self.log_s.append(self.s)
 
-    def track(self, times: I64) -> Trajectory:
-        return track_on_path(
-            self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m
-        )
+    def driven(self, times: I64) -> Actor:
+        """Return the road user with the track that it drove."""
+        s_m, f = np.array(self.log_s[: len(times)]), self.f
+        track = track_on_path(f.path, times, s_m, f.box, f.offset_m)
+        return Actor(f.actor_id, f.label, f.box, track, behaviour=Behaviour("idm", f.params))
 
 
 def _predicted(

@@ -20,10 +20,10 @@ from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
-from scenarios.expert import ExpertStyle, drive
+from scenarios.expert import drive
 from scenarios.map_lines import bordered, ground_of
 from scenarios.map_route import LaneGraph, Spot, Way
-from scenarios.map_traffic import place_followers, vehicles
+from scenarios.map_traffic import place_followers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
 from scenarios.street_map import CYCLE, GREEN_S, Head, StreetMap, with_cycles
@@ -70,12 +70,6 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     heads = [
         head for head in street.heads if any(key in lane_map.lanes for key in head.signal.lanes)
     ]
-    style = ExpertStyle(
-        spec.ego.speed_mps,
-        spec.ego.cruise_mps,
-        spec.ego.max_lateral_accel_mps2,
-        spec.ego.headway_s,
-    )
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
     lane_map = replace(lane_map, signals=_timed(heads, line, front_m, spec.ego.cruise_mps))
     driven = _until(line, goal_m + front_m + 1.0)
@@ -85,15 +79,17 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
     rng = stream(drawn.scene_id, spec.seed, "scenario/map/vehicles")
     followers = place_followers(LaneGraph(lane_map.lanes), way, line, spec.map.vehicles, rng)
-    run = drive(driven, 0.0, vehicle, style, (), followers, end_us, lane_map.signals)
+    ego_log, vehicles = drive(
+        driven, 0.0, vehicle, spec.ego, (), followers, end_us, lane_map.signals
+    )
     return RecordedLog(
         drawn.scene_id,
         kind,
         lane_map,
-        ground_of(lane_map, run.ego_log.xyz),
-        run.ego_log,
+        ground_of(lane_map, ego_log.xyz),
+        ego_log,
         vehicle,
-        vehicles(followers, run.followers),
+        vehicles,
         (),
         street.origin,
         files.content_hash,

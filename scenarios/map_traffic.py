@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.types import F64, Actor, Behaviour, Trajectory
-from alpasim_plugin.world.idm import IdmParams
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.world.path import Path
 from scenarios.expert import Follower
 from scenarios.map_route import LaneGraph, Way
@@ -61,23 +60,10 @@ def place_followers(
         taken.append((own, shape, place))
         sharpest = max(float(np.abs(path.curvature).max()), 1e-6)
         speed_mps = min(speed_mps, float(np.sqrt(BEND_MPS2 / sharpest)))
-        params = IdmParams(desired_speed_mps=speed_mps)
-        followers.append(Follower(path, 0.0, speed_mps, SIZES["car"], params))
+        params = {"desired_speed_mps": speed_mps}
+        name = f"car-{len(followers)}"
+        followers.append(Follower(name, "car", path, 0.0, speed_mps, SIZES["car"], params))
     return followers
-
-
-def vehicles(followers: list[Follower], tracks: tuple[Trajectory, ...]) -> tuple[Actor, ...]:
-    """Return the vehicles with the tracks that they drove beside the expert."""
-    return tuple(
-        Actor(
-            f"car-{number}",
-            "car",
-            follower.box,
-            track,
-            behaviour=Behaviour("idm", {"desired_speed_mps": follower.params.desired_speed_mps}),
-        )
-        for number, (follower, track) in enumerate(zip(followers, tracks, strict=True))
-    )
 
 
 def _shape(path: Path) -> Any:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
 from alpasim_plugin.core.types import (
     F64,
@@ -102,15 +101,7 @@ class Actors:
 
         Reactive drivers take one acceleration from the positions at the last call and hold it over
         the step.
-
-        Raises:
-            InputError: Time does not increase.
         """
-        if self.t_us is not None and t_us <= self.t_us:
-            raise InputError(
-                f"t = {t_us} us: the last time was {self.t_us} us",
-                "step forwards, or reset first",
-            )
         if self.t_us is not None and t_us > self.closed_us:
             for walker in self.walkers.values():
                 walker.step(max(self.t_us, self.closed_us), t_us, ego, self.vehicle)
@@ -126,14 +117,10 @@ class Actors:
             yaw = yaw_of(ego.T_world_rig)
             direction = np.array([np.cos(yaw), np.sin(yaw)])
             centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
-            others = concatenate(
-                [
-                    bodies_from(
-                        centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
-                    ),
-                    bodies,
-                ]
+            own = bodies_from(
+                centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
             )
+            others = concatenate([own, bodies])
             self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
         for driver in self.drivers:
             pose = driver.pose(t_us, self.closed_us, driver.motion)
@@ -291,7 +278,7 @@ class _Driver:
     ) -> None:
         self.actor, self.ground = actor, ground
         self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
-        self.params = IdmParams.from_mapping({} if self.act else actor.behaviour.params)
+        self.params = IdmParams(**({} if self.act else actor.behaviour.params))
         self.path = _driving_line(actor, index)
         self.lights = () if self.path is None else lights_on(self.path, signals)
         self.line = -1

@@ -35,20 +35,9 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
             around them are left out, so that a large map costs no more than what is seen of it.
 
     Raises:
-        InputError: There is no point, a coordinate is not finite, or the grid would have more than
-            `MAX_NODES` nodes.
+        InputError: The grid would have more than `MAX_NODES` nodes.
     """
     xyz = points.reshape(-1, 3)
-    if len(xyz) == 0 or not np.isfinite(xyz).all() or cell_m <= 0:
-        bad = (
-            "no points"
-            if len(xyz) == 0
-            else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
-        )
-        raise InputError(
-            f"{len(xyz)} points, cell {cell_m} m: {bad}",
-            "give finite ground points and a cell > 0",
-        )
     if drive is not None:
         near = np.all(
             (xyz[:, :2] >= drive[:, :2].min(axis=0) - SIGHT_M)
@@ -67,10 +56,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     ij = np.floor((xyz[:, :2] - low) / cell_m).astype(np.int64)
     _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
-    rest = xyz - xyz[0]
-    sums = np.column_stack(
-        [np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)]
-    )
+    sums = np.stack([np.bincount(inverse, rest) for rest in (xyz - xyz[0]).T], axis=1)
     means = sums / count[:, None] + xyz[0]
     xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
     nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)

@@ -8,12 +8,11 @@ Physical Review E 62 (2000), equations 2 and 3.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Box
 from alpasim_plugin.world.path import Lines
 
@@ -28,23 +27,6 @@ class IdmParams:
     accel_mps2: float = 1.5
     brake_mps2: float = 2.0  # comfortable
     hard_brake_mps2: float = 7.0  # what the vehicle can do; the model's own demand is cut off here
-
-    @staticmethod
-    def from_mapping(params: Mapping[str, float]) -> IdmParams:
-        """Read the parameters of a `Behaviour`; absent ones take their defaults.
-
-        Raises:
-            InputError: A parameter that the model does not have, or one that is not positive.
-        """
-        known = IdmParams.__dataclass_fields__
-        for key, value in params.items():
-            if key not in known or not value > 0:
-                found = f"{value} is not positive" if key in known else "no such parameter"
-                raise InputError(
-                    f"idm parameter {key!r}: {found}",
-                    f"use positive {', '.join(known)}",
-                )
-        return IdmParams(**{k: float(v) for k, v in params.items()})
 
 
 def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:
@@ -211,9 +193,6 @@ def find_leaders(
     return out
 
 
-NO_BODIES = Bodies(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
-
-
 def bodies_from(xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64) -> Bodies:
     """Build `Bodies` from centres ``(M, 2)``, headings ``(M,)``, boxes and velocities ``(M,
     2)``.
@@ -230,11 +209,5 @@ def bodies_from(xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64) -> Bodie
 
 def concatenate(parts: Sequence[Bodies]) -> Bodies:
     """Stack several groups of bodies."""
-    if not parts:
-        return NO_BODIES
-    return Bodies(
-        *(
-            np.concatenate(columns)
-            for columns in zip(*(vars(part).values() for part in parts), strict=True)
-        )
-    )
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Bodies(*map(np.concatenate, columns))

@@ -49,15 +49,7 @@ def sample_clothoid(
 
     Returns:
         ``(N, 4)``: x, y, heading (not wrapped), curvature; the first row is ``start``.
-
-    Raises:
-        InputError: A length or step that is not positive.
     """
-    if not (length_m > 0 and step_m > 0):
-        raise InputError(
-            f"length {length_m} m, step {step_m} m: not positive",
-            "give lengths > 0",
-        )
     n = max(1, int(np.ceil(length_m / step_m - 1e-9)))
     s = np.linspace(0.0, length_m, n + 1)
     rate = (end_curvature_per_m - start_curvature_per_m) / length_m

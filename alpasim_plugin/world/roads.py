@@ -309,7 +309,6 @@ class _Tip:
     pose: tuple[float, float, float]
     profile: Profile
     joint: Joint | None = None
-    strip: Strip | None = None
     junction: Junction | None = None
     forward: tuple[
         str | None, ...
@@ -402,7 +401,7 @@ def _grow_taper(
 
 
 def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersection) -> Stretch:
-    if tip.joint is None or tip.junction is not None or tip.strip is None:
+    if tip.joint is None or tip.junction is not None:
         raise InputError(
             f"{name}: two intersections without a road between them",
             "put a straight between them",
@@ -419,7 +418,7 @@ def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersect
         forward,
         tuple(str(b) for b in tip.backward),
     )
-    tip.pose, tip.joint, tip.junction, tip.strip = junction.pose, junction.joint, junction, None
+    tip.pose, tip.joint, tip.junction = junction.pose, junction.joint, junction
     tip.forward, tip.backward = (), ()
     return Stretch(junction.forward, junction.forward_next, junction.backward)
 
@@ -447,7 +446,7 @@ def _link(draft: MapDraft, tip: _Tip, strip: Strip) -> None:
 def _move(tip: _Tip, curve: F64, strip: Strip, forward: tuple[str, ...]) -> None:
     end = curve[-1]
     tip.pose = (float(end[0]), float(end[1]), float(end[2]))
-    tip.joint, tip.strip, tip.forward, tip.backward = strip.joint(), strip, forward, strip.backward
+    tip.joint, tip.forward, tip.backward = strip.joint(), forward, strip.backward
 
 
 def polyline(lane_map: LaneMap, lane_ids: Sequence[str]) -> F64:

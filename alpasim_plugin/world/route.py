@@ -13,7 +13,6 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     arc_lengths,
     densify,
@@ -183,13 +182,7 @@ def route_from_log(
     heading change, and the offset from the centre fades out over `BLEND_M`. Where the log ends
     outside every lane, or the map ends, the route ends too. ``lane_ids`` are the lanes of both
     parts in driving order.
-
-    Raises:
-        InputError: The log has no pose, or a position that is not finite.
     """
-    if len(ego_log) == 0 or not np.isfinite(ego_log.xyz).all():
-        found = "no poses" if len(ego_log) == 0 else "positions that are not finite"
-        raise InputError(f"the recorded drive: {found}", "use a log with at least one finite pose")
     # Drop points nearer than `MIN_STEP_M` to the last kept one; the last point stays.
     xyz = ego_log.xyz
     kept = [0]

@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, quat_from_yaw, se2
 from alpasim_plugin.core.types import (
     Actor,
@@ -86,15 +85,6 @@ def test_replay_is_present_exactly_from_its_first_to_its_last_pose():
     actors = Actors([Actor("a", "car", BOX, line_track(0, 5, 1.0, t0=100_000))], Vehicle(), 0)
     present = [t for t in (99_999, 100_000, 1_100_000, 1_100_001) if actors.step(t, FAR_AWAY)]
     assert present == [100_000, 1_100_000]
-
-
-def test_time_must_go_forwards_until_a_reset():
-    actors = Actors([Actor("a", "car", BOX, line_track(0, 5))], Vehicle(), 0)
-    actors.step(500_000, FAR_AWAY)
-    with pytest.raises(InputError):
-        actors.step(500_000, FAR_AWAY)
-    actors.reset()
-    assert actors.step(0, FAR_AWAY)["a"][0, 3] == 0.0
 
 
 def test_reactive_driver_follows_its_track_while_the_log_is_forced():

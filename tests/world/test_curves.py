@@ -52,11 +52,6 @@ def test_straight_keeps_its_heading_far_from_the_origin():
     np.testing.assert_allclose(curve[-1, :2], [5e5, 4e6 + 100.0], atol=1e-8)
 
 
-def test_no_length_is_refused():
-    with pytest.raises(InputError):
-        sample_clothoid((0, 0, 0), 0.0, 0.0, 0.0)
-
-
 @settings(deadline=None, max_examples=examples(40))
 @given(st.floats(8, 40), st.floats(8, 40), st.sampled_from([np.pi / 2, -np.pi / 2, 0.0]))
 def test_connector_meets_both_poses_exactly_and_never_bends_backwards(ahead, aside, turn):

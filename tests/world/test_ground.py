@@ -79,18 +79,6 @@ def test_one_point_or_a_line_of_points_is_ground_enough(points):
     np.testing.assert_allclose(height_at(field, np.array([[0.0, 0.0], [11.0, 5.0]])), 3.0)
 
 
-UNUSABLE = [
-    (np.zeros((0, 3)), "no points"),
-    (np.array([[0.0, 0.0, np.nan]]), "1 points that are not finite"),
-]
-
-
-@pytest.mark.parametrize(("points", "found"), UNUSABLE)
-def test_ground_without_usable_points_is_refused(points, found):
-    with pytest.raises(InputError):
-        from_points(points)
-
-
 def test_ground_of_a_continent_is_refused_before_memory_is_taken():
     with pytest.raises(InputError):
         from_points(np.array([[0.0, 0.0, 0.0], [4e6, 3e6, 0.0]]), 1.0)

@@ -16,7 +16,7 @@ from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, find_leader, idm
 from alpasim_plugin.world.path import Lines, Path
 from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
-from scenarios.expert import ExpertStyle, speed_limits
+from scenarios.expert import speed_limits
 
 STEP_S = 0.1
 LATERAL_MPS2 = 2.0
@@ -60,9 +60,7 @@ class ReferenceLine:
     @staticmethod
     def along(path: Path, fastest_mps: float) -> ReferenceLine:
         """Return the line with its speed limits, at most ``fastest_mps``."""
-        return ReferenceLine(
-            path, speed_limits(path, ExpertStyle(fastest_mps, fastest_mps, LATERAL_MPS2, 1.5))
-        )
+        return ReferenceLine(path, speed_limits(path, fastest_mps, LATERAL_MPS2))
 
 
 def acceleration(

@@ -18,7 +18,7 @@ from alpasim_plugin.lab.training.policy_expert import (
     expert_speeds,
     leader_on,
 )
-from alpasim_plugin.world.idm import NO_BODIES, NO_LEADER, Leader, bodies_from
+from alpasim_plugin.world.idm import NO_LEADER, Leader, bodies_from
 from alpasim_plugin.world.path import smooth_path
 from policies.learned_net import KNOTS_M, TIMES_S, knot_weights, path_grid
 
@@ -80,7 +80,8 @@ def test_only_bodies_that_reach_into_the_way_are_leaders():
     assert leader.index == 1
     assert leader.gap_m == pytest.approx(60.0 - 2.25 - 13.8, abs=0.05)
     assert leader.speed_mps == pytest.approx(5.0)
-    assert leader_on(line, 10.0, 3.8, 0.94, NO_BODIES).index == -1
+    nobody = bodies_from(np.zeros((0, 2)), np.zeros(0), [], np.zeros((0, 2)))
+    assert leader_on(line, 10.0, 3.8, 0.94, nobody).index == -1
 
 
 def test_headings_of_a_circle_lay_out_the_circle():
