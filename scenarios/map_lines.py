@@ -23,6 +23,7 @@ from alpasim_plugin.core.geometry import arc_lengths, densify, matrix_from_quat
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.world.ground import flat, from_points, height_at
+from alpasim_plugin.world.path import polyline_path, thinned
 
 MAX_STEP_M = 2.0
 
@@ -67,36 +68,24 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     """Return the driven path as one lane of usual width, without paint: nothing says where lines
     were.
     """
-    xy = ego.xyz[:, :2]
-    keep = [0]
-    for i in range(1, len(xy)):
-        if np.linalg.norm(xy[i] - xy[keep[-1]]) > 0.5:
-            keep.append(i)
-    line = (
-        xy[keep]
-        if len(keep) > 1
-        else np.stack([xy[0], xy[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
-    )
+    line = thinned(ego.xyz[:, :2], 0.5)
+    if len(line) == 1:
+        line = np.stack([line[0], line[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
     first, last = line[1] - line[0], line[-1] - line[-2]
-    line = np.concatenate(
-        [
-            [line[0] - first / np.linalg.norm(first) * BEFORE_M],
-            line,
-            [line[-1] + last / np.linalg.norm(last) * BEYOND_M],
-        ]
+    before = line[0] - first / np.linalg.norm(first) * BEFORE_M
+    beyond = line[-1] + last / np.linalg.norm(last) * BEYOND_M
+    path = polyline_path(np.concatenate([[before], line, [beyond]]))
+    s = np.linspace(0.0, path.length_m, max(2, int(path.length_m / VERTEX_M) + 1))
+    centre, left, right = (
+        laid(path.at(s, side * LANE_M / 2)[0], field) for side in (0.0, 1.0, -1.0)
     )
-    s = arc_lengths(line)
-    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / VERTEX_M) + 1))
-    centre = np.stack([np.interp(at, s, line[:, axis]) for axis in range(2)], axis=1)
-    along = np.gradient(centre, axis=0)
-    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(
-        np.linalg.norm(along, axis=1, keepdims=True), 1e-12
-    )
-    edges = [centre + side * LANE_M / 2 * left for side in (0.0, 1.0, -1.0)]
-    middle, one, other = (np.column_stack([edge, height_at(field, edge)]) for edge in edges)
-    return LaneMap(
-        {"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")}
-    )
+    lane = Lane("corridor", centre, left, right, left_paint="none", right_paint="none")
+    return LaneMap({"corridor": lane})
+
+
+def laid(line: F64, field: HeightField) -> F64:
+    """Return a line ``(N, 2+)`` on the ground ``(N, 3)``."""
+    return np.column_stack([line[:, :2], height_at(field, line)])
 
 
 def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:

@@ -87,13 +87,13 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
             option = "--policy" if part == "policy" else "--renderer"
             return InputError(f"{text}: a {part}, not a {kind}", f"Write {option} {text}.")
     name = text.removesuffix(".yaml")
-    near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
-    if not near:
-        by_last = {one.rsplit("/", 1)[-1]: one for one in names}
-        last = name.rsplit("/", 1)[-1]
-        near = [by_last[one] for one in difflib.get_close_matches(last, by_last, 3, 0.6)]
-    near = near or difflib.get_close_matches(
-        text, [path.name for path in Path().glob("*.y*ml")], cutoff=0.8
+    files = [path.name for path in Path().glob("*.y*ml")]
+    by_last = {known.rsplit("/", 1)[-1]: known for known in names}
+    last = difflib.get_close_matches(name.rsplit("/", 1)[-1], by_last, 3, 0.6)
+    near = (
+        difflib.get_close_matches(name, list(names), 3, 0.5)
+        or [by_last[one] for one in last]
+        or difflib.get_close_matches(text, files, cutoff=0.8)
     )
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     found = f"no such file or folder, and no shipped {kind} has that name"
@@ -147,7 +147,7 @@ def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
     Raises:
         InputError: Nothing there, an empty folder, or a bad suite file.
     """
-    return _expand(str(path_or_name), None, (), [])
+    return _expand(str(path_or_name), None, [])
 
 
 def expand(
@@ -162,9 +162,7 @@ def expand(
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
 
 
-def _expand(
-    text: str, base: Path | None, chain: tuple[Path, ...], opened: list[Path]
-) -> list[ScenarioRef]:
+def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRef]:
     path = _locate(text, base)
     if os.path.isdir(path):
         if source_of(path) is not None:
@@ -182,8 +180,6 @@ def _expand(
         return [ScenarioRef(str(f)) for f in files]
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
         return [ScenarioRef(str(path))]
-    if real(path) in chain:
-        raise InputError(f"{path}: a suite that contains itself", "remove the entry")
     opened.append(path)
     if len(opened) > MOST_SUITES:
         raise InputError(
@@ -196,7 +192,7 @@ def _expand(
     for i, entry in enumerate(spec.scenarios):
         item = SuiteItem(path=entry) if isinstance(entry, str) else entry
         try:
-            refs = _expand(item.path, real(path).parent, (*chain, real(path)), opened)
+            refs = _expand(item.path, real(path).parent, opened)
         except InputError as e:
             mark = document.mark(("scenarios", i))
             raise InputError(f"{mark}: {e.message}", e.hint) from e

@@ -20,14 +20,23 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.seeding import stream
-from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
+from scenarios.schema import RangeSpec, ScenarioSpec
 from scenarios.schema_parts import Part
 
-_LENGTHS, _SPEEDS = ("length_m",), ("speed_mps", "cruise_mps", "desired_speed_mps", "end_speed_mps")
-_CURVATURES = ("curvature_per_m", "start_curvature_per_m", "end_curvature_per_m")
-_TIMES = ("at_us", "brake_at_us")
-
-
+JITTERED = {  # key of a number -> what `JitterSpec` calls its range
+    "length_m": "length",
+    "curvature_per_m": "curvature",
+    "start_curvature_per_m": "curvature",
+    "end_curvature_per_m": "curvature",
+    "speed_mps": "speed",
+    "cruise_mps": "speed",
+    "desired_speed_mps": "speed",
+    "end_speed_mps": "speed",
+    "lane_width_m": "lane_width",
+    "s_m": "position_m",
+    "at_us": "time_us",
+    "brake_at_us": "time_us",
+}
 AS_WRITTEN = 0  # the scene seed that jitters nothing
 
 
@@ -127,33 +136,31 @@ def _varied(
 def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:
     """Return the specification with road, ego and actors changed within the declared ranges."""
     ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
-    touched = {
-        _by_id(k, ids)
-        for k in (*fixed, *spec.variations, *(k for sample in spec.samples for k in sample))
-    }
+    written = [*fixed, *spec.variations, *(key for sample in spec.samples for key in sample)]
+    touched = {_by_id(key, ids) for key in written}
 
-    def walk(part: Any, loc: tuple[str | int, ...], name: str) -> Any:
+    def walk(part: Any, loc: tuple[str | int, ...]) -> Any:
         if isinstance(part, Part):
-            pairs = ((k, getattr(part, k)) for k in type(part).model_fields)
-            changed = {k: walk(v, (*loc, k), k) for k, v in pairs}
-            return part.model_copy(
-                update={k: v for k, v in changed.items() if v is not getattr(part, k)}
-            )
+            names = type(part).model_fields
+            return part.model_copy(update={k: walk(getattr(part, k), (*loc, k)) for k in names})
         if isinstance(part, tuple) and part and isinstance(part[0], Part):
             # Actors are named by their ids, so that the order of the list does not matter.
-            keys = [getattr(item, "id", i) for i, item in enumerate(part)]
-            new = tuple(walk(item, (*loc, key), "") for item, key in zip(part, keys, strict=True))
-            return part if all(a is b for a, b in zip(new, part, strict=True)) else new
-        if (
-            isinstance(part, bool)
-            or not isinstance(part, int | float)
-            or ".".join(map(str, loc)) in touched
-        ):
+            return tuple(walk(one, (*loc, getattr(one, "id", i))) for i, one in enumerate(part))
+        kind = JITTERED.get(str(loc[-1]))
+        if kind is None or part is None or ".".join(map(str, loc)) in touched:
             return part
-        return _shake(part, loc, name, spec.jitter, scene_id, spec.seed)
+        if kind == "length" and loc[0] != "road":
+            return part
+        # One factor bends the whole road, so that transitions still end with the curvature of the
+        # arc after them.
+        key = kind if kind == "curvature" else dotted(loc)
+        u = float(stream(scene_id, spec.seed, f"scenario/jitter/{key}").uniform(-1.0, 1.0))
+        reach = u * getattr(spec.jitter, kind)
+        if kind == "time_us":
+            return max(0, part + round(reach))
+        return part + reach if kind == "position_m" else part * (1.0 + reach)
 
-    update = {"road": walk(spec.road, ("road",), "road"), "ego": walk(spec.ego, ("ego",), "ego")}
-    update["actors"] = walk(spec.actors, ("actors",), "actors")
+    update = {name: walk(getattr(spec, name), (name,)) for name in ("road", "ego", "actors")}
     return spec.model_copy(update=update)
 
 
@@ -170,11 +177,9 @@ def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[A
 def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
     """Return dotted keys and plain values of a specification; actors go by their ids."""
     if isinstance(part, Part):
-        names = set(type(part).model_fields) - (
-            {"jitter", "variations", "samples"} if not loc else set()
-        )
-        pairs: list[tuple[str | int, Any]] = [
-            (name, getattr(part, name)) for name in type(part).model_fields if name in names
+        rules = {"jitter", "variations", "samples"} if not loc else set()
+        pairs = [
+            (name, getattr(part, name)) for name in type(part).model_fields if name not in rules
         ]
     elif isinstance(part, tuple) and part and isinstance(part[0], Part):
         pairs = [(getattr(item, "id", i), item) for i, item in enumerate(part)]
@@ -188,23 +193,3 @@ def _by_id(key: str, ids: dict[str, str]) -> str:
     head, _, rest = key.partition(".")
     item, _, tail = rest.partition(".")
     return f"actors.{ids[item]}.{tail}" if head == "actors" and item in ids else key
-
-
-def _shake(
-    value: float, loc: tuple[str | int, ...], name: str, j: JitterSpec, scene_id: str, seed: int
-) -> float:
-    # One factor bends the whole road, so that transitions still end with the curvature of the arc
-    # after them.
-    key = "curvature" if name in _CURVATURES else dotted(loc)
-    u = float(stream(scene_id, seed, f"scenario/jitter/{key}").uniform(-1.0, 1.0))
-    if name in _TIMES:
-        return max(0, value + round(u * j.time_us))
-    if name == "s_m":
-        return value + u * j.position_m
-    relative = {
-        **dict.fromkeys(_LENGTHS, j.length if loc[0] == "road" else 0.0),
-        **dict.fromkeys(_CURVATURES, j.curvature),
-        **dict.fromkeys(_SPEEDS, j.speed),
-        "lane_width_m": j.lane_width,
-    }.get(name, 0.0)
-    return value * (1.0 + u * relative) if relative else value

@@ -314,7 +314,7 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     every = EVERY if placed.strip else EVERY_STILL
     out = []
     for camera in drive.cameras:
-        name = camera if camera != drive.front or "front" in camera else "front"
+        name = _name_of(drive, camera)
         for i, one in enumerate(drive.of(camera)):
             held = i % every == every // 2 and len(drive.of(camera)) >= EVERY
             use = (
@@ -419,12 +419,17 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     K = np.diag([scale, scale, 1.0]) @ lens.straight_K()
     K[1, 2] -= (lens.height * scale - height) / 2
     return CameraSpec(
-        name if name != drive.front or "front" in name else "front",
+        _name_of(drive, name),
         width,
         height,
         K,
         placed.mounts[name],
     )
+
+
+def _name_of(drive: SourceDrive, camera: str) -> str:
+    """Return the name of a camera in the scenario, where the one that looks ahead is a front."""
+    return camera if camera != drive.front or "front" in camera else "front"
 
 
 def scene_id_of(drive: SourceDrive) -> str:

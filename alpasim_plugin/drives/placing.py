@@ -18,6 +18,7 @@ from alpasim_plugin.core.types import F64, HeightField, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
+from scenarios.map_lines import laid
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
 from scenarios.recorded import SourceFiles
@@ -330,20 +331,14 @@ def given_map(
             "give the map of this street, in the coordinates of the poses",
         )
 
-    def laid(line: F64) -> F64:
-        return np.column_stack([line[:, :2], height_at(placed.ground, line)])
-
-    lanes = {
-        key: replace(
-            lane,
-            centre=laid(lane.centre),
-            left=None if lane.left is None else laid(lane.left),
-            right=None if lane.right is None else laid(lane.right),
-        )
-        for key, lane in lane_map.lanes.items()
-    }
-    edges = tuple(laid(edge) for edge in lane_map.road_edges)
-    return replace(lane_map, lanes=lanes, road_edges=edges), (
+    lanes = {}
+    for key, lane in lane_map.lanes.items():
+        edges = {
+            name: laid(getattr(lane, name), placed.ground) for name in ("centre", "left", "right")
+        }
+        lanes[key] = replace(lane, **edges)
+    borders = tuple(laid(edge, placed.ground) for edge in lane_map.road_edges)
+    return replace(lane_map, lanes=lanes, road_edges=borders), (
         f"the road is that of {path.name}, laid onto the ground that was found",
         *notes,
     )

@@ -17,7 +17,7 @@ from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
-from alpasim_plugin.core.types import F32, F64, U8
+from alpasim_plugin.core.types import F32
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
@@ -26,15 +26,10 @@ from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from scenarios.drive import Obstacle
 
 ASIDE_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
 OPAQUE = 0.5
-SHOWN, COVERED = 6, 8  # photographs of the page; views that coverage is measured on
-PLAN_PX, PLAN_M = (
-    900,
-    70.0,
-)  # the view from above: its width, and how much of the world it shows at most across
+SHOWN, COVERED = 3, 8  # photographs of each use on the page; views that measure coverage
 PICTURES = "pictures"
 Report = Callable[[str, int, int], None]
 
@@ -73,18 +68,14 @@ def measure(
 
 
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
-    known = {name: T for name, T in view.actors.items() if name in graph.actors}
-    out = graph.render(view.camera, known)
+    out = graph.render(view.camera, {})
     shown = replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0)).to_uint8()
     return Comparison(view.name, shown, view.rgb, psnr_db(shown, view.rgb), ssim(shown, view.rgb))
 
 
 def _spread(count: int, most: int) -> list[int]:
-    return (
-        [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
-        if count
-        else []
-    )
+    """Return up to ``most`` numbers below ``count``, evenly spread."""
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
 
 
 def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
@@ -99,40 +90,6 @@ def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
     )
     alpha = graph.render(camera, {}).alpha
     return float((alpha[camera.height // 2 :] > OPAQUE).mean())
-
-
-def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle]) -> U8:
-    """Draw points, path and obstacles from above, the drive's heading to the right."""
-    path = placed.ego.xyz[:, :2]
-    low, high = path.min(axis=0) - 15.0, path.max(axis=0) + 15.0
-    high = np.maximum(high, low + 20.0)
-    metres = float(min(max(high - low), 10 * PLAN_M))
-    scale = PLAN_PX / metres
-    size = np.ceil((high - low).clip(0, metres) * scale).astype(int)
-    image = np.full((size[1], size[0], 3), 255, np.uint8)
-
-    def at(xy: F64) -> F64:
-        return np.column_stack([(xy[:, 0] - low[0]) * scale, (high[1] - xy[:, 1]) * scale])
-
-    order = np.argsort(placed.points.xyz[:, 2])
-    cells = at(placed.points.xyz[order]).astype(np.int64)
-    inside = ((cells >= 0) & (cells < size)).all(axis=1)
-    image[cells[inside, 1], cells[inside, 0]] = np.rint(
-        placed.points.rgb[order][inside] * 200
-    ).astype(np.uint8)
-    cv2.polylines(image, [np.rint(at(path)).astype(np.int32)], False, (30, 90, 220), 2, cv2.LINE_AA)
-    for one in obstacles:
-        c = np.cos(one.yaw_rad)
-        s = np.sin(one.yaw_rad)
-        half = np.array([one.box.length_m, one.box.width_m]) / 2
-        corners = (
-            np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]])
-            + one.xyz[:2]
-        )
-        cv2.polylines(
-            image, [np.rint(at(corners)).astype(np.int32)], True, (200, 40, 30), 2, cv2.LINE_AA
-        )
-    return image
 
 
 def write_page(
@@ -159,11 +116,12 @@ def write_page(
     (folder / PICTURES).mkdir(exist_ok=True)
     shown = []
     for use, rows in comparisons.items():
-        for row in [rows[i] for i in _spread(len(rows), SHOWN // 2)]:
-            name = f"{PICTURES}/{use}-{row.name}.jpg"
-            _write(folder / name, np.concatenate([row.truth, row.shown], axis=0))
-            shown.append((use, row, name))
-    _write(folder / PICTURES / "plan.png", _plan(placed, standing.obstacles))
+        for i in _spread(len(rows), SHOWN):
+            name = f"{PICTURES}/{use}-{rows[i].name}.jpg"
+            both = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
+            data = cv2.imencode(".jpg", np.ascontiguousarray(both[..., ::-1]))[1].tobytes()
+            write_bytes(folder / name, data)
+            shown.append((use, rows[i], name))
     spread = [one.uncertainty_m for one in standing.obstacles]
     quality = {
         "source": drive.kind,
@@ -192,10 +150,6 @@ def write_page(
 
 def _mean(rows: Sequence[Comparison], name: str) -> float:
     return round(float(np.mean([getattr(row, name) for row in rows])), 3)
-
-
-def _write(path: Path, rgb: U8) -> None:
-    write_bytes(path, cv2.imencode(path.suffix, np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes())
 
 
 def _page(
@@ -232,8 +186,6 @@ def _page(
     sections += [
         f"Standing obstacles: {boxes['boxes']} boxes{sides}. On the driven path {boxes['cleared_cells']} cells of 0.2 m were opaque\n"
         "by mistake and were taken as free.",
-        "## From above",
-        f"![from above]({PICTURES}/plan.png)",
         "## Photograph above, reconstruction below",
     ]
     for use, row, name in shown:

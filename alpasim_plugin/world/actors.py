@@ -36,7 +36,7 @@ from alpasim_plugin.world.idm import (
     moved_on,
     wanted_gap_m,
 )
-from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep
+from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep, thinned
 from alpasim_plugin.world.route import LaneIndex
 from alpasim_plugin.world.signals import lights_on, red_gap_m
 from alpasim_plugin.world.walkers import Walker
@@ -368,12 +368,7 @@ def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
     """Return the line of a track, thinned where it stands and extended along the lanes; None for a
     track that goes nowhere.
     """
-    xyz = actor.track.xyz
-    keep = [0]
-    for i in range(1, len(xyz)):
-        if np.hypot(*(xyz[i, :2] - xyz[keep[-1], :2])) > LINE_STEP_M:
-            keep.append(i)
-    line = xyz[keep]
+    line = thinned(actor.track.xyz, LINE_STEP_M)
     if len(line) < 2 or np.hypot(*(line[-1, :2] - line[0, :2])) < MIN_PATH_M:
         return None
     path = polyline_path(line)

@@ -284,6 +284,17 @@ class Lines:
         return dx * dx + dy * dy
 
 
+def thinned(line: F64, step_m: float) -> F64:
+    """Return the points of a polyline ``(N, 2+)`` that are farther than a step from the last one
+    that is kept, the first always.
+    """
+    kept = [0]
+    for i in range(1, len(line)):
+        if np.hypot(*(line[i, :2] - line[kept[-1], :2])) > step_m:
+            kept.append(i)
+    return line[kept]
+
+
 def polyline_path(xyz: F64) -> Path:
     """Build a path from a polyline ``(N, 2 or 3)``; repeated points are dropped.
 

@@ -40,7 +40,7 @@ def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
     assert (lane.left_paint, lane.right_paint) == ("none", "none")
     assert scenario.cameras[0].name == "front"
     assert (scenario.cameras[0].width % 16, scenario.cameras[0].height % 16) == (0, 0)
-    assert any("the last was dropped (000024.png)" in note for note in scenario.notes)
+    assert any("000024.png" in note for note in scenario.notes)
 
 
 def test_the_wheels_stand_on_the_road_that_bows(imported):
