@@ -26,7 +26,10 @@ EDGES_M = np.linspace(
 TALL = 0.8  # how high to look, as a share of the camera's height
 LOW = 0.35  # the least share required where a curve ends the line of sight
 LEAVE_LANE_M = 2.6
-NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
+NARROW_M, WIDE_M = (
+    0.35,
+    0.8,
+)  # thinner patches are lane markings: lines, and the bars of a crosswalk
 ROAD_NEAR_M = 5.5
 ROAD_FAR_M = 12.0
 ROAD_HALF_M = 0.9

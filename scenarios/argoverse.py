@@ -43,7 +43,7 @@ from alpasim_plugin.world.ground import from_points
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
-# Argoverse 2 mark types -> the paints a scene can show. Mixed lines take their solid half; double
+# Argoverse 2 mark types -> the markings a scene can show. Mixed lines take their solid half; double
 # white is drawn as one line.
 PAINTS: dict[str, Paint] = {
     "NONE": "none",

@@ -2,7 +2,7 @@
 says what stands in it).
 
 Coordinates are metres in the scenario's world, rotations are matrices or ``wxyz``, cameras are
-OpenCV's. Photographs are the frames of the folder's ``transforms.json``: pinhole pictures without
+OpenCV's. Photographs are the frames of the folder's ``transforms.json``: pinhole images without
 distortion, each with its time, camera and use.
 """
 

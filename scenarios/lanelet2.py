@@ -338,7 +338,7 @@ def _linked(
 
 
 def _paint(way: Item) -> Paint:
-    """Return the paint of a bound; colours other than yellow are white."""
+    """Return the lane marking of a bound; colours other than yellow are white."""
     kind, subtype = way.tags.get("type"), way.tags.get("subtype", "")
     if kind in UNMARKED:
         return "none"

@@ -117,7 +117,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
     )  # a bare log keeps its id whatever is overridden
     start, end = _window(drawn, drive)
     background = _background(drawn)
-    # Where the street itself is built its paint is chosen; paint that nobody knows of a recorded
+    # Where the street itself is built its markings are chosen; those that nobody knows of a recorded
     # street stays unknown.
     recorded = drive.source in RECORDED_STREETS or (
         background is not None and not background.keep_road

@@ -65,7 +65,7 @@ def bordered(lanes: Mapping[str, Lane], beside: LaneMap) -> LaneMap:
 
 
 def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
-    """Return the driven path as one lane of usual width, without paint: nothing says where lines
+    """Return the driven path as one lane of usual width, without markings: nothing says where lines
     were.
     """
     line = thinned(ego.xyz[:, :2], 0.5)

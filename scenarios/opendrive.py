@@ -1,4 +1,4 @@
-"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and paint, the border of
+"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and markings, the border of
 the drivable surface, and the place.
 
 Lanes follow one another along sections, from road to road, and through junctions. A map lies in a
@@ -451,7 +451,7 @@ def _stations(road: Road, section: Section) -> F64:
 
 
 def _paint(mark: tuple[str, str] | None) -> Paint:
-    """Return the paint of a road mark; colours other than yellow are white."""
+    """Return the kind of a road mark; colours other than yellow are white."""
     if mark is None or mark[0] == "none":
         return "none"
     kind, colour = mark

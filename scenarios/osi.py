@@ -292,7 +292,7 @@ def _along(centre: F64, points: F64) -> F64:
 
 
 def _paint(border: Any) -> Paint:
-    """Return the paint of a boundary; colours other than yellow are white."""
+    """Return the lane marking of a boundary; colours other than yellow are white."""
     yellow = border.classification.color == YELLOW
     if border.classification.type == SOLID:
         return "solid_yellow" if yellow else "solid_white"

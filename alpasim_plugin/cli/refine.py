@@ -1,4 +1,4 @@
-"""``simrun refine``: apply a fixer to a video file or a folder of pictures."""
+"""``simrun refine``: apply a fixer to a video file or a folder of images."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Lane:
 
 @dataclass(frozen=True)
 class Marking:
-    """Paint that the map gives as a line of its own, not as a lane's edge."""
+    """A lane marking that the map gives as a line of its own, not as a lane's edge."""
 
     xyz: F64  # (N, 3) metres, world
     paint: Paint

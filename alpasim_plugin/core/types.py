@@ -393,8 +393,8 @@ class Degradation:
     """How the renderer ``3dgs`` differs from the scene as built.
 
     ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``:
-        a model fitted to frames seen from
-    aside, rendered on the path (OneFixer, App. A). ``none``: the scene as built.
+        a model fitted to frames seen at a lateral offset, rendered on the path (OneFixer,
+        App. A). ``none``: the scene as built.
     """
 
     kind: Literal["reconstruction", "cycle", "none"] = "reconstruction"

@@ -244,7 +244,7 @@ def write_folder(
 
 
 def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
-    """Return what identifies an import: the pictures by size and time of change, their poses and
+    """Return what identifies an import: the images by size and time of change, their poses and
     lenses, and the options.
     """
     digest = hashlib.sha256(

@@ -48,7 +48,7 @@ WHEELS, ASIDE_WEIGHT = (
     0.8,
     0.02,
 )  # half the width of what is driven over, and what points beside it count: kerbs come and go
-FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are judged
+FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are assessed
 CROSS_AT: F64 = np.asarray(
     np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64
 )  # offsets of the cross section's knots
@@ -262,7 +262,7 @@ class _Strip:
         for i in range(ROUNDS):
             end = max(TIGHT, LOOSE * 0.75**i)
             error = h - A @ coefficients
-            slack = end + 2 / np.sqrt(weight)  # a far point is judged by its own spread
+            slack = end + 2 / np.sqrt(weight)  # a far point is assessed by its own spread
             robust = np.where(np.abs(error) < slack, (1 - (error / slack) ** 2) ** 2, 0.0)
             W = scipy.sparse.diags(weight * robust)
             coefficients = np.asarray(

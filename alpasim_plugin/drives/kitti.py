@@ -56,7 +56,7 @@ def is_kitti(folder: Path) -> bool:
 
 
 def read_kitti(folder: Path) -> SourceDrive:
-    """Read a drive: the left camera is driven by and fitted, the right one is kept for judging.
+    """Read a drive: the left camera is driven by and fitted, the right one is kept for measuring.
 
     Raises:
         InputError: A file is missing or damaged, or a pose is no rigid motion; the message names

@@ -42,7 +42,7 @@ class PlacedDrive:
         strip: The fit behind it; None where the ground was not seen.
         ego: Rig poses.
         mounts: Camera to its pose on the rig.
-        poses: Camera to its poses ``(N, 4, 4)``, in the order of the drive's pictures.
+        poses: Camera to its poses ``(N, 4, 4)``, in the order of the drive's images.
         facts: How up, scale and ground were found, for the page of quality.
         notes: What was assumed.
     """

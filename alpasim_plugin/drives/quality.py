@@ -79,7 +79,7 @@ def _spread(count: int, most: int) -> list[int]:
 
 
 def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
-    """Return the share of the picture's lower half that the model covers, seen from beside where a
+    """Return the share of the image's lower half that the model covers, seen from beside where a
     view was taken.
     """
     shift = np.eye(4)

@@ -83,7 +83,7 @@ class SourceDrive:
         scene_id: A name for the scenario.
         pictures: All photographs, camera by camera in order of time; each has its time and camera.
         front: The camera that looks ahead and is driven by.
-        never_fitted: Cameras whose photographs are kept for judging.
+        never_fitted: Cameras whose photographs are kept for measuring.
         metric: What makes lengths metres; None where the unit is arbitrary.
         points: Points that come with the poses; None where there are none.
         notes: What was assumed or left out.
@@ -99,7 +99,7 @@ class SourceDrive:
     notes: tuple[str, ...] = ()
 
     def of(self, camera: str) -> list[Picture]:
-        """Return a camera's pictures in order of time."""
+        """Return a camera's images in order of time."""
         return [picture for picture in self.pictures if picture.camera == camera]
 
     @property
@@ -229,7 +229,7 @@ def name_numbers(files: Sequence[Path]) -> list[int]:
 
 
 def in_order(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
-    """Return a camera's pictures without times as they were taken, with a note.
+    """Return a camera's images without times as they were taken, with a note.
 
     The order is that of the file. Some tools list photographs in an order of their own: where the
     path along the names, in natural order, is shorter, the names count.

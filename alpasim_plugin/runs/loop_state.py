@@ -53,7 +53,7 @@ SPEED_SPAN_US = 500_000
 
 def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
     """Return the poses of the actors that are drawn, as views that cannot be written: what stands
-    in a reconstruction is in its pictures already.
+    in a reconstruction is in its images already.
     """
     shown = {name: T.view() for name, T in actors.items() if not name.startswith(STANDING_ID)}
     for T in shown.values():

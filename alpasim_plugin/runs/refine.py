@@ -2,7 +2,7 @@
 opacity and semantic map.
 
 Only the current block is held in memory. The result is renamed to its final name when it is
-complete. A folder of PNG pictures may stand in the place of a video: no codec between a frame and
+complete. A folder of PNG images may stand in the place of a video: no codec between a frame and
 what is made of it.
 """
 
@@ -33,7 +33,7 @@ from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, Video
 
 CAMERA = "video"
 SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
-PERIOD = Fraction(1, 10)  # seconds from picture to picture: they have no times of their own
+PERIOD = Fraction(1, 10)  # seconds from image to image: they have no times of their own
 GREY_LEVELS = 40  # channels of an opacity video may differ by this much, because of compression
 
 
@@ -44,7 +44,7 @@ class PictureFolderReader:
         path: The folder.
 
     Raises:
-        InputError: No such folder, no picture in it, a picture that cannot be read or is not of 8
+        InputError: No such folder, no image in it, an image that cannot be read or is not of 8
             bits, or a changing size.
     """
 

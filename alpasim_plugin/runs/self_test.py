@@ -61,8 +61,7 @@ def broken_renderers() -> list[str]:
 def run_self_test(
     spec: GateSpec, root: Path, command: Sequence[str], progress: Progress
 ) -> tuple[list[Trial], Outcome]:
-    """Drive the suite behind the reference and every broken renderer and judge each pair by the
-    gate.
+    """Drive the suite behind the reference and every broken renderer, and gate each pair.
 
     The gate's rules apply unchanged, except that the reference is `REFERENCE` and that the suite's
     scenes are all that is asked about, however few. As a control the reference is driven a second
@@ -100,7 +99,7 @@ def run_self_test(
 def judge_against(
     table: RolloutTable, spec: GateSpec, first: RolloutTable, name: str
 ) -> GateVerdict:
-    """Judge one renderer of a table against the reference of the first."""
+    """Decide about one renderer of a table against the reference of the first."""
     fields = {
         "renderers": (name,),
         "baseline": REFERENCE,

@@ -1,9 +1,9 @@
 """Which lines of a map are painted on the road: one rule, which the built world, the semantic map
 and the learned metrics share.
 
-Paint is what the map says: its marking lines, and the edges of lanes whose paint it knows. Unknown
-paint is nothing: a line that nobody has seen is not drawn. Where the road itself is built, its
-paint is a choice, and `with_default_paint` makes it before anything is drawn.
+A line is painted where the map says so: its marking lines, and the edges of lanes whose markings
+it knows. A line that nobody has seen is not drawn. Where the road itself is built, its lane
+markings are a choice, and `with_default_paint` makes it before anything is drawn.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     """Return what is painted along lanes, each place once.
 
     Returns:
-        Lines ``(N, 3)``, metres, world, with their paint, which is neither ``none`` nor
+        Lines ``(N, 3)``, metres, world, with their kind of line, which is neither ``none`` nor
         ``unknown``: marking lines first, then lane edges; an edge along which an earlier line runs
         is left out.
     """
@@ -102,11 +102,11 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
 
 
 def with_default_paint(lane_map: LaneMap) -> LaneMap:
-    """Return a map whose unknown paint is chosen, for a road that is built from it.
+    """Return a map whose unknown lane markings are chosen, for a road that is built from it.
 
     An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes
     a double yellow one, an outer edge a solid white line; inside intersections nothing is painted.
-    In maps with marking lines of their own, lane edges of unknown paint stay as they are, and
+    In maps with marking lines of their own, lane edges of unknown markings stay as they are, and
     unknown marking lines are solid white.
     """
     if lane_map.markings:
@@ -125,7 +125,7 @@ def with_default_paint(lane_map: LaneMap) -> LaneMap:
 
 
 def _default(edges: _Edges, i: int) -> Paint:
-    """Return the paint of an unknown edge: that of a known one along it, else what its neighbours
+    """Return the marking of an unknown edge: that of a known one along it, else what its neighbours
     suggest.
     """
     samples = edges.beside(i)

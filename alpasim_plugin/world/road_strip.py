@@ -271,7 +271,7 @@ def _ring(left: F64, right: F64) -> F64:
 
 
 def inner_paint(profile: Profile) -> Paint:
-    """Return the paint left of the innermost lane."""
+    """Return the lane marking left of the innermost lane."""
     return "solid_yellow" if profile.backward == 0 or profile.median_m > 0 else profile.centre_paint
 
 

@@ -1,5 +1,5 @@
 """Make docs/img/drive.gif of a run: one scene behind three renderers, with the plan in force drawn
-into each picture.
+into each image.
 
 simrun --renderer clean,3dgs,onefixer --policy lane-camera --out RUN suites/first
 python docs/scripts/first_picture.py RUN hard-hard_brake
@@ -68,7 +68,7 @@ def frames(folder: Path, name: str) -> list[U8]:
 
 
 def main(run: Path, scene: str) -> None:
-    """Write the picture."""
+    """Write the image."""
     panels = [
         frames(run / "rollouts" / name / "lane-camera" / scene / "0", name) for name in COLOURS
     ]

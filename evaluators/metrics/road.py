@@ -77,7 +77,7 @@ class Polylines:
         """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there
         is none.
 
-        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is judged by its vertex nearest in
+        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is placed by its vertex nearest in
         plan view: that one must lie within ``height_m`` of the point's height, and the line whose
         such vertex is nearest in 3-D is taken.
         """

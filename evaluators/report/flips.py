@@ -45,14 +45,14 @@ def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
 
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
-    """Encode a picture as a ``data:`` address, smaller where it is large; None where it is not a
-    readable picture.
+    """Encode an image as a ``data:`` address, smaller where it is large; None where it is not a
+    readable image.
     """
     try:
         data = read_bytes(path, SOURCE_BYTES)
         image = decode_image(data, path)
     except InputError:
-        return None  # the report says that the picture is absent
+        return None  # the report says that the image is absent
     height, width = image.shape[:2]
     if len(data) > MAX_BYTES or width > MAX_WIDTH:
         if width > MAX_WIDTH:
@@ -160,7 +160,7 @@ class FlipRow:
         time: When the plans diverged, since the first frame.
         gap: How far apart they were then.
         pictures: (side, colour, data address, width, height) at that time.
-        why_not: Why there are no pictures.
+        why_not: Why there are no images.
         links: (side, colour, clip, folder).
     """
 
@@ -173,12 +173,12 @@ class FlipRow:
 
 
 def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
-    """Lay out the flips with their pictures, as far as a budget goes.
+    """Lay out the flips with their images, as far as a budget goes.
 
     Args:
         run: The run; ``flips.json`` holds when plans diverged and where the frames of that time
             are.
-        budget_bytes: Most bytes of pictures to inline.
+        budget_bytes: Most bytes of images to inline.
 
     Returns:
         The rows, how many more flips there are, and the number of pairs compared.

@@ -35,7 +35,7 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
     return the file.
 
     Args:
-        run: The run that was judged.
+        run: The run that was gated.
         verdict: What `evaluators.statistics.gate.judge` gave.
         gate: Name or file of the gate.
     """

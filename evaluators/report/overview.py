@@ -37,7 +37,7 @@ from evaluators.statistics.verdicts import shown_questions
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral"]
 
-TONES: Mapping[str, Tone] = {  # of endings; the others call for a look
+TONES: Mapping[str, Tone] = {  # of endings; the others need attention
     REACHED_END: "better",
     "collision": "worse",
     "off-road": "worse",

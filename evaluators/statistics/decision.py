@@ -228,7 +228,7 @@ class State:
 
 
 def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> State:
-    """Return the state after the scenes so far, however often one looked before.
+    """Return the state after the scenes so far, however many interim analyses came before.
 
     Args:
         question: What is to be decided.

@@ -138,7 +138,7 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
 
     Args:
         path_or_name: The file or the name.
-        known: The metrics that it may name: those of the run that it judges.
+        known: The metrics that it may name: those of the run that it decides about.
 
     Returns:
         The gate and the file it came from.
@@ -251,7 +251,7 @@ def judge(
     preset: str = DEFAULT,
     repeatable: bool | None = None,
 ) -> GateVerdict:
-    """Judge rollouts.
+    """Decide a gate about rollouts.
 
     Args:
         rollouts: Every planned rollout of the run.
@@ -264,7 +264,7 @@ def judge(
             tried, and taken as repeatable.
 
     Raises:
-        InputError: A renderer that the gate names is not there, nothing is left to judge, or the
+        InputError: A renderer that the gate names is not there, nothing is left to compare, or the
             scenes are too few to pass a gate about others.
     """
     sides = _sides(rollouts)

@@ -66,7 +66,7 @@ def rollouts_of(manifests: Iterable[JsonView]) -> tuple[list[Rollout], Times]:
 
 
 def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, JsonObject]:
-    """Count outcomes by arm.
+    """Count outcomes by variant.
 
     Args:
         rollouts: Those of a run, in its order.

@@ -213,7 +213,7 @@ def flipped(rows: F64) -> F64:
 
 
 def verdict_of(change: Change, p: float | None, max_new: int) -> Verdict:
-    """Judge a metric on a suite.
+    """Decide about a metric on a suite.
 
     Args:
         change: What changed.

@@ -110,7 +110,7 @@ CAUSES: dict[str, Cause] = {
 
 
 def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> Outcome:
-    """Judge rollouts that could not be run or scored.
+    """Decide about rollouts that could not be run or scored.
 
     Args:
         failures: The ``failures`` block of summary.json: ``n_failed``, ``n_rollouts``,
@@ -150,7 +150,7 @@ def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
 def verdict(
     bounds: list[float] | None, p: float | None, margin: float, direction: Direction
 ) -> Verdict:
-    """Judge a difference by its 95 % interval.
+    """Decide about a difference by its 95 % interval.
 
     Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is
         more than ``margin`` worse, and the test

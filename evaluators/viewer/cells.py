@@ -338,7 +338,7 @@ def _camera_data(
 
 
 def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
-    """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy,
+    """Return what projects rig coordinates into an image of at most this width: fx, fy, cx, cy,
     and the mounting, 3 rows of 4.
     """
     scale = min(1.0, width_px / camera.width)

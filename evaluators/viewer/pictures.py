@@ -31,7 +31,7 @@ from evaluators.opening import Run
 
 JPEG_QUALITY = 76
 FRAME_PX = 512  # wider frames are made smaller
-BEFORE_US = 1_000_000  # of an event: the pictures that led to it
+BEFORE_US = 1_000_000  # of an event: the images that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
@@ -109,7 +109,7 @@ def encoded(source: Source, zero_us: int) -> dict[str, Any]:
 
 
 def jpeg(rgb: U8) -> str:
-    """Encode a picture ``(H, W, 3)`` for a page, as base64."""
+    """Encode an image ``(H, W, 3)`` for a page, as base64."""
     # Halved colour resolution and optimised tables: a page is looked at, not measured.
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
@@ -137,7 +137,7 @@ def trust_by_time(rows: Rows, camera: str) -> dict[int, str]:
 
 
 def seen_before(rows: Rows, t_us: int) -> str:
-    """Say how much of the pictures in the second before an instant was guessed and recorded; empty
+    """Say how much of the images in the second before an instant was guessed and recorded; empty
     where no fixer says so.
 
     Example:

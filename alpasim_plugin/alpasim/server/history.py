@@ -12,7 +12,7 @@ past is found by content:
   instead; the first frame of a drive has none, so its nearest pose counts.
 - A frame with no parent within reach starts a history.
 
-Two drives that differ thus have their own branches from where they part, and what one is given does
+Two drives that differ thus have their own branches from where they part, and what one receives does
 not depend on the other.
 
 Memory is bounded: what nobody used for `expiry_s` goes; beyond `max_bytes`, first frames that have

@@ -1,8 +1,8 @@
 """The layers of the semantic map, and their conversion to arrays: straight segments with width and
 colour, and flat triangles.
 
-What is painted is the rule of `world.paint`: marking lines and lane edges of known paint, each
-once; unknown paint is drawn as nothing.
+What is painted is the rule of `world.paint`: marking lines and lane edges of a
+known kind, each once; unknown lane markings are not drawn.
 """
 
 from __future__ import annotations

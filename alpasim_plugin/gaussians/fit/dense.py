@@ -1,7 +1,7 @@
 """Measure what photographs along a way say of every pixel: how far away it is, by optical flow to
 neighbours, and whether it is sky.
 
-A neighbour is first warped by the depth that tracks give (inverse depth is linear in the picture on
+A neighbour is first warped by the depth that tracks give (inverse depth is linear in the image on
 every plane, so it is interpolated linearly between the tracks' points); flow (dense inverse search,
 Kroeger et al. 2016) then finds the little that is left, also where the road under the bonnet moves
 by a hundred pixels. The inverse depth of a pixel is the one that explains all neighbours best
@@ -259,7 +259,7 @@ def _confirms(
 I32 = npt.NDArray[np.int32]
 
 SMOOTH_LEVELS = 5.0  # largest step of brightness to a neighbouring pixel
-SMALLEST_SHARE = 0.002  # of the picture, of a region
+SMALLEST_SHARE = 0.002  # of the image, of a region
 SOLID_SHARE = 0.25  # of a region's measured pixels that have a depth: then it is a wall
 COLOUR_LEVELS = 40.0  # by which the sky's colour may differ from its median in all photographs
 
@@ -276,13 +276,13 @@ def sky_masks(views: Sequence[PosedView]) -> list[Bool]:
     ]
     if not seen:
         return [region > 0 for region in regions]
-    # Every photograph counts alike, so that one wall that fills a picture does not decide.
+    # Every photograph counts alike, so that one wall that fills an image does not decide.
     usual = np.median([np.median(colours, axis=0) for colours in seen], axis=0)
     return [_of_colour(view, region, usual) for view, region in zip(views, regions, strict=True)]
 
 
 def _regions(view: PosedView) -> I32:
-    """Label smooth regions that reach the top of the picture and are not solid."""
+    """Label smooth regions that reach the top of the image and are not solid."""
     grey = cv2.GaussianBlur(
         cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), 0
     )

@@ -1,4 +1,4 @@
-"""What the camera did to a photograph: its lens (OpenCV's models, and the pinhole picture without
+"""What the camera did to a photograph: its lens (OpenCV's models, and the pinhole image without
 distortion), exposure and balance.
 
 A camera that meters for itself changes its gain by a tenth from one street corner to the next. A
@@ -23,7 +23,7 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 
 FISHEYE_HALF_VIEW_RAD = np.radians(
     50.0
-)  # of a fisheye's pinhole picture, from its middle to a side: beyond, pixels are only stretched
+)  # of a fisheye's pinhole image, from its middle to a side: beyond, pixels are only stretched
 _FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
 
 
@@ -66,7 +66,7 @@ class Lens:
         return self.model == "fisheye" or bool(self.distortion.any())
 
     def straight_K(self) -> F64:
-        """Return the intrinsics of the picture without distortion, of the same size: what it shows
+        """Return the intrinsics of the image without distortion, of the same size: what it shows
         is all in the photograph.
         """
         if not self.bends:

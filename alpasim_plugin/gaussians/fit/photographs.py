@@ -14,7 +14,7 @@ through their converters, for example):
 ``opencv`` is x right, y down, z forward; ``opengl`` is x right, y up, z back (what Instant-NGP and
 nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3; with
 ``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``,
-radians, may stand for the focal length. Pictures are freed of their distortion as they are read.
+radians, may stand for the focal length. Images are freed of their distortion as they are read.
 Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
 names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
@@ -117,7 +117,7 @@ class Picture:
 
 
 def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, list[Picture]]:
-    """Read what a ``transforms.json`` says, without opening its pictures.
+    """Read what a ``transforms.json`` says, without opening its images.
 
     Args:
         folder: Holds the file.
@@ -125,7 +125,7 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, li
             a file.
 
     Returns:
-        The document; its frames as pictures, in the file's order.
+        The document; its frames as images, in the file's order.
 
     Raises:
         InputError: The file or a key is missing, or something in it cannot be: names the frame and
@@ -145,7 +145,7 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, li
 
 
 def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
-    """Return the pictures whose files exist, and the names of the others.
+    """Return the images whose files exist, and the names of the others.
 
     Raises:
         InputError: Fewer than two exist, or one lies outside of the folder.

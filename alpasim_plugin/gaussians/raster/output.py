@@ -1,4 +1,4 @@
-"""What a rasteriser returns, and the background that it is given."""
+"""What a rasteriser returns, and the background that it receives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Road paint as short straight strokes, from lane edges, marking lines, crosswalks and stop lines.
+"""Lane markings as short strokes, from lane edges, marking lines, crosswalks and stop lines.
 
 Which lines are painted is the rule of `world.paint`.
 """
@@ -27,7 +27,7 @@ WHITE, YELLOW = 0, 1
 
 
 class Strokes(NamedTuple):
-    """Straight pieces of paint in ground coordinates."""
+    """Straight pieces of lane markings in ground coordinates."""
 
     start: F64  # (M, 2) metres
     end: F64  # (M, 2)
@@ -36,7 +36,7 @@ class Strokes(NamedTuple):
 
 
 def paint_strokes(site: Site) -> Strokes:
-    """Return all paint near the site's path."""
+    """Return all lane markings near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
     painted = [(site.frame.to_ground(line), paint) for line, paint in painted_lines(lane_map)]

@@ -1,4 +1,4 @@
-"""ColorVideoVDP (Mantiuk et al. 2024): how far apart two pictures look, in units of
+"""ColorVideoVDP (Mantiuk et al. 2024): how far apart two images look, in units of
     just-objectionable differences; 10 is the same.
 
 The package ``cvvdp`` (MIT) is not a dependency: install it beside (`HOW`). Its parameters ship in
@@ -31,7 +31,7 @@ class ColourVideoVDP:
         self._metric = package.cvvdp(display_name=DISPLAY, quiet=True, device=torch.device("cpu"))
 
     def jod(self, made: U8, truth: U8) -> F64:
-        """Return the quality ``(T,)`` of pictures ``(T, H, W, 3)``, each by itself: 10 is no
+        """Return the quality ``(T,)`` of images ``(T, H, W, 3)``, each by itself: 10 is no
         visible difference.
         """
         return np.array(

@@ -1,15 +1,15 @@
-"""Lane paint in pictures: which pixels are painted, and how much of it was invented or lost.
+"""Lane markings in images: which pixels show them, and how many were invented or lost.
 
-A pixel is paint where the road is seen and it is brighter than the road on both its sides along the
-row, which must be alike: the symmetrical local threshold, best of the comparison by Veit et al.
-(ITSC 2008), here with medians. Brightness is the mean of red and green, so that white and yellow
-count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The
-detector is simple on purpose and the same for the photograph and for what is measured: a kerb's
-bright edge is paint in both.
+A pixel shows a lane marking where the road is seen and it is brighter than the road on both its
+sides along the row, which must be alike: the symmetrical local threshold, best of the comparison by
+Veit et al. (ITSC 2008), here with medians. Brightness is the mean of red and green, so that white
+and yellow count alike. The width of the sides follows from the distance: a lane marking is at most
+`WIDEST_M` wide. The detector is simple on purpose and the same for the photograph and for what is
+measured: a kerb's bright edge counts as one in both.
 
-Precision is the share of the painted pixels of a picture that lie within `TOLERANCE_PX` of a
-painted pixel of the photograph; recall is the share of the photograph's that lie so near to one of
-the picture. Paint that is nowhere in the photograph is invented: 1 - precision.
+Precision is the share of the painted pixels of an image that lie within `TOLERANCE_PX` of a painted
+pixel of the photograph; recall is the share of the photograph's that lie so near to one of the
+image. A lane marking that is nowhere in the photograph is invented: 1 - precision.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from alpasim_plugin.core.types import F64, U8, Bool, HeightField
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.world.ground import height_at
 
-CONTRAST_LEVELS = 18.0  # by which paint is brighter than either side
+CONTRAST_LEVELS = 18.0  # by which a lane marking is brighter than either side
 WIDEST_M = 0.35
 NEAREST_M, FARTHEST_M = 4.0, 30.0  # of the road that is looked at, along the optical axis
 ASIDE_M = 4.0  # from the recorded path
@@ -34,13 +34,13 @@ TOLERANCE_PX = 2
 
 @dataclass(frozen=True)
 class PaintCounts:
-    """Painted pixels of pictures and of their photographs; counts of several pictures are added.
+    """Painted pixels of images and of their photographs; counts of several images are added.
 
     Attributes:
-        made: In the picture.
-        made_true: Of those, near paint of the photograph.
+        made: In the image.
+        made_true: Of those, near a lane marking of the photograph.
         true: In the photograph.
-        true_made: Of those, near paint of the picture.
+        true_made: Of those, near a lane marking of the image.
     """
 
     made: int = 0
@@ -58,12 +58,12 @@ class PaintCounts:
 
     @property
     def precision(self) -> float | None:
-        """Return the share of paint that is real; None where there is none."""
+        """Return the share of lane markings that are real; None where there is none."""
         return self.made_true / self.made if self.made else None
 
     @property
     def recall(self) -> float | None:
-        """Return the share of the real paint that is shown; None where there is none."""
+        """Return the share of the real lane markings that are shown; None where there is none."""
         return self.true_made / self.true if self.true else None
 
 
@@ -122,7 +122,7 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
 
 
 def paint_of(rgb: U8, road: Road) -> Bool:
-    """Return which pixels ``(H, W)`` of a picture ``(H, W, 3)`` are painted road."""
+    """Return which pixels ``(H, W)`` of an image ``(H, W, 3)`` are painted road."""
     bright = rgb[..., :2].astype(np.float64).mean(axis=2)
     out = np.zeros(bright.shape, dtype=bool)
     for row in np.flatnonzero(road.side_px):
@@ -148,7 +148,7 @@ def _brighter(row: F64, side: int) -> Bool:
 
 
 def compare_paint(made: U8, truth: U8, road: Road) -> PaintCounts:
-    """Count the painted pixels of a picture and of its photograph, both ``(H, W, 3)``."""
+    """Count the painted pixels of an image and of its photograph, both ``(H, W, 3)``."""
     a, b = paint_of(made, road), paint_of(truth, road)
     size = 2 * TOLERANCE_PX + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))

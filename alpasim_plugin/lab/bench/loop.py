@@ -52,7 +52,7 @@ class FrameCost:
 
     Attributes:
         renderer: Its name.
-        size: Width and height of the camera's picture, pixels.
+        size: Width and height of the camera's image, pixels.
         frames: How many the means are over.
         ms: Mean processor time by stage, on one thread; each pass through a stage with its least
             time of the repeats.
@@ -170,9 +170,7 @@ def reference_ms(times: int = 7) -> float:
 
 
 def frame_cost(renderer: str, scenario: Scenario, repeats: int) -> FrameCost:
-    """Drive a scene several times behind a renderer, on one thread, and judge what the policy
-    saw.
-    """
+    """Drive a scene several times behind a renderer, on one thread, and measure the images."""
     drives: list[dict[str, list[float]]] = []
     for _ in range(repeats):
         clear_cache("recording:")  # each drive reads its photographs, as the first of a scene does

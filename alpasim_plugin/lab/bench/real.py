@@ -2,7 +2,7 @@
 of a camera that no fit ever saw.
 
 Every photograph of such a camera is rendered in order of time, as the loop would ask for frames, so
-that a fixer has its history; only photographs that the fit did not see are measured. Pictures are
+that a fixer has its history; only photographs that the fit did not see are measured. Images are
 compared at the size at which the scenario renders the camera.
 """
 
@@ -182,7 +182,7 @@ def _refuse_blocks(renderer: Renderer) -> None:
 def _rendered(
     scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]
 ) -> list[U8]:
-    """Return a picture for each photograph."""
+    """Return an image for each photograph."""
     frames = []
     for i, shot in enumerate(taken):
         frames.append(renderer.render(request_of(scenario, shot)).rgb)

@@ -1,1 +1,1 @@
-"""The laboratory's verbs: train, judge, bench."""
+"""The laboratory's verbs: train and bench."""

@@ -1,4 +1,4 @@
-"""``simrun bench real``: renderers and fixers judged by the photographs of imported drives."""
+"""``simrun bench real``: renderers and fixers measured by the photographs of imported drives."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def real(
     a second camera.
 
     PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and
-    recall of lane paint.
+    recall of lane markings.
     """
     del debug
     specs = {name: resolve_renderer(name) for name in _names(renderers)}

@@ -1,4 +1,5 @@
-"""The last stage of the distilled arms as a task: the student's rollouts, the scores' alternation,
+"""The last stage of the distilled systems as a task: the student's rollouts, the scores'
+alternation,
 and the adversarial head.
 
 Parts: ``dit`` (the student), ``fake`` (the fake score), ``head`` (One-Forcing). The real score is

@@ -3,7 +3,7 @@ Deconvolution and Checkerboard Artifacts, 2016).
 
 A generator that works on cells of 4 and 16 pixels may draw their borders: the steps from a pixel to
 its neighbour are then larger in some columns of a cell than in others. In the truth they are not,
-apart from chance, and chance is the same in both pictures.
+apart from chance, and chance is the same in both images.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ PERIODS = (4, 16)  # cells of the generator at 1/4 and at 1/16
 # steps above count as this one: a grid shows on flat surfaces, and edges and texture say nothing
 # about it
 LARGEST = 0.03
-LEAST = 1e-3  # added to a mean step, so that a flat picture has a ratio
+LEAST = 1e-3  # added to a mean step, so that a flat image has a ratio
 
 
 def grid_term(made: Tensor, truth: Tensor) -> Tensor:
@@ -47,7 +47,7 @@ def _steps(images: Tensor, axis: int) -> Tensor:
 
 
 def _by_place(steps: Tensor, period: int) -> Tensor:
-    """Return the mean over cells ``(B, places)``; a picture of one cell has no step across the
+    """Return the mean over cells ``(B, places)``; an image of one cell has no step across the
     cell's end.
     """
     places = min(period, steps.shape[1])

@@ -1,7 +1,7 @@
 """Errors of the semantic map in training: pixels are the evidence, the map is a hint.
 
-A map may be missing, lack the paint of its lanes, lie beside the road, or be that of another
-street. A fixer that has seen all of these believes a map only where the picture agrees with it.
+A map may be missing, lack its lane markings, lie beside the road, or be that of another
+street. A fixer that has seen all of these believes a map only where the image agrees with it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHIFT_PX, TURN_DEG, ZOOM = (
     0.03,
 )  # spread along x and y, at 256 pixels across; of the turn; of the scale's logarithm
 PAINT = ("line_untyped", "line_white", "line_yellow", "line_other")
-ALIKE = 0.985  # cosine between a pixel's colour and that of paint, at any brightness
+ALIKE = 0.985  # cosine between a pixel's colour and that of lane markings, at any brightness
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class MapError:
     Attributes:
         kind: See `CHANCES`; "other" shows the map of another sequence.
         shift_px: Of a shifted map, along x and y, at 256 pixels across.
-        turn_deg, zoom: Of a shifted map, about the middle of the picture.
+        turn_deg, zoom: Of a shifted map, about the middle of the image.
     """
 
     kind: Kind
@@ -81,7 +81,7 @@ def with_error(sdmap: U8, error: MapError) -> U8:
 
 
 def is_paint(sdmap: U8) -> Bool:
-    """Return which pixels of maps ``(..., H, W, 3)`` show lane paint, at any brightness."""
+    """Return which pixels of maps ``(..., H, W, 3)`` show lane markings, at any brightness."""
     colour = sdmap.astype(np.float32)
     length = np.linalg.norm(colour, axis=-1)
     paint = np.array([COLOURS[name] for name in PAINT], np.float32)

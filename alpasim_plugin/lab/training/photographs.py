@@ -44,7 +44,7 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
     """Read a folder of photographs from structure from motion: axes of OpenGL, an arbitrary unit,
     and not all images there.
 
-    A picture is freed of its distortion at full size, then reduced by averaging, and its height is
+    An image is freed of its distortion at full size, then reduced by averaging, and its height is
     cut at the middle to a multiple of 16.
 
     Args:

@@ -1,9 +1,9 @@
-"""DiFix3D+ and DiffusionHarmonizer: the deployed step from the render, with losses on the picture.
+"""DiFix3D+ and DiffusionHarmonizer: the deployed step from the render, with losses on the image.
 
     z_r = E(r),  x = z_r / (alpha + sigma),  z_0 = x - t v(x, t),  y' = D(z_0)          `lab.image_fixers.pipeline`
     L   = | y' - y |^2  +  lambda min(d(y', y), c)  +  w L_warp(y')                      on values in [-1, 1]
 
-``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value
+``r`` render, ``y`` clean frame, ``d`` perceptual distance of an image, ``c`` the largest value
 that counts (DiffusionHarmonizer: beyond it there is no gradient), ``L_warp`` of `warping` (its
 temporal form). The temporal form encodes the clip ``[r_t, y'_t-1 ... y'_t-4]``, newest first: the
 last four outputs are the model's own, rounded to eight bits as they are shown, without gradients.
@@ -75,7 +75,7 @@ class RenderStep:
 
 
 def eight_bits(frames: Tensor) -> Tensor:
-    """Round values in [-1, 1] to 256 levels, as pictures are shown; values beyond are clipped."""
+    """Round values in [-1, 1] to 256 levels, as images are shown; values beyond are clipped."""
     return frames.clamp(-1, 1).add(1).mul(GREY).round().div(GREY).sub(1)
 
 
@@ -87,14 +87,14 @@ def newest_first(frames: Tensor) -> Tensor:
 def picture_losses(
     made: Tensor, clean: Tensor, distance: Distance, perceptual: float, clamp: float | None
 ) -> dict[str, Tensor]:
-    """Return the weighted losses of pictures ``(B, 3, 1, H, W)`` in [-1, 1].
+    """Return the weighted losses of images ``(B, 3, 1, H, W)`` in [-1, 1].
 
     Args:
         made: The model's, not clipped.
         clean: The clean frames.
-        distance: Perceptual distance of pictures.
+        distance: Perceptual distance of images.
         perceptual: Its weight lambda.
-        clamp: The largest distance of a picture that counts; None: all.
+        clamp: The largest distance of an image that counts; None: all.
     """
     distances = distance(made[:, :, 0], clean[:, :, 0])
     counted = distances if clamp is None else distances.clamp(max=clamp)

@@ -31,16 +31,16 @@ DOING = "setting up the training of an image model"
 ROLLOUT = (
     8  # frames of a temporal clip; the loss is on one of those that have four outputs before them
 )
-MEASURED = 64  # pictures that the clamp is measured on
+MEASURED = 64  # images that the clamp is measured on
 
 
 @dataclass(frozen=True)
 class RenderStepLoss:
-    """Losses on the deployed step's picture.
+    """Losses on the deployed step's image.
 
     Args:
         weight: lambda, of the perceptual distance.
-        clamp: Share of the training pictures' distances, render against clean frame, that the
+        clamp: Share of the training images' distances, render against clean frame, that the
             largest distance that counts is above; None: all distances count whole. The published .3
             is a value of LPIPS, and other distances have other values.
         references: The last four outputs that the network looks at: its ``own``, the ``clean``

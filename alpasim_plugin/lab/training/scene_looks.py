@@ -33,7 +33,7 @@ class DamageRanges:
         depth_error: Spread of the depth of the first points.
         pose_error_m: Spread of the views' poses; half of the scenes have none where the range
             begins at 0.
-        shift_m: Cycle: how far aside the fitted views lie, to either side.
+        shift_m: Cycle: lateral offset of the fitted views, to either side.
     """
 
     share: Range = (0.05, 0.5)

@@ -82,10 +82,10 @@ def drift_of(psnr: F64 | None) -> float | None:
 
 
 def grid_ratio(images: U8, truths: U8, side: int = 4, flat_levels: float = 3.0) -> float | None:
-    """Return how much stronger a picture's steps are across the borders of a grid than elsewhere,
+    """Return how much stronger an image's steps are across the borders of a grid than elsewhere,
     on surfaces that are flat in the truth.
 
-    A network that makes cells of pixels at a time may leave their grid in the picture; 1 is none.
+    A network that makes cells of pixels at a time may leave their grid in the image; 1 is none.
     Both axes count alike.
 
     Args:

@@ -14,14 +14,14 @@ TITLE_PX, GAP_PX = 18, 3
 
 
 def sheet(columns: Mapping[str, Sequence[U8]], rows: Sequence[str]) -> U8:
-    """Lay pictures out as a table with titles.
+    """Lay images out as a table with titles.
 
     Args:
-        columns: Title -> one picture ``(H, W, 3)`` a row, all of one size.
-        rows: Titles of the rows, written into their first picture's corner.
+        columns: Title -> one image ``(H, W, 3)`` a row, all of one size.
+        rows: Titles of the rows, written into their first image's corner.
 
     Raises:
-        EvaluatorError: Columns of other lengths, or pictures of other sizes.
+        EvaluatorError: Columns of other lengths, or images of other sizes.
     """
     sizes = {picture.shape for column in columns.values() for picture in column}
     if len(sizes) != 1 or any(len(column) != len(rows) for column in columns.values()):

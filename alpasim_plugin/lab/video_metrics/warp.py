@@ -21,7 +21,7 @@ def warp_l1(video: U8) -> F64:
 
     Farneback flow on grey frames (pyramid 0.5, 3 levels, window 21, 3 iterations, poly_n 5,
     poly_sigma 1.2); the previous frame is sampled where the flow points, bilinear, in float32; mean
-    over the pixels that come from inside the picture of the absolute difference summed over RGB,
+    over the pixels that come from inside the image of the absolute difference summed over RGB,
     divided by 765.
 
     Args:

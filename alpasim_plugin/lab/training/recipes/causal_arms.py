@@ -1,4 +1,4 @@
-"""The causal video arms of the paper's comparison: OmniDreams, Self-Forcing, One-Forcing,
+"""The causal video systems of the paper's comparison: OmniDreams, Self-Forcing, One-Forcing,
 ArtiFixer.
 
 Shares and rates are the papers': U is OneFixer's updates, a rate is relative to OneFixer's. Where
@@ -23,7 +23,7 @@ STUDENT = PartSchedule(rate=1 / 15, betas=(0.0, 0.999), clip=10.0)
 CRITIC = PartSchedule(rate=1 / 75, betas=(0.0, 0.999), clip=10.0)
 
 # OmniDreams: the causal backbone, fine-tuned to the fixer task. It is also the student of the
-# distilled arms.
+# distilled systems.
 CAUSAL = Stage("student", FlowMatching("block"))
 # Their teacher: the bidirectional backbone, fine-tuned alike.
 TEACHER = Stage(

@@ -37,7 +37,7 @@ GSFIX3D_LAST_SHARE = 0.01 ** (
     10_000 / 25_000
 )  # its rate falls to a hundredth in 25,000 updates; the paper's run has 10,000
 CONDITION_DROPOUT = (
-    0.2  # .1 for the picture alone and .1 for picture and embedding; there is no embedding here
+    0.2  # .1 for the image alone and .1 for image and embedding; there is no embedding here
 )
 WINDOW = 7  # latents of 25 frames
 
