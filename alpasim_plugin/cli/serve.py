@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
@@ -170,12 +168,8 @@ def _serve_policy(
     facts = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     text = f"serving EgodriverService at {host.address}: {policy}"
     _host(host, facts, text, host_policy, as_json)
-    counts: dict[str, float] = dict(service.counts)
+    counts = dict(service.counts)
     counts["sessions closed for room"] = len(service.sessions.crowded_out)
-    if service.drives_s:
-        for percent in (50, 95, 99):
-            time_ms = float(np.percentile(service.drives_s, percent)) * 1000
-            counts[f"drive_ms_p{percent}"] = round(time_ms, 2)
     _print_counts(counts, as_json)
 
 

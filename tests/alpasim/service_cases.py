@@ -13,9 +13,11 @@ from typing import Any
 import cv2
 import grpc
 import numpy as np
+import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
+from alpasim_plugin.alpasim.server.sources import UpstreamSource
 from alpasim_plugin.core.geometry import quat_from_matrix, se2
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.log.images import encode_image
@@ -218,12 +220,17 @@ def channel_to(host: Host) -> Iterator[Any]:
         yield channel
 
 
+def trust_every_frame(monkeypatch: pytest.MonkeyPatch, trust: float = 1.0) -> None:
+    """Let the distance to the recorded path count for nothing."""
+    monkeypatch.setattr(UpstreamSource, "_trust_in", lambda source, view, left: trust)
+
+
 @contextmanager
 def in_front_of(
     upstream: Host, policy: HostPolicy = HostPolicy(), **settings: Any
 ) -> Iterator[tuple[Any, Assembled]]:
     """Run the service in front of another; give a stub of it and its parts."""
-    made = assemble(Settings(upstream=Upstream(upstream.address), threads=1, **settings))
+    made = assemble(Settings(upstream=Upstream(upstream.address), **settings))
     with (
         hosted({"SensorsimService": made.service}, policy=policy) as host,
         channel_to(host) as channel,

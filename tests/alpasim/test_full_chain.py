@@ -29,6 +29,7 @@ from evaluators import reduce_rollout, score
 from evaluators.metrics.presets import preset
 from scenarios.load import load_scenario
 from scenarios.suite import shipped_names
+from tests.alpasim.service_cases import trust_every_frame
 
 pytestmark = pytest.mark.slow
 
@@ -120,7 +121,7 @@ class Network:
 @pytest.fixture(scope="module")
 def renderer(scene):
     """The service behind: frames of the scene as built, whoever asks."""
-    return assemble(Settings(renderer="clean", scenes=(scene,), threads=1)).services
+    return assemble(Settings(renderer="clean", scenes=(scene,))).services
 
 
 @contextmanager
@@ -128,14 +129,13 @@ def chain(network, scene, renderer, overrides):
     """Start the services; give the addresses of the fixed renderer, the one behind it, and the
     driver.
     """
+    trust_every_frame(network.monkeypatch)
     base = network.add(renderer)
     front = assemble(
         Settings(
             overrides=overrides,
             scenes=(scene,),
             upstream=Upstream(base),
-            threads=1,
-            reliability=1.0,
         )
     )
     spec = resolve("policy", "lane-camera")

@@ -11,7 +11,7 @@ import pytest
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.wire import common_pb2, logging_pb2, sensorsim_pb2
-from tests.alpasim.service_cases import StandInRenderer, hosted, in_front_of
+from tests.alpasim.service_cases import StandInRenderer, hosted, in_front_of, trust_every_frame
 
 Entry = logging_pb2.LogEntry
 
@@ -95,10 +95,11 @@ def replay(log, scenes, **settings: Any):
     return images
 
 
-def test_the_calls_of_one_recorded_drive(shared_data, overrides):
+def test_the_calls_of_one_recorded_drive(shared_data, overrides, monkeypatch):
+    trust_every_frame(monkeypatch)
     log, scenes = complete_logs(shared_data)[0], shared_data / "alpasim-golden" / "scenes"
     scene = scenes / f"{log.parents[1].name}.usdz"
-    images = replay(log, scene, overrides=overrides, reliability=1.0)
+    images = replay(log, scene, overrides=overrides)
     assert len(images) > 20
     handed_on = replay(log, scene, renderer="identity")
     recorded = [

@@ -174,7 +174,6 @@ def test_a_server_drops_a_wrong_map_and_says_so(aside_m, is_off, overrides, capl
                 renderer="onefixer+clean",
                 scenes=["smoke/straight"],
                 overrides=[*overrides, *more],
-                threads=1,
             )
         )
         entry, asked = made.scenes.get(ask().scene_id), ask()

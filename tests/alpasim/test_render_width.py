@@ -13,7 +13,7 @@ from tests.alpasim.test_sensorsim_local import SCENE, ask
 
 
 def frames(requests, **settings: object):
-    made = assemble(Settings(scenes=[SCENE], threads=1, **settings))  # type: ignore[arg-type]
+    made = assemble(Settings(scenes=[SCENE], **settings))  # type: ignore[arg-type]
     return [made.service.frames.answers([asked], CallTime())[0] for asked in requests]
 
 

@@ -30,7 +30,7 @@ W, H = 64, 36
 
 @pytest.fixture(scope="module")
 def served():
-    made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1))
+    made = assemble(Settings(renderer="clean", scenes=[SCENE]))
     with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
         yield Stub(channel, "SensorsimService"), made
 
@@ -123,7 +123,7 @@ def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path):
     )
     write_ply(tmp_path / "own.ply", cloud)
     overrides = [f"background.file={tmp_path / 'own.ply'}"]
-    made = assemble(Settings(renderer="clean", scenes=[SCENE], overrides=overrides, threads=1))
+    made = assemble(Settings(renderer="clean", scenes=[SCENE], overrides=overrides))
     shown = []
     with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
         stub = Stub(channel, "SensorsimService")

@@ -31,7 +31,7 @@ def file(tmp_path_factory):
 
 
 def served(file, renderer):
-    return SceneCache([file], resolve_served(renderer), False, threads=1).get("served")
+    return SceneCache([file], resolve_served(renderer), False).get("served")
 
 
 def request(entry, t_us):

@@ -125,7 +125,7 @@ def test_what_rolls(asked, shutter, rolls):
 
 
 def served(shutter, asked):
-    made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1, shutter=shutter))
+    made = assemble(Settings(renderer="clean", scenes=[SCENE], shutter=shutter))
     return decode_image(made.service.frames.answers([asked], CallTime())[0])
 
 
@@ -142,7 +142,7 @@ def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_r
 
 
 def test_the_map_has_the_shutter_of_the_frame():
-    made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE], threads=1))
+    made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE]))
     asked = ask()
     view, entry = read_view(asked), made.scenes.get(asked.scene_id)
     lens = read_lens(asked.camera_intrinsics, W, H)
@@ -150,8 +150,8 @@ def test_the_map_has_the_shutter_of_the_frame():
     boxes = {name: pair[1] for name, pair in view.objects.items()}
     request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
     drawn, still = (
-        drawn_map(entry, request, lens, 1),
-        drawn_map(entry, replace(request, exposure=None), lens, 1),
+        drawn_map(entry, request, lens),
+        drawn_map(entry, replace(request, exposure=None), lens),
     )
     assert still is not None
     assert (drawn != still).any()

@@ -46,7 +46,7 @@ def version_of(
 
     Args:
         spec: Renderer and fixer.
-        settings: What else shapes the images: device, scenes, reliability, masks.
+        settings: What else shapes the images: device, scenes, masks.
         upstream: The upstream's own triple.
 
     Returns:
@@ -134,12 +134,9 @@ class Settings:
         overrides: ``KEY=VALUE`` of the fixer's settings.
         scenes: Folders, files or shipped names.
         upstream: None: render here.
-        device, threads: For renderer and fixer.
+        device: For renderer and fixer.
         history_bytes, expiry_s: Bounds of the histories.
-        reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded
-            path.
         masks: Grey masks by camera.
-        kept_scenes: Scenes that stay loaded.
         shutter: Which shutters roll; see `shutters.exposure_of`.
         render_width: Pixels; wider images are made at this width and enlarged. None: all are made
             as asked.
@@ -150,12 +147,9 @@ class Settings:
     scenes: Sequence[str] = ()
     upstream: Upstream | None = None
     device: str = "cpu"
-    threads: int | None = None
     history_bytes: int = 2 << 30
     expiry_s: float = 900.0
-    reliability: float | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
-    kept_scenes: int = 4
     shutter: Shutter = "asked"
     render_width: int | None = None
 
@@ -207,7 +201,7 @@ def assemble(settings: Settings) -> Assembled:
             f"--upstream {settings.upstream.address}: {settings.renderer!r} renders itself",
             "give a fixer (onefixer), identity, or no --upstream",
         )
-    if settings.upstream is None and (settings.masks or settings.reliability is not None):
+    if settings.upstream is None and settings.masks:
         raise InputError(
             "--mask: our own renderer states its opacity",
             "use them with --upstream",
@@ -218,24 +212,17 @@ def assemble(settings: Settings) -> Assembled:
             "use it without --upstream",
         )
     busy = threading.Lock()
-    fixers = None if spec.fixer is None else FixerCache(spec, settings.device, settings.threads)
+    fixers = None if spec.fixer is None else FixerCache(spec, settings.device)
     needs_map = fixers is not None and fixers.needs_map
     own = spec if settings.upstream is None else None
     scenes = None
     if settings.scenes:
-        scenes = SceneCache(
-            settings.scenes,
-            own,
-            needs_map,
-            settings.device,
-            settings.threads,
-            kept=settings.kept_scenes,
-        )
+        scenes = SceneCache(settings.scenes, own, needs_map, settings.device)
     channel = stub = None
     source: FrameSource
     if settings.upstream is None:
         assert scenes is not None
-        source = LocalSource(scenes, busy, settings.threads, settings.shutter)
+        source = LocalSource(scenes, busy, settings.shutter)
     else:
         channel = settings.upstream.channel()
         stub = Stub(channel, "SensorsimService")
@@ -243,17 +230,14 @@ def assemble(settings: Settings) -> Assembled:
         source = UpstreamSource(
             stub,
             scenes,
-            settings.reliability,
             masks,
             settings.upstream.as_png,
-            settings.threads,
             settings.shutter,
         )
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
     frames = FrameServer(source, fixers, tree, busy, settings.render_width)
     shaping = {
         "device": settings.device,
-        "reliability": settings.reliability,
         "masks": {camera: file_sha256(path) for camera, path in settings.masks.items()},
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,

@@ -31,6 +31,7 @@ from alpasim_plugin.runs.guards import checked_frames
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 
+KEPT_SCENES = 4  # loaded, the least recently used going first
 FILES = (".usdz", ".yaml", ".yml", ".xml")
 
 
@@ -76,12 +77,12 @@ class FixerCache:
 
     Args:
         spec: A renderer with a fixer.
-        device, threads: For the network.
+        device: For the network.
     """
 
-    def __init__(self, spec: RendererSpec, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(self, spec: RendererSpec, device: str = "cpu") -> None:
         assert spec.fixer is not None, "a renderer without a fixer has nothing to fix"
-        self._spec, self._session = spec.fixer, {"device": device, "threads": threads}
+        self._spec, self._session = spec.fixer, {"device": device, "threads": None}
         self._made: dict[tuple[str, int], CausalFixer] = {}
 
     @property
@@ -136,8 +137,7 @@ class SceneCache:
         spec: The renderer to build for a scene; None: scenes are only needed for their maps and
             paths.
         needs_map: Whether the fixer takes semantic maps.
-        device, threads, seed: For the renderer.
-        kept: Scenes that stay loaded, the least recently used going first.
+        device: For the renderer.
 
     Raises:
         InputError: A place without a scene, a file that is no scene, or two scenes of one id.
@@ -149,12 +149,9 @@ class SceneCache:
         spec: RendererSpec | None,
         needs_map: bool,
         device: str = "cpu",
-        threads: int | None = None,
-        seed: int = 0,
-        kept: int = 4,
     ) -> None:
-        self._spec, self._needs_map, self.kept = spec, needs_map, kept
-        self._threads, self._session = threads, {"seed": seed, "device": device, "threads": threads}
+        self._spec, self._needs_map = spec, needs_map
+        self._session = {"seed": 0, "device": device, "threads": None}
         self._sources: dict[str, str | Path] = {}
         self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
         self._lock, self._loading = threading.Lock(), threading.Lock()
@@ -200,7 +197,7 @@ class SceneCache:
                 found = self._load(self._sources[scene_id])
                 with self._lock:
                     self._loaded[scene_id] = found
-                    while len(self._loaded) > self.kept:
+                    while len(self._loaded) > KEPT_SCENES:
                         self._loaded.popitem(last=False)
             return found
 
@@ -239,9 +236,7 @@ class SceneCache:
                     settings.references,
                     settings.recording,
                 )
-                references = ReferenceSession(
-                    *of, hysteresis=False, threads=thread_count(self._threads)
-                )
+                references = ReferenceSession(*of, hysteresis=False, threads=thread_count(None))
         return SceneEntry(
             scenario,
             prepare_map(scenario.lane_map) if self._needs_map else None,

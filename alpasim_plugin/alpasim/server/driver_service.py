@@ -17,7 +17,7 @@ import os
 import threading
 import time
 import traceback
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -33,7 +33,6 @@ from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, w
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.images import check_image, picture_fault
 from alpasim_plugin.core.types import (
     F64,
@@ -57,7 +56,6 @@ MOVING_MPS = 0.3
 SPEED_WINDOW_US = 200_000
 MOST_POSES = 8192  # of a session's motion; the oldest are forgotten
 MOST_CAMERAS = 64  # of a session
-KEPT_TIMES = 10_000  # newest drive calls whose time is kept
 
 
 class DriverService:
@@ -75,7 +73,6 @@ class DriverService:
 
     Attributes:
         sessions: Those that are open.
-        drives_s: Seconds of the newest `KEPT_TIMES` queries that were answered.
         counts: Calls, and failed ones, by name.
     """
 
@@ -95,7 +92,6 @@ class DriverService:
         self.sessions: Sessions[Driving] = Sessions(
             expiry_s, most_sessions, Driving.close, clock, budget
         )
-        self.drives_s: deque[float] = deque(maxlen=KEPT_TIMES)
         self.counts: Counter[str] = Counter()
 
     @answering
@@ -165,12 +161,10 @@ class DriverService:
         self, request: egodriver_pb2.DriveRequest, context: Any
     ) -> egodriver_pb2.DriveResponse:
         """Answer with a plan, or with an empty one while the policy lacks frames."""
-        began = time.perf_counter()
         session = self.sessions.get(request.session_uuid)
         with self.sessions.working(request.session_uuid, session.decoded):
             answer = session.drive(int(request.time_now_us))
         self.counts["drive" if answer.trajectory.poses else "drive without a frame"] += 1
-        self.drives_s.append(time.perf_counter() - began)
         return answer
 
     def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
@@ -442,7 +436,7 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
         )
         return made
 
-    service = _Serving(name, _file_digest(factory), make, _unknown_scene)
+    service = _Serving(name, None, make, _unknown_scene)
     with Host({"EgodriverService": service}, place, every=service.sessions.expire) as host:
         host.wait()
 
@@ -458,12 +452,3 @@ class _Serving(DriverService):
 def _unknown_scene(scene_id: str) -> Scenario:
     standing = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     return blank_scenario(scene_id, standing)
-
-
-def _file_digest(factory: Callable[..., Any]) -> str | None:
-    """Return the SHA-256 of the file that defines the policy, for `get_version`."""
-    try:
-        file = inspect.getsourcefile(factory)
-    except (TypeError, OSError):  # no Python source: a built-in, or typed after -c
-        return None
-    return file_sha256(file) if file is not None and os.path.isfile(file) else None

@@ -66,8 +66,6 @@ class FrameServer:
         self._fixers = fixers
         self._busy = busy
         self._width = width
-        self._in_work: dict[bytes, threading.Event] = {}
-        self._in_work_lock = threading.Lock()
         self.events: Counter[str] = Counter()
 
     def answers(self, requests: Sequence[Request], left: CallTime) -> list[bytes]:
@@ -95,46 +93,31 @@ class FrameServer:
                 encode(self._sized(item.frame.rgb, size), form)
                 for item, size, form in zip(rendered, sizes, forms, strict=True)
             ]
-        nodes = self._nodes(requests, views, left)
-        return [
-            self._encoded(nodes[view.key], size, form)
-            for view, size, form in zip(views, sizes, forms, strict=True)
-        ]
-
-    def _nodes(
-        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
-    ) -> dict[bytes, Node[Answered]]:
-        """Return the frame of every view. A frame that another call is working on is waited for,
-        after this call's own are done.
-        """
         nodes: dict[bytes, Node[Answered]] = {}
-        missing = dict(
-            zip((view.key for view in views), zip(requests, views, strict=True), strict=True)
-        )
-        while missing:
-            for key, (_, view) in list(missing.items()):
-                known = self.tree.find(view)
-                if known is not None:
-                    nodes[key] = known
-                    del missing[key]
-            own, others = self._claim(list(missing))
-            try:
-                if own:
-                    asked, seen = zip(*(missing[key] for key in own), strict=True)
-                    for item, view in zip(self.source.render(asked, seen, left), seen, strict=True):
-                        nodes[view.key] = self._fixed(item, view, left)
-            finally:
-                self._release(own)
-            missing = {key: value for key, value in missing.items() if key not in nodes}
-            if others and missing:
-                left.wait(others[0])
-        return nodes
+        missing: dict[bytes, tuple[Request, View]] = {}
+        for request, view in zip(requests, views, strict=True):
+            known = self.tree.find(view)
+            if known is None:
+                missing[view.key] = request, view
+            else:
+                nodes[view.key] = known
+        if missing:
+            asked, seen = zip(*missing.values(), strict=True)
+            for item, view in zip(self.source.render(asked, seen, left), seen, strict=True):
+                nodes[view.key] = self._fixed(item, view, left)
+        images = [nodes[view.key].state.image for view in views]
+        return [
+            encode(self._sized(image, size), form)
+            for image, size, form in zip(images, sizes, forms, strict=True)
+        ]
 
     def _fixed(self, item: Rendered, view: View, left: CallTime) -> Node[Answered]:
         assert self._fixers is not None
         with left.holding(self._busy):
-            # Under the lock: which frames there are does not change between the look at the tree
-            # and the entry.
+            # Under the lock: which frames there are does not change until the entry.
+            known = self.tree.find(view)
+            if known is not None:  # another call has made it meanwhile
+                return known
             parent = self.tree.parent_of(view)
             if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
                 raise UpstreamFault(
@@ -148,36 +131,11 @@ class FrameServer:
             size = size_of(answered) + NODE_BYTES + OBJECT_BYTES * len(view.objects)
             return self.tree.add(view, answered, size, parent)
 
-    def _encoded(
-        self, node: Node[Answered], size: tuple[int, int], form: tuple[int, float]
-    ) -> bytes:
-        known = node.answers.get(form)
-        if known is None:
-            known = encode(self._sized(node.state.image, size), form)
-            self.tree.remember(node, form, known)
-        return known
-
     def _sized(self, image: U8, size: tuple[int, int]) -> U8:
         """Return an image at the size asked for, where it was made smaller; an upstream's image
         has the size that the upstream chose.
         """
         return image if self._width is None else enlarged(image, size)
-
-    def _claim(self, keys: Sequence[bytes]) -> tuple[list[bytes], list[threading.Event]]:
-        """Take the keys that nobody works on; return them and what to wait for instead of the
-        others.
-        """
-        with self._in_work_lock:
-            others = [self._in_work[key] for key in keys if key in self._in_work]
-            own = [key for key in keys if key not in self._in_work]
-            for key in own:
-                self._in_work[key] = threading.Event()
-        return own, others
-
-    def _release(self, keys: Sequence[bytes]) -> None:
-        with self._in_work_lock:
-            for key in keys:
-                self._in_work.pop(key).set()
 
 
 def image_form(request: Request) -> tuple[int, float]:

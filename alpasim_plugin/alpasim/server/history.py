@@ -26,7 +26,7 @@ import time
 from bisect import bisect_left, insort
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import cv2
@@ -115,7 +115,6 @@ class Node(Generic[S]):
         T_before: Camera pose and time of its parent; None at the start of a history.
         parent: Key of its parent.
         children: How many frames follow it.
-        answers: Encoded images by format and quality.
     """
 
     view: View
@@ -125,7 +124,6 @@ class Node(Generic[S]):
     parent: bytes | None
     used_s: float
     children: int = 0
-    answers: dict[tuple[int, float], bytes] = field(default_factory=dict)
 
 
 @dataclass
@@ -134,17 +132,14 @@ class Counts:
 
     frames: int = 0
     repeated: int = 0
-    forks: int = 0
     starts: int = 0
-    expired: int = 0
-    pruned: int = 0
 
 
 class HistoryTree(Generic[S]):
     """The histories of all scenes and cameras. All methods may be called from several threads.
 
     Args:
-        max_bytes: Most memory of states and answers together.
+        max_bytes: Most memory of all states.
         expiry_s: Frames unused for so long are forgotten.
         clock: Monotonic seconds.
     """
@@ -177,13 +172,8 @@ class HistoryTree(Generic[S]):
             return None if node is None else self._touch(node.view.key)
 
     def add(self, view: View, state: S, size: int, parent: Node[S] | None) -> Node[S]:
-        """Enter an answered frame; if an equal one was entered meanwhile, that one stays and is
-        returned.
-        """
+        """Enter an answered frame that is not known yet."""
         with self._lock:
-            known = self._touch(view.key)
-            if known is not None:
-                return known
             before = None if parent is None else (parent.view.T_world_camera[1], parent.view.t_us)
             node = Node(
                 view,
@@ -199,19 +189,9 @@ class HistoryTree(Generic[S]):
             self.counts.frames += 1
             self.counts.starts += parent is None
             if parent is not None:
-                self.counts.forks += parent.children > 0
                 parent.children += 1
             self._trim(keep=view.key)
             return node
-
-    def remember(self, node: Node[S], form: tuple[int, float], data: bytes) -> None:
-        """Keep a frame's answer in one image format."""
-        with self._lock:
-            if self._nodes.get(node.view.key) is node and form not in node.answers:
-                node.answers[form] = data
-                node.size += len(data)
-                self.bytes += len(data)
-                self._trim(keep=node.view.key)
 
     def expire(self) -> None:
         """Forget what nobody used for `expiry_s`."""
@@ -252,13 +232,11 @@ class HistoryTree(Generic[S]):
             if now - oldest.used_s <= self.expiry_s or oldest.view.key == keep:
                 break
             self._remove(oldest)
-            self.counts.expired += 1
         while self.bytes > self.max_bytes:
             others = [node for key, node in self._nodes.items() if key != keep]
             if not others:
                 break
             self._remove(next((node for node in others if node.children), others[0]))
-            self.counts.pruned += 1
 
     def _remove(self, node: Node[S]) -> None:
         del self._nodes[node.view.key]

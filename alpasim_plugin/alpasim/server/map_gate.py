@@ -73,7 +73,6 @@ def contradiction(
     boxes: Sequence[ActorBox],
     rgb: U8,
     camera_offset_m: float = 0.0,
-    threads: int | None = None,
 ) -> Contradiction | None:
     """Compare an image with the map; None: they do not contradict each other.
 
@@ -84,11 +83,10 @@ def contradiction(
         boxes: Road users, which hide lines.
         rgb: ``(H, W, 3)`` the image.
         camera_offset_m: How far to the left of the recorded path the camera stands (`beside`).
-        threads: Of the map rasteriser.
     """
     small = shrunk(camera)
     markings = top_hat(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA))
-    open_road = ~draw_map(NOTHING, small, T_world_camera, boxes, threads=threads).any(axis=2)
+    open_road = ~draw_map(NOTHING, small, T_world_camera, boxes).any(axis=2)
 
     def agreement_at(offset_m: float) -> float | None:
         T = T_world_camera.copy()
@@ -96,7 +94,7 @@ def contradiction(
             T_world_camera
         )  # who stands to the right sees the lines to the left
         return agreement(
-            pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road),
+            pieces_of(line_pixels(draw_map(scene_map, small, T)) & open_road),
             markings,
         )
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import grpc
 
-from alpasim_plugin.alpasim.server.caches import SceneCache, advertised
+from alpasim_plugin.alpasim.server.caches import KEPT_SCENES, SceneCache, advertised
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.status import CallTime, Failures, Unimplemented, answering
 from alpasim_plugin.core.errors import InputError
@@ -178,9 +178,7 @@ class Sensorsim(Failures):
             entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
             for name in self._own_scenes.loaded
         ]
-        return sensorsim_pb2.LoadedScenesReturn(
-            scenes=scenes, loaded_instance_capacity=self._own_scenes.kept
-        )
+        return sensorsim_pb2.LoadedScenesReturn(scenes=scenes, loaded_instance_capacity=KEPT_SCENES)
 
     @answering
     def prefetch_scene(

@@ -80,8 +80,6 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
 
 def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F32:
     """Return the opacity ``(H, W)`` that stands for a frame's trust."""
-    if not 0.0 <= trust <= 1.0:
-        raise InputError(f"the reliability: {trust}", "give a number from 0 to 1")
     out = np.full((height, width), trust, dtype=np.float32)
     if mask is not None:
         out = np.minimum(
@@ -150,13 +148,11 @@ def asked_of(
     return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
 
 
-def drawn_map(
-    entry: SceneEntry, asked: RenderRequest, lens: Lens, threads: int | None
-) -> U8 | None:
+def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens) -> U8 | None:
     """Return the semantic map as the lens sees it; None where the fixer takes none."""
     if entry.scene_map is None:
         return None
-    return lens.image(draw_exposed_map(entry.scene_map, asked, entry.scenario.actors, threads))
+    return lens.image(draw_exposed_map(entry.scene_map, asked, entry.scenario.actors))
 
 
 def gated(
@@ -165,7 +161,6 @@ def gated(
     asked: RenderRequest,
     shown: U8,
     view: View,
-    threads: int | None,
 ) -> Rendered:
     """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in
     the log.
@@ -176,7 +171,6 @@ def gated(
         asked: The pinhole, poses and road users of ``shown``.
         shown: The frame as that pinhole shows it.
         view: For the log.
-        threads: Of the map rasteriser.
     """
     assert entry.scene_map is not None, "a frame with a map is of a scene with one"
     T, actors = (
@@ -192,7 +186,6 @@ def gated(
         actor_boxes(actors, entry.scenario.actors),
         shown,
         beside_m,
-        threads,
     )
     if found is None:
         return rendered
@@ -214,7 +207,6 @@ class LocalSource:
     Args:
         scenes: Scenes with their renderers.
         busy: Held while something is computed: renderers are no more than one at a time.
-        threads: Threads of the map rasteriser.
         shutter: Which shutters roll; see `shutters.exposure_of`.
     """
 
@@ -222,10 +214,9 @@ class LocalSource:
         self,
         scenes: SceneCache,
         busy: threading.Lock,
-        threads: int | None = None,
         shutter: Shutter = "asked",
     ) -> None:
-        self._scenes, self._busy, self._threads, self._shutter = scenes, busy, threads, shutter
+        self._scenes, self._busy, self._shutter = scenes, busy, shutter
 
     def render(
         self, requests: Sequence[Request], views: Sequence[View], left: CallTime
@@ -248,13 +239,9 @@ class LocalSource:
         with left.holding(self._busy):
             frame = entry.render(asked)
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
-            sdmap = drawn_map(entry, asked, lens, self._threads)
+            sdmap = drawn_map(entry, asked, lens)
         rendered = Rendered(lens.frame(frame), sdmap)
-        return (
-            rendered
-            if sdmap is None
-            else gated(rendered, entry, asked, frame.rgb, view, self._threads)
-        )
+        return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view)
 
 
 class UpstreamSource:
@@ -264,12 +251,9 @@ class UpstreamSource:
         stub: Of ``SensorsimService`` at the upstream.
         scenes: Scenes for maps and recorded paths; None: no map, and the path is asked of the
             upstream.
-        trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path
-            (`reliability`).
         masks: Grey masks by camera.
         as_png: Ask for PNG whatever the caller asked for, so that the image is not compressed
             twice.
-        threads: Threads of the map rasteriser.
         shutter: Which shutters roll, for the map; see `shutters.exposure_of`.
     """
 
@@ -277,15 +261,13 @@ class UpstreamSource:
         self,
         stub: Any,
         scenes: SceneCache | None,
-        trust: float | None = None,
         masks: Mapping[str, U8] | None = None,
         as_png: bool = True,
-        threads: int | None = None,
         shutter: Shutter = "asked",
     ) -> None:
         self._shutter: Shutter = shutter
-        self._stub, self._scenes, self._trust, self._masks = stub, scenes, trust, masks or {}
-        self._as_png, self._threads, self._has_batch = as_png, threads, True
+        self._stub, self._scenes, self._masks = stub, scenes, masks or {}
+        self._as_png, self._has_batch = as_png, True
         self._paths: dict[str, F64] = {}
         self._mounts: dict[tuple[str, str], F64] = {}
 
@@ -353,7 +335,7 @@ class UpstreamSource:
                 replace(view, width=width, height=height),
             )
             asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)), self._shutter)
-            sdmap = drawn_map(entry, asked, lens, self._threads)
+            sdmap = drawn_map(entry, asked, lens)
             if sdmap is not None:
                 straight = straight_of(seen.camera_intrinsics, width, height)
                 camera = CameraSpec(
@@ -366,13 +348,10 @@ class UpstreamSource:
                     replace(asked, camera=camera),
                     shown,
                     view,
-                    self._threads,
                 )
         return rendered
 
     def _trust_in(self, view: View, left: CallTime) -> float:
-        if self._trust is not None:
-            return self._trust
         T_world_rig = view.T_world_camera[1] @ inverse(self._mount(view, left))
         return path_reliability(self._path(view, left), T_world_rig[:2, 3])
 

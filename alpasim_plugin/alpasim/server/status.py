@@ -98,11 +98,6 @@ class CallTime:
         finally:
             lock.release()
 
-    def wait(self, event: threading.Event) -> None:
-        """Wait for an event; waiting ends with the call's time."""
-        while not event.wait(POLL_S):
-            self.left_s()
-
 
 def status_of(error: Exception) -> tuple[Any, str]:
     """Return the status and text that a caller gets for an error."""
