@@ -24,6 +24,7 @@ from alpasim_plugin.core.geometry import (
 )
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import parsing, real
+from alpasim_plugin.core.reading.arrays import parse_npy
 from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import (
     F64,
@@ -41,7 +42,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.world.ground import from_points
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
-from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
 # Argoverse 2 mark types -> the markings a scene can show. Mixed lines take their solid half; double
 # white is drawn as one line.
@@ -175,7 +176,7 @@ def read_ground(
     transform_path = files.only(folder, ("*___img_Sim2_city.json",), what)
     raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), what)
     sim2 = files.read_json(transform_path)
-    raster = np.asarray(files.parse_npy(files.read_bytes(raster_path), raster_path))
+    raster = np.asarray(parse_npy(files.read_bytes(raster_path), raster_path))
     with parsing(transform_path, "give the keys R, t and s, and a raster of 2-D floats"):
         if raster.ndim != 2 or raster.dtype.kind != "f":
             raise ValueError(f"a raster of {raster.dtype} {raster.shape}")
@@ -186,7 +187,7 @@ def read_ground(
         city = (pixel / float(sim2["s"]) - np.array(sim2["t"], dtype=np.float64)) @ np.array(
             sim2["R"], dtype=np.float64
         ).reshape(2, 2)
-    grid = files.near(raster_path, np.column_stack([city, heights]) - origin)
+    grid = near(raster_path, np.column_stack([city, heights]) - origin)
     return from_points(
         np.concatenate([grid, *lane_edges(lane_map.lanes), *lane_map.drivable_areas, wheels]),
         GROUND_CELL_M,
@@ -219,7 +220,7 @@ def _line(files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64
         points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64)
         if len(points) < 2:
             raise ValueError(f"{len(points)} points")
-        return files.near(where, points - origin)
+        return near(where, points - origin)
 
 
 def _closed(ring: F64) -> F64:
@@ -325,7 +326,7 @@ def _rig_log(
     t_us = poses.t_ns // 1000
     keep = np.concatenate([[True], np.diff(t_us) > 0])
     up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
-    xyz = files.near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
+    xyz = near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
     return checked_trajectory(path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int(
         (~keep).sum()
     )

@@ -22,6 +22,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import scipy
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, transform_points
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Signal
@@ -29,7 +30,7 @@ from scenarios.commonroad_map import mark_intersections
 from scenarios.map_lines import is_left_of, rails
 from scenarios.map_route import Spot
 from scenarios.opendrive import T_enu_earth, earth_xyz
-from scenarios.recorded import SourceFiles
+from scenarios.recorded import SourceFiles, near
 from scenarios.street_map import Head, StreetMap
 
 KINDS = {
@@ -73,7 +74,7 @@ class Osm:
         self.files, self.path = files, path
         root = files.read_xml(path)
         if root.tag != "osm":
-            raise files.fail(path, f"root element {root.tag!r}", "give a Lanelet2 map (OSM XML)")
+            raise InputError(f"{path}: root element {root.tag!r}", "give a Lanelet2 map (OSM XML)")
         self.items: dict[str, dict[str, Item]] = {"node": {}, "way": {}, "relation": {}}
         places: dict[str, dict[str, str]] = {}
         for element in root:
@@ -82,7 +83,7 @@ class Osm:
                 continue
             key = str(element.get("id"))
             if key in of_kind:
-                raise files.fail(path, f"{element.tag} {key} twice", "give each its own id")
+                raise InputError(f"{path}: {element.tag} {key} twice", "give each its own id")
             of_kind[key] = _item(element)
             if element.tag == "node":
                 places[key] = {**element.attrib, **of_kind[key].tags}
@@ -108,15 +109,15 @@ class Osm:
         """
         item = self.items["way"].get(way)
         if item is None:
-            raise self.files.fail(self.path, f"way {way}, which is missing", "add it to the map")
+            raise InputError(f"{self.path}: way {way}, which is missing", "add it to the map")
         refs = item.of("", "node")
         lost = next((ref for ref in refs if ref not in self.items["node"]), None)
         where = f"{self.path}, way {way}"
         if lost is not None:
-            raise self.files.fail(where, f"node {lost}, which is missing", "add it to the map")
+            raise InputError(f"{where}: node {lost}, which is missing", "add it to the map")
         refs = refs[:1] + [after for before, after in pairwise(refs) if after != before]
         if len(refs) < 2:
-            raise self.files.fail(where, f"{len(refs)} node", "give it at least two")
+            raise InputError(f"{where}: {len(refs)} node", "give it at least two")
         return refs
 
     def line(self, nodes: Iterable[str]) -> F64:
@@ -143,9 +144,8 @@ class Osm:
         local = {key for key, place in places.items() if "local_x" in place or "local_y" in place}
         if local and len(local) < len(places):
             key = next(key for key in places if key not in local)
-            raise self.files.fail(
-                f"{self.path}, node {key}",
-                f"no local_x and local_y, which {len(local)} of {len(places)} nodes have",
+            raise InputError(
+                f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
                 "give them to all nodes, or to none",
             )
         axes = ("local_x", "local_y") if local else ("lon", "lat")
@@ -161,8 +161,8 @@ class Osm:
         else:
             if not (np.abs(xy) <= (180.0, 90.0)).all():
                 key = list(places)[int(np.argmax((np.abs(xy) > (180.0, 90.0)).any(axis=1)))]
-                raise self.files.fail(
-                    f"{self.path}, node {key}", "no place on the earth", "correct lat and lon"
+                raise InputError(
+                    f"{self.path}, node {key}: no place on the earth", "correct lat and lon"
                 )
             origin = (0.0, 0.0, 0.0)
             lon, lat = np.round((xy.min(axis=0) + xy.max(axis=0)) / 2, 3) if len(xy) else (0.0, 0.0)
@@ -170,7 +170,7 @@ class Osm:
             points = transform_points(T_enu_earth(lat, lon, 0.0), earth)
             points[:, 2] = z
             notes.append(f"origin at latitude {lat:.3f}, longitude {lon:.3f}; x east, y north")
-        self.files.near(self.path, points)
+        near(self.path, points)
         return dict(zip(places, points, strict=True)), origin, tuple(notes)
 
     def _number(self, key: str, place: Mapping[str, str], name: str) -> float:
@@ -180,7 +180,7 @@ class Osm:
             value = float("nan")
         if not np.isfinite(value):
             found = f"{name} = {place.get(name)!r}"
-            raise self.files.fail(f"{self.path}, node {key}", found, "give a number")
+            raise InputError(f"{self.path}, node {key}: {found}", "give a number")
         return value
 
 
@@ -231,7 +231,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         bounds[key] = left, right
         lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
-        raise files.fail(path, "a map without a lanelet for vehicles", "use one with a road")
+        raise InputError(f"{path}: a map without a lanelet for vehicles", "use one with a road")
     lanes = mark_intersections(_linked(lanes, bounds))
     for key in [key for key in lanes if osm.lanelets[key].tags.get("one_way") in ("no", "false")]:
         left, right = bounds[key]
@@ -283,7 +283,7 @@ def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
     for side in ("left", "right"):
         ways = lanelet.of(side, "way")
         if len(ways) != 1:
-            raise osm.files.fail(where, f"{len(ways)} ways as {side} bound", "give it one")
+            raise InputError(f"{where}: {len(ways)} ways as {side} bound", "give it one")
         found.append(Bound(ways[0], tuple(osm.nodes(ways[0]))))
     left, right = found
     ends = [osm.line((bound.nodes[0], bound.nodes[-1])) for bound in found]
@@ -292,7 +292,7 @@ def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
         right = right.turned()
     lines = osm.line(left.nodes), osm.line(right.nodes)
     if left.way == right.way or min(float(arc_lengths(line)[-1]) for line in lines) <= 0.0:
-        raise osm.files.fail(where, "a bound without length, or one for both sides", "correct it")
+        raise InputError(f"{where}: a bound without length, or one for both sides", "correct it")
     if not is_left_of(*lines):
         left, right = left.turned(), right.turned()
     return left, right
@@ -374,9 +374,8 @@ def _limits(osm: Osm) -> tuple[dict[str, float], list[str]]:
 
 def _rule(osm: Osm, lanelet: str, ref: str) -> Item:
     if ref not in osm.rules:
-        raise osm.files.fail(
-            f"{osm.path}, lanelet {lanelet}",
-            f"regulatory element {ref}, which is missing",
+        raise InputError(
+            f"{osm.path}, lanelet {lanelet}: regulatory element {ref}, which is missing",
             "add it to the map",
         )
     return osm.rules[ref]

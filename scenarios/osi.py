@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of
 from scenarios.osi_messages import UNREAD, ground_truths
-from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
 VEHICLE, PEDESTRIAN = 2, 3  # types of moving objects
 LABELS = {
@@ -63,11 +64,11 @@ class _Track:
         size = self.first.base.dimension
         return Box(size.length, size.width, size.height)
 
-    def trajectory(self, files: SourceFiles, where: str, origin: F64) -> Trajectory:
+    def trajectory(self, where: str, origin: F64) -> Trajectory:
         """Return the poses of the box centre."""
         quat = Rotation.from_euler("ZYX", np.nan_to_num(self.angles)).as_quat()[:, [3, 0, 1, 2]]
         xyz = np.array(self.xyz) - origin
-        return checked_trajectory(files, where, np.array(self.t_us), files.near(where, xyz), quat)
+        return checked_trajectory(where, np.array(self.t_us), near(where, xyz), quat)
 
 
 def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
@@ -103,22 +104,21 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
             track.t_us.append(times[-1])
             track.xyz.append((place.x, place.y, place.z))
             track.angles.append((turn.yaw, turn.pitch, turn.roll))
-    chosen, why = _choose_ego(files, file, tracks, len(times), host, ego)
+    chosen, why = _choose_ego(file, tracks, len(times), host, ego)
     begin = tracks[chosen].xyz[0]
     if not np.isfinite(begin).all():
-        raise files.fail(f"{file}, object {chosen}", "a place that is not finite", "repair it")
+        raise InputError(f"{file}, object {chosen}: a place that is not finite", "repair it")
     origin = np.array([*np.round(begin[:2]), 0.0])
     centres = {
-        key: track.trajectory(files, f"{file}, object {key}", origin)
-        for key, track in tracks.items()
+        key: track.trajectory(f"{file}, object {key}", origin) for key, track in tracks.items()
     }
     vehicle = _vehicle(tracks[chosen])
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
     ego_log = offset_trajectory(centres[chosen], T_centre_rig)
     if len(ego_log) < 2:
-        raise files.fail(f"{file}, object {chosen}", "1 pose", "choose an ego that drives")
-    lanes = {} if roads is None else _lanes(files, file, roads, origin)
+        raise InputError(f"{file}, object {chosen}: 1 pose", "choose an ego that drives")
+    lanes = {} if roads is None else _lanes(file, roads, origin)
     if any(lane.kind == "vehicle" for lane in lanes.values()):
         lane_map = bordered(lanes, LaneMap({}))
         ground = ground_of(lane_map, ego_log.xyz)
@@ -152,7 +152,6 @@ def _actors(tracks: Mapping[int, tuple[_Track, Trajectory]]) -> tuple[Actor, ...
 
 
 def _choose_ego(
-    files: SourceFiles,
     path: Path,
     tracks: Mapping[int, _Track],
     n_messages: int,
@@ -164,9 +163,8 @@ def _choose_ego(
         name = str(host) if ego is None else ego
         key = next((key for key in tracks if str(key) == name), None)
         if key is None:
-            raise files.fail(
-                path,
-                f"no moving object {name!r} for the ego",
+            raise InputError(
+                f"{path}: no moving object {name!r} for the ego",
                 f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
             )
         return key, f"ego is {'the host vehicle' if ego is None else 'object'} {key}"
@@ -176,9 +174,8 @@ def _choose_ego(
         if track.first.type == VEHICLE and len(track.t_us) == n_messages
     ]
     if not always:
-        raise files.fail(
-            path,
-            f"{len(tracks)} moving objects, none a vehicle that is present all the time",
+        raise InputError(
+            f"{path}: {len(tracks)} moving objects, none a vehicle that is present all the time",
             "name the ego: log: {osi: FILE, ego: ID}",
         )
     key = min(always)
@@ -197,12 +194,12 @@ def _vehicle(track: _Track) -> Vehicle:
     return Vehicle(track.box, rear_m, wheelbase_m)
 
 
-def _lanes(files: SourceFiles, path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
+def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
     """Return the lanes of a message, linked."""
     borders = {one.id.value: one for one in roads.lane_boundary}
     lanes: dict[str, Lane] = {}
     for one in roads.lane:
-        lane = _lane(files, f"{path}, lane {one.id.value}", one, borders, origin)
+        lane = _lane(f"{path}, lane {one.id.value}", one, borders, origin)
         if lane is not None:
             lanes[lane.lane_id] = lane
     after = {key: list(lane.successors) for key, lane in lanes.items()}
@@ -233,15 +230,13 @@ def _beside(lanes: Mapping[str, Lane], lane: Lane, name: str | None) -> str | No
     return name if float(first @ other) > 0 else None
 
 
-def _lane(
-    files: SourceFiles, where: str, one: Any, borders: Mapping[int, Any], origin: F64
-) -> Lane | None:
+def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane | None:
     """Return a lane in driving direction; None for one that is not driven or lacks a border."""
     facts = one.classification
     kind = "vehicle" if facts.type == DRIVING else KINDS.get(facts.subtype)
     if kind is None or len(facts.centerline) < 2:
         return None
-    centre = files.near(where, _points(facts.centerline) - origin)
+    centre = near(where, _points(facts.centerline) - origin)
     sides = []
     for ids in (facts.left_lane_boundary_id, facts.right_lane_boundary_id):
         found = [borders[ref.value] for ref in ids if ref.value in borders]
@@ -249,7 +244,7 @@ def _lane(
         edge = _along(centre, np.concatenate([np.zeros((0, 3)), *points]) - origin)
         if len(edge) < 2:
             return None
-        sides.append((files.near(where, edge), _paint(found[0])))
+        sides.append((near(where, edge), _paint(found[0])))
     ahead = [str(pair.successor_lane_id.value) for pair in facts.lane_pairing]
     behind = [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing]
     beside = [

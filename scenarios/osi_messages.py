@@ -17,6 +17,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
+from alpasim_plugin.core.errors import InputError
 from scenarios.recorded import SourceFiles
 
 PACKAGE = "simrun.osi"
@@ -90,7 +91,7 @@ def ground_truths(files: SourceFiles, path: Path) -> Iterator[Any]:
         where = f"{path}, message {number}"
         if len(part) < length or length == 0:
             found = f"{len(part)} of {length} bytes"
-            raise files.fail(where, found, "fetch the file again; it may be truncated")
+            raise InputError(f"{where}: {found}", "fetch the file again; it may be truncated")
         try:
             message = truth.FromString(part)
             # In a view the same number holds a mounting position, whose parts have other types.
@@ -99,8 +100,8 @@ def ground_truths(files: SourceFiles, path: Path) -> Iterator[Any]:
                 if inside.HasField("global_ground_truth"):
                     message = inside.global_ground_truth
         except DecodeError as error:
-            raise files.fail(
-                where, "no readable OSI message", "give a binary .osi trace"
+            raise InputError(
+                f"{where}: no readable OSI message", "give a binary .osi trace"
             ) from error
         yield message
         start += 4 + length

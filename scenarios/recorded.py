@@ -10,7 +10,6 @@ import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,7 +21,6 @@ from pyarrow import feather
 from alpasim_plugin.core import reading
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import COORDINATE_M, SOURCE_BYTES
-from alpasim_plugin.core.reading.arrays import parse_npy
 from alpasim_plugin.core.reading.files import parse_xml
 from alpasim_plugin.core.reading.tables import Kind, check_columns
 from alpasim_plugin.core.types import (
@@ -64,10 +62,7 @@ def near(where: Path | str, xyz: F64) -> F64:
 
 
 class SourceFiles:
-    """Reads the files of one recorded log and hashes what it read.
-
-    Args:
-    """
+    """Reads the files of one recorded log and hashes what it read."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
@@ -76,12 +71,6 @@ class SourceFiles:
     def content_hash(self) -> str:
         """Return the sha256 over names and bytes of all files read so far, in reading order."""
         return self._hash.hexdigest()
-
-    def fail(self, path: Path | str, found: str, do_this: str) -> InputError:
-        """Make the error that names a file; the caller raises it."""
-        return InputError(f"{path}: {found}", do_this)
-
-    near = staticmethod(near)
 
     def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
         """Return the one file of a folder that matches one of the glob patterns, the first pattern
@@ -123,11 +112,7 @@ class SourceFiles:
 
     def read_json(self, path: Path) -> Any:
         """Read a JSON document."""
-        return self.parse_json(self.read_bytes(path), path)
-
-    def parse_json(self, data: bytes, where: Path | str) -> Any:
-        """Parse a JSON document that came out of ``where``."""
-        return reading.parse_json(data, where, "fetch the file again; it may be truncated")
+        return reading.parse_json(self.read_bytes(path), path)
 
     def read_feather(
         self, path: Path, columns: Mapping[str, Kind]
@@ -150,21 +135,13 @@ class SourceFiles:
             )
         return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
 
-    def parse_npy(self, data: bytes, where: Path | str) -> np.ndarray[Any, Any]:
-        """Parse a NumPy array without pickles."""
-        return parse_npy(data, where, "fetch the file again; it may be truncated")
-
     def read_xml(self, path: Path) -> ElementTree.Element:
         """Parse an XML document; a DOCTYPE is refused, so no entity can be defined or expanded.
 
         Raises:
             InputError: The document is malformed or truncated, or declares a DOCTYPE.
         """
-        return self.parse_xml(self.read_bytes(path), path)
-
-    def parse_xml(self, data: bytes, path: Path | str) -> ElementTree.Element:
-        """Parse an XML document that came out of ``path``; see `read_xml`."""
-        return parse_xml(data, path)
+        return parse_xml(self.read_bytes(path), path)
 
 
 @dataclass(frozen=True)
@@ -218,36 +195,20 @@ def checked_trajectory(
     if len(t_us) < least:
         found = f"{len(t_us)} pose" + ("" if len(t_us) == 1 else "s")
         raise InputError(f"{path}: {found}", f"use a recording with at least {least} poses")
-    for name, values in (("positions", xyz), ("rotations", quat)):
-        bad = ~np.isfinite(values).all(axis=1)
-        if bad.any():
-            raise InputError(
-                f"{path}: {name} that are not finite, first in row {int(np.argmax(bad))}",
-                "repair or drop these rows",
-            )
-    steps = np.diff(t_us)
-    if (steps <= 0).any():
-        row = int(np.argmax(steps <= 0)) + 1
-        found = f"time {int(t_us[row])} us after {int(t_us[row - 1])} us in row {row}"
-        raise InputError(f"{path}: {found}", "sort the rows and drop repeated times")
     norms = np.linalg.norm(quat, axis=1)
-    bad = np.abs(norms - 1.0) > 1e-2
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(
-            f"{path}: a quaternion of length {norms[row]:.3g} in row {row}",
-            "give unit quaternions (w, x, y, z)",
-        )
+    checks = {
+        "a position that is not finite": ~np.isfinite(xyz).all(axis=1),
+        "a rotation that is not finite": ~np.isfinite(norms),
+        "a time that is not after the one before it": np.diff(t_us, prepend=t_us[:1] - 1) <= 0,
+        "a quaternion that is not of unit length": np.abs(norms - 1.0) > 1e-2,
+    }
+    for found, bad in checks.items():
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(f"{path}: {found} in row {row}", "repair or drop these rows")
     return Trajectory(
         np.ascontiguousarray(t_us, dtype=np.int64), np.ascontiguousarray(xyz), quat / norms[:, None]
     )
-
-
-def split_at_gaps(t_us: I64, max_gap_us: int = MAX_GAP_US) -> list[slice]:
-    """Return the runs of a track's times ``(T,)`` that have no hole longer than ``max_gap_us``."""
-    cuts = np.nonzero(np.diff(t_us) > max_gap_us)[0] + 1
-    bounds = [0, *cuts.tolist(), len(t_us)]
-    return [slice(a, b) for a, b in pairwise(bounds)]
 
 
 def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
@@ -273,19 +234,11 @@ def actors_of_track(
     Runs after the first are called ``ID~2``, ``ID~3``, ... so that no actor is interpolated across
     a gap in the recording.
     """
-    actors: list[Actor] = []
-    for run, part in enumerate(split_at_gaps(track.t_us), start=1):
-        t = track.t_us[part]
-        xyz = track.xyz[part]
-        quat = track.quat[part]
+    cuts = np.nonzero(np.diff(track.t_us) > MAX_GAP_US)[0] + 1
+    columns = (np.split(column, cuts) for column in (track.t_us, track.xyz, track.quat))
+    actors = []
+    for run, (t, xyz, quat) in enumerate(zip(*columns, strict=True), start=1):
         name = actor_id if run == 1 else f"{actor_id}~{run}"
-        actors.append(
-            Actor(
-                name,
-                label,
-                box,
-                Trajectory(t, xyz, quat),
-                is_static=stands_still(t, xyz, label, fixed),
-            )
-        )
+        part, still = Trajectory(t, xyz, quat), stands_still(t, xyz, label, fixed)
+        actors.append(Actor(name, label, box, part, is_static=still))
     return actors

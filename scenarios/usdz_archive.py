@@ -7,14 +7,13 @@ from __future__ import annotations
 import contextlib
 import zipfile
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from alpasim_plugin.core.config import parse
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
-from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading import parse_json, parsing
 from alpasim_plugin.core.reading.files import check_names, open_regular
 from alpasim_plugin.core.reading.tables import parse_parquet
 from scenarios.recorded import SourceFiles
@@ -33,7 +32,7 @@ class Archive:
         with contextlib.ExitStack() as opening:
             stream = opening.enter_context(open_regular(path, ARCHIVE_BYTES))
             with parsing(path, "fetch the file again; it may be truncated", "no readable ZIP"):
-                self._zip = zipfile.ZipFile(stream)
+                self._zip = opening.enter_context(zipfile.ZipFile(stream))
                 infos = self._zip.infolist()
             check_names([info.filename for info in infos], path)
             self._open = opening.pop_all()
@@ -42,13 +41,7 @@ class Archive:
     def __enter__(self) -> Archive:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._zip.close()
+    def __exit__(self, *_: object) -> None:
         self._open.close()
 
     @property
@@ -88,7 +81,7 @@ class Archive:
 
     def json(self, member: str) -> Any:
         """Read a JSON member."""
-        return self.files.parse_json(self.read(member), f"{self.path}, {member}")
+        return parse_json(self.read(member), f"{self.path}, {member}")
 
     def yaml(self, member: str) -> Any:
         """Read a YAML member; only plain data is built, within the bounds of a configuration
@@ -97,13 +90,11 @@ class Archive:
         where, data = f"{self.path}, {member}", self.read(member)
         YAML_BYTES.check(len(data), where)
         with parsing(where, "fetch the file again", "broken YAML"):
-            text = data.decode("utf-8")
-        return parse(text, where).data
+            return parse(data.decode("utf-8"), where).data
 
     def table(self, member: str) -> list[JsonObject]:
         """Read a parquet member as rows."""
         where = f"{self.path}, {member}"
-        table = parse_parquet(self.read(member), where, do_this="fetch the file again")
         with parsing(where, "fetch the file again", "no readable parquet"):
-            rows: list[JsonObject] = table.to_pylist()
-        return rows
+            rows: list[JsonObject] = parse_parquet(self.read(member), where).to_pylist()
+            return rows

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     centre_line,
     densify,
@@ -25,11 +26,13 @@ from alpasim_plugin.core.geometry import (
     yaw_from_quat,
 )
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.reading import parse_json
+from alpasim_plugin.core.reading.arrays import parse_npy
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_camera
 from scenarios.map_lines import is_left_of, lane_edges
-from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
+from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, near
 from tests.scenarios.ftheta_projection import RecordedLens, lens_of
 
 # Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
@@ -72,7 +75,7 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
         if not name.endswith(".npy"):
             continue
         where = f"{path}, {name}"
-        values = np.asarray(files.parse_npy(data, where), dtype=np.float64)
+        values = np.asarray(parse_npy(data, where), dtype=np.float64)
         if (
             values.shape != (11,)
             or not np.isfinite(values).all()
@@ -81,7 +84,9 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
             or values[10] not in (0.0, 1.0)
         ):
             found = f"an array of shape {values.shape} that is not an f-theta lens"
-            raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
+            raise InputError(
+                f"{where}: {found}", "give cx, cy, width, height, 6 coefficients, flag"
+            )
         lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
     return lenses
 
@@ -124,12 +129,12 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
     path = files.only(folder / layer, ("*.tar",), f"layer {layer}")
     members = {name: data for name, data in read_tar(files, path).items() if name.endswith(".json")}
     if len(members) != 1:
-        raise files.fail(path, f"{len(members)} JSON members", "give a tar with one JSON member")
+        raise InputError(f"{path}: {len(members)} JSON members", "give a tar with one JSON member")
     name, data = next(iter(members.items()))
-    document = files.parse_json(data, f"{path}, {name}")
+    document = parse_json(data, f"{path}, {name}")
     labels = document.get("labels") if isinstance(document, dict) else None
     if not isinstance(labels, list):
-        raise files.fail(f"{path}, {name}", "no list 'labels'", "use a file of the RDS-HQ layout")
+        raise InputError(f"{path}, {name}: no list 'labels'", "use a file of the RDS-HQ layout")
     out: list[Label] = []
     for number, raw in enumerate(labels):
         where = f"{path}, label {number}"
@@ -140,13 +145,15 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
             attributes = {a["name"]: _value(a) for a in shape.get("attributes", ())}
             lines = tuple(np.array(v, dtype=np.float64).reshape(-1, 3) for v in _vertices(shape))
         except (KeyError, TypeError, ValueError) as error:
-            raise files.fail(
-                where, f"no readable shape: {error!r}", "use a file of the RDS-HQ layout"
+            raise InputError(
+                f"{where}: no readable shape: {error!r}", "use a file of the RDS-HQ layout"
             ) from error
         if not lines or any(len(line) == 0 or not np.isfinite(line).all() for line in lines):
-            raise files.fail(where, "a shape without finite vertices", "repair or drop this label")
+            raise InputError(
+                f"{where}: a shape without finite vertices", "repair or drop this label"
+            )
         for line in lines:
-            files.near(where, line)
+            near(where, line)
         out.append(Label(where, attributes, lines))
     return tuple(out)
 
@@ -236,14 +243,13 @@ def oriented_lanes(
     raw: dict[str, tuple[F64, F64]] = {}
     for label in labels:
         if len(label.lines) != 2 or min(len(line) for line in label.lines) < 2:
-            raise files.fail(
-                label.where,
-                f"{len(label.lines)} edges",
+            raise InputError(
+                f"{label.where}: {len(label.lines)} edges",
                 "give each lane two edges of at least 2 points",
             )
         if label.feature_id in raw:
-            raise files.fail(
-                label.where, f"lane id {label.feature_id} twice", "give each lane its own id"
+            raise InputError(
+                f"{label.where}: lane id {label.feature_id} twice", "give each lane its own id"
             )
         one, two = label.lines
         raw[label.feature_id] = (one, _same_order(one, two))
@@ -370,17 +376,13 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     folder = Path(path)
     files = SourceFiles()
     if not folder.is_dir():
-        raise files.fail(folder, "no such folder", "give the folder that holds 3d_lanes")
+        raise InputError(f"{folder}: no such folder", "give the folder that holds 3d_lanes")
     ego_log, clip = read_poses(files, folder)
     layers = {name: read_layer(files, folder, f"3d_{name}") for name in LAYERS}
     if not layers["lanes"]:
-        raise files.fail(folder / "3d_lanes", "a map without lanes", "use a clip with lanes")
+        raise InputError(f"{folder}: a map without lanes", "use a clip with lanes")
     if not layers["road_boundaries"]:
-        raise files.fail(
-            folder / "3d_road_boundaries",
-            "a map without road edges",
-            "use a clip with road boundaries",
-        )
+        raise InputError(f"{folder}: a map without road edges", "use a clip with road boundaries")
     lanes, lane_notes = oriented_lanes(files, layers["lanes"], ego_log)
     stops = [
         label for label in layers["wait_lines"] if label.attributes.get("is_implicit") is not True
@@ -412,11 +414,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     )
     lenses = read_lenses(files, folder)
     if FRONT_WIDE not in lenses:
-        raise files.fail(
-            folder / "ftheta_intrinsic",
-            f"no lens {FRONT_WIDE}",
-            "use a clip with the front wide camera",
-        )
+        raise InputError(f"{folder}: no lens {FRONT_WIDE}", "use a clip with the front wide camera")
     ground = from_points(
         np.concatenate([*lane_edges(lanes), *lane_map.road_edges, ego_log.xyz]),
         GROUND_CELL_M,
@@ -465,30 +463,28 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
         if match is None:
             continue
         where = f"{path}, {name}"
-        matrix = np.asarray(files.parse_npy(data, where), dtype=np.float64)
+        matrix = np.asarray(parse_npy(data, where), dtype=np.float64)
         if (
             matrix.shape != (4, 4)
             or not np.isfinite(matrix).all()
             or abs(np.linalg.det(matrix[:3, :3]) - 1) > 1e-3
         ):
-            raise files.fail(
-                where,
-                f"an array of shape {matrix.shape} that is not a rigid motion",
+            raise InputError(
+                f"{where}: an array of shape {matrix.shape} that is not a rigid motion",
                 "give 4x4 rig-to-world matrices",
             )
         frames[int(match.group(1))] = matrix
     if sorted(frames) != list(range(len(frames))):
         missing = next(i for i in range(len(frames) + 1) if i not in frames)
-        raise files.fail(
-            path,
-            f"no frame {missing:06d} among {len(frames)} poses",
+        raise InputError(
+            f"{path}: no frame {missing:06d} among {len(frames)} poses",
             "give frames numbered from 000000 without holes",
         )
     stamp = re.match(r"(?P<clip>.+)_(?P<start>\d+)_(?P<end>\d+)$", path.stem)
     start_us = int(stamp["start"]) if stamp else 0
     poses = np.stack([frames[i] for i in range(len(frames))]) if frames else np.zeros((0, 4, 4))
     t_us = start_us + np.round(np.arange(len(poses)) * (1e6 / FRAME_RATE_HZ)).astype(np.int64)
-    files.near(path, poses[:, :3, 3])
+    near(path, poses[:, :3, 3])
     quat = quat_from_matrix(poses[:, :3, :3])
     return checked_trajectory(path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp[
         "clip"

@@ -116,7 +116,7 @@ BROKEN = {
     "object 7": broken(lambda parts: setattr(parts[3].moving_object[1].base.position, "x", np.nan)),
     "no moving object '8'": messages(host=8),
     "0 moving objects": [TRUTH(timestamp={"seconds": 1})],
-    "object 3: time": broken(lambda parts: parts.append(parts[0])),
+    "object 3: a time": broken(lambda parts: parts.append(parts[0])),
     "1 pose": messages()[:1],
     "lane 1": broken(
         lambda parts: setattr(parts[0].lane[0].classification.centerline[0], "y", 1e9)
