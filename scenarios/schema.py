@@ -40,7 +40,7 @@ class LaneChangeSpec(Part):
 
     at_m: float = within(b.DISTANCE_M, "Start of the change, along the ego's path.")
     to_lane: int = within(b.LANE_INDEX, "Target lane.")
-    length_m: float = within(b.SEGMENT_M, "Length of the change along the road.", 60.0)
+    length_m: float = within(b.SEGMENT_M, "Along the road.", 60.0)
 
 
 class EgoSpec(Part):
@@ -54,9 +54,7 @@ class EgoSpec(Part):
     )
     speed_mps: float = within(b.SPEED_MPS, "Speed at the log's start.", 10.0)
     cruise_mps: float = within(b.CRUISE_MPS, "Desired speed on a free straight.", 10.0)
-    max_lateral_accel_mps2: float = within(
-        b.ACCEL_MPS2, "Limit that slows the expert in bends.", 2.0
-    )
+    max_lateral_accel_mps2: float = within(b.ACCEL_MPS2, "In bends.", 2.0)
     headway_s: float = within(b.HEADWAY_S, "Time gap to a leader.", 1.5)
     lane_changes: tuple[LaneChangeSpec, ...] = Field(
         default=(), max_length=int(b.ELEMENTS.high), description="Lane changes, in driving order."
@@ -70,16 +68,14 @@ class EnvironmentSpec(Part):
         default=0.7, ge=0, le=1, description="Share of the roadside covered by facades."
     )
     building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
-        default=(6.0, 18.0), description="Least and greatest height of facades."
+        default=(6.0, 18.0), description="Least and greatest."
     )
     trees_per_100m: float = within(b.TREES_PER_100M, "Trees per road side.", 4.0)
     poles_spacing_m: float = Field(
-        default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none."
+        default=30.0, ge=0, le=b.POLES_M.high, description="Between lamp posts; 0: none."
     )
     sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
-    texture: float = Field(
-        default=1.0, ge=0, le=1, description="Contrast of ground and facade texture."
-    )
+    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facades.")
     fog_visibility_m: float | None = Field(
         default=None,
         ge=10,
@@ -108,8 +104,8 @@ class CameraModel(Part):
     """A camera on the rig."""
 
     name: str = Field(default="front", min_length=1, description="Name that policies request.")
-    width: int = within(b.IMAGE_SIDE_PX, "Image width in pixels.", 256)
-    height: int = within(b.IMAGE_SIDE_PX, "Image height in pixels.", 144)
+    width: int = within(b.IMAGE_SIDE_PX, "Pixels.", 256)
+    height: int = within(b.IMAGE_SIDE_PX, "Pixels.", 144)
     lens: Literal["pinhole", "opencv", "fisheye", "ftheta"] = Field(
         default="pinhole", description="Equations: docs/cameras.md."
     )
@@ -117,10 +113,10 @@ class CameraModel(Part):
         default=75.0,
         gt=1,
         lt=221,
-        description="Horizontal field of view; of pinhole and opencv at most 120.",
+        description="Of pinhole and opencv at most 120.",
     )
     focal_px: tuple[float, float] | None = Field(
-        default=None, description="Focal lengths in x and y, in place of hfov_deg."
+        default=None, description="In x and y, in place of hfov_deg."
     )
     centre_px: tuple[float, float] | None = Field(
         default=None, description="Where the axis meets the image; none: the middle."
@@ -133,11 +129,9 @@ class CameraModel(Part):
     max_angle_deg: float | None = Field(
         default=None, gt=0, le=110, description="Black beyond this angle from the axis."
     )
-    x_m: float = within(b.MOUNT_M, "Mount, metres ahead of the rear axle.", 1.6)
-    y_m: float = within(b.MOUNT_M, "Mount, metres to the left.", 0.0)
-    z_m: float = Field(
-        default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground."
-    )
+    x_m: float = within(b.MOUNT_M, "Ahead of the rear axle.", 1.6)
+    y_m: float = within(b.MOUNT_M, "To the left.", 0.0)
+    z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Above the ground.")
     yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
     shutter_us: int = within(
@@ -289,7 +283,7 @@ class DegradationSpec(Part):
         default=0.1,
         ge=0,
         le=0.5,
-        description="Spread of the first points' depth, share.",
+        description="Spread of the first points' depth.",
     )
     pose_error_m: float = Field(
         default=0.0,
@@ -333,12 +327,12 @@ class VehicleSpec(Part):
     width_m: float = within(b.VEHICLE_M, "Body width.", 1.88)
     height_m: float = within(b.VEHICLE_M, "Body height.", 1.6)
     rear_axle_to_centre_m: float = within(b.AXLE_M, "From the rear axle to the body's middle.", 1.4)
-    wheelbase_m: float = within(b.VEHICLE_M, "Distance between the axles.", 2.85)
+    wheelbase_m: float = within(b.VEHICLE_M, "Between the axles.", 2.85)
     max_steer_rad: float = Field(
         default=0.6,
         ge=b.STEER_RAD.low,
         lt=b.STEER_RAD.high,
-        description="Largest road-wheel angle.",
+        description="Of the road wheels.",
     )
     max_steer_rate_radps: float = within(b.STEER_RATE_RADPS, "Largest steering rate.", 0.8)
     max_accel_mps2: float = within(b.ACCEL_MPS2, "Largest acceleration.", 3.5)

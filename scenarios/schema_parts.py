@@ -110,7 +110,7 @@ class NarrowGapSegment(Part):
     kind: Literal["narrow_gap"]
     length_m: float = within(b.SEGMENT_M, "Length; the cars stand in its middle half.", 40.0)
     gap_m: float = Field(
-        default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars."
+        default=3.0, gt=2.0, le=8, description="Free width between the parked cars."
     )
     shift_m: float = Field(
         default=0.0,
@@ -118,8 +118,8 @@ class NarrowGapSegment(Part):
         le=3,
         description="The gap's middle, left of the ego lane's.",
     )
-    cars_left: int = Field(default=2, ge=0, le=8, description="Parked cars on the left.")
-    cars_right: int = Field(default=2, ge=0, le=8, description="Parked cars on the right.")
+    cars_left: int = Field(default=2, ge=0, le=8, description="Parked on the left.")
+    cars_right: int = Field(default=2, ge=0, le=8, description="Parked on the right.")
 
 
 SEGMENT_KINDS: dict[str, type[Part]] = {
@@ -148,10 +148,10 @@ class RoadSpec(Part):
     """A road of segments along the ego's path. Driving is on the right."""
 
     lanes_forward: int = Field(
-        default=1, ge=1, le=6, description="Lanes in the ego's direction at the start."
+        default=1, ge=1, le=6, description="In the ego's direction at the start."
     )
     lanes_backward: int = Field(default=1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
-    lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Width of every lane.")
+    lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Of every lane.")
     median_m: float = Field(
         default=0.0,
         ge=0,
@@ -165,7 +165,7 @@ class RoadSpec(Part):
         le=6,
         description="Parking strip, instead of the shoulder.",
     )
-    speed_limit_mps: float | None = within(b.LIMIT_MPS, "Speed limit of all lanes.", None)
+    speed_limit_mps: float | None = within(b.LIMIT_MPS, "Of all lanes.", None)
     centre_paint: CentrePaint = Field(
         default="double_yellow", description="Line between the directions."
     )
@@ -313,7 +313,7 @@ class ParkedActor(_Actor):
         b.OFFSET_M, "From the outer lane's edge; negative: it stands in the lane.", 0.3
     )
     count: int = Field(default=1, ge=1, le=40, description="Vehicles in the row.")
-    spacing_m: float = within(b.SPACING_M, "Distance between their centres.", 7.0)
+    spacing_m: float = within(b.SPACING_M, "Between their centres.", 7.0)
     yaw_deg: float = Field(
         default=0.0, ge=-180, le=180, description="Turned to the left against the lane."
     )
@@ -414,7 +414,7 @@ class CutInActor(_Adversary):
         default=2_500_000,
         ge=b.PERIOD_US.low,
         le=b.TIME_US.high,
-        description="Duration of the lateral motion.",
+        description="Its duration.",
     )
     end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
     decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes then.", 2.0)

@@ -26,7 +26,7 @@ from scenarios.schema_parts import Part
 DOCS = Path(__file__).resolve().parents[1]
 EVERY_VERB = ("--json", "--debug", "--help")
 OBSTACLES_UNKNOWN = METRICS["collision_any"].invalid  # long, and of every contact
-TYPES = {float: "number", int: "integer", str: "text", bool: "`true`, `false`"}
+TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
