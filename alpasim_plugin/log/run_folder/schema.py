@@ -156,7 +156,6 @@ ROLLOUTS_TABLE = TableSchema(
         Column("failure_class", "text"),
         Column("failure", "text"),
         Column("path", "text"),
-        Column("copied_from", "text"),
         Column("wall_s", "number"),
         Column("frames", "integer"),
         Column("steps", "integer"),
