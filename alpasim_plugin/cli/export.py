@@ -74,7 +74,7 @@ def export(
         raise InputError("simrun export: --alpasim DIR or --mcap FILE", "Give one of both.")
     items = items or (str(run_or_newest(None)),)
     if alpasim is not None:
-        if not wanted.is_all:
+        if wanted.axes:
             raise InputError(
                 "--alpasim: --scene, --policy, --seed or --renderer beside it",
                 "Leave them out: a run is exported whole.",
