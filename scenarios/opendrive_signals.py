@@ -28,7 +28,7 @@ from scenarios.street_map import Head
 
 PEDESTRIAN_LIGHT = "1000002"
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
-LOWEST_HEAD_M = 2.2  # of the middle of the lamps above the road, where the map has them lower
+LOWEST_HEAD_M = 3.0  # of the middle of the lamps above the road, where the map has them lower
 PLATE_M = 0.1  # what is lower than this is painted on the road
 
 

@@ -30,6 +30,7 @@ from evaluators.statistics.baselines import (
     table_of_run,
     write_baseline,
 )
+from evaluators.statistics.boundary_gate import judge_boundaries
 from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.gate import GateVerdict, check_number_of_scenes, judge, load_gate
 from scenarios.load import load_scenario
@@ -98,25 +99,35 @@ def gate(
             f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
             "Score the run with that preset.",
         )
-    stored = None
-    repeatable = is_repeatable(stored_run)
-    if baseline_file is not None:
-        if os.path.isdir(baseline_file):
-            ensure_tables(baseline_file, warn)
-        baseline = read_baseline(baseline_file)
-        check_matches(baseline, stored_run, baseline_file)
-        stored = baseline.table
-        if baseline.repeatable is False:
-            repeatable = False
-    verdict = judge(
-        table_of_run(stored_run),
-        spec,
-        stored,
-        str(baseline_file or ""),
-        stored_run.table,
-        preset,
-        repeatable,
-    )
+    if spec.boundary_margin is not None:
+        earlier = None if baseline_file is None else read_run(baseline_file).summary
+        verdict = judge_boundaries(
+            stored_run.table,
+            spec,
+            stored_run.summary.get("boundary"),
+            None if earlier is None else earlier.get("boundary", {}),
+            str(baseline_file or ""),
+        )
+    else:
+        stored = None
+        repeatable = is_repeatable(stored_run)
+        if baseline_file is not None:
+            if os.path.isdir(baseline_file):
+                ensure_tables(baseline_file, warn)
+            baseline = read_baseline(baseline_file)
+            check_matches(baseline, stored_run, baseline_file)
+            stored = baseline.table
+            if baseline.repeatable is False:
+                repeatable = False
+        verdict = judge(
+            table_of_run(stored_run),
+            spec,
+            stored,
+            str(baseline_file or ""),
+            stored_run.table,
+            preset,
+            repeatable,
+        )
     files = write_gate_files(verdict, source, stored_run, out or run)
     if out is None and os.path.isfile(run / PAGES[0]):
         write_reports(run, flips=read_run_json(run).get("kind") != "score")

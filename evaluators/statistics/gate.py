@@ -121,10 +121,19 @@ class GateSpec(_Strict):
     max_missing: float = Field(
         default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric."
     )
-    metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
+    metrics: dict[str, MetricRule] = Field(default={}, min_length=1, description="Metric to rule.")
+    boundary_margin: float | None = Field(
+        default=None,
+        ge=0.0,
+        description="How much more of the range of --vary may fail, in the parameter's unit; in place of metrics.",
+    )
 
     @model_validator(mode="after")
     def _decides_about_its_population(self) -> GateSpec:
+        if bool(self.metrics) == (self.boundary_margin is not None):
+            raise ValueError(
+                "a gate needs either metrics or boundary_margin | points of a search are not averaged: write two gates"
+            )
         binding = [rule for rule in self.metrics.values() if rule.is_paired and rule.must_decide]
         if self.population == "scenes" and not binding:
             raise ValueError(

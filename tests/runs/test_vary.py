@@ -56,6 +56,11 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
     assert "no failure" in found["variants"]["clean/pure-pursuit"]["reason"]
     assert found["reachable"][1] < 2000
     assert found["unreachable"]
+    gate = tmp_path / "gate.yaml"
+    gate.write_text("version: 1\nboundary_margin: 0.5\n")
+    command = ["gate", str(tmp_path / "run"), "--gate", str(gate)]
+    assert run_command([*command, "--baseline-file", str(tmp_path / "run")]) == 0
+    assert run_command(command) == 2  # one variant, and nothing to compare it with
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,9 @@ def test_lights_of_a_junction_take_turns_and_people_walk_while_their_road_has_re
         assert "red" in colours[:2]
         assert colours[0] == "red" or colours[2] == "red"
     assert {one.colour_at(1_000_000) for one in signals} == {"green", "red"}
+    assert go.head is not None
+    assert go.head[0] == pytest.approx(98.0)
+    assert go.head[2] >= 3.0
 
 
 def test_what_stands_beside_a_road_is_part_of_the_map_and_what_does_not_fit_is_said(tmp_path):
