@@ -102,7 +102,7 @@ def gate(
     if spec.boundary_margin is not None:
         earlier = None if baseline_file is None else read_run(baseline_file).summary
         verdict = judge_boundaries(
-            stored_run.table,
+            table_of_run(stored_run),
             spec,
             stored_run.summary.get("boundary"),
             None if earlier is None else earlier.get("boundary", {}),
