@@ -104,9 +104,8 @@ def _export_to_alpasim(items: Sequence[str], folder: Path, as_json: bool) -> Non
     for one in done.runs:
         failed = f", {one.failed} failed" if one.failed else ""
         lines.append(f"run     {done.root / one.folder}  {one.rollouts} rollouts{failed}")
-        lines += [f"  note  {note}" for note in one.notes]
     lines += [f"scene   {done.root / scene}" for scene in done.scenes]
-    exported = [{**vars(one), "notes": list(one.notes)} for one in done.runs]
+    exported = [vars(one) for one in done.runs]
     facts = {"out": str(done.root), "runs": exported, "scenes": list(done.scenes)}
     show(as_json, facts, *lines)
 

@@ -15,17 +15,17 @@ import json
 import math
 import os
 import re
-import types
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import YAML_BYTES, YAML_VALUES
 from alpasim_plugin.core.reading import read_text, real
 from alpasim_plugin.core.reading.files import wanted_of
@@ -378,17 +378,17 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     name = dotted(loc)
     last = str(problem["loc"][-1]) if problem["loc"] else ""
     if kind == "extra_forbidden":
-        models = _models_at(model, problem["loc"][:-1])
-        keys = sorted({f.alias or k for m in models for k, f in m.model_fields.items()})
+        keys = sorted(_fields_at(model, problem["loc"][:-1]))
         message = f"unknown key {last!r} in {dotted(loc[:-1])}"
-        elsewhere = _keys_below(model)
+        sections = {key: _fields_at(model, (key,)) for key in _fields_at(model, ())}
+        elsewhere = {key: f"{name}.{key}" for name, below in sections.items() for key in below}
         near = _like(last, [*keys, *elsewhere])
         if near is not None and near not in keys:
             return message, f"did you mean {elsewhere[near]!r}? valid here: {', '.join(keys)}"
         return message, _nearest(last, keys)
     if kind == "missing":
-        fields = [m.model_fields.get(last) for m in _models_at(model, problem["loc"][:-1])]
-        wanted = next((field.description for field in fields if field), None) or "see the schema"
+        field = _fields_at(model, problem["loc"][:-1]).get(last, {})
+        wanted = str(field.get("description") or "see the schema")
         return f"{name} has no {last!r}", f"add {last}: {wanted.partition('. ')[0].rstrip('.')}"
     if kind in ("union_tag_invalid", "literal_error"):
         value = str(context.get("tag", problem["input"]))
@@ -397,7 +397,7 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
         key = f"{name}.kind" if "tag" in context else name
         return f"{key} is {value!r}", _nearest(value, choices)
     if kind == "union_tag_not_found":
-        kinds = sorted({str(tag) for m in _models_at(model, problem["loc"]) for tag in _tags(m)})
+        kinds = sorted({tag for form in _forms_at(model, problem["loc"]) for tag in _tags(form)})
         return f"{name} has no 'kind'", f"add kind: {' | '.join(kinds)}"
     if kind == "value_error":
         message, _, hint = str(context["error"]).partition(" | ")
@@ -430,52 +430,44 @@ def _like(name: str, choices: Collection[str]) -> str | None:
     return near[0] if near else None
 
 
-def _keys_below(model: type[BaseModel]) -> dict[str, str]:
-    """Return the keys of a model's sections, with their paths."""
-    found: dict[str, str] = {}
-    for section, field in model.model_fields.items():
-        for below in filter(_is_model, _plain(field.annotation)):
-            found |= {key: f"{section}.{key}" for key in below.model_fields if key not in found}
-    return found
+def _fields_at(model: type[BaseModel], loc: Key) -> JsonObject:
+    """Return the JSON schemas of the keys that may stand at a pydantic location."""
+    fields: JsonObject = {}
+    for form in _forms_at(model, loc):
+        fields |= form.get("properties", {})
+    return fields
 
 
-def _models_at(model: Any, loc: Key) -> list[type[BaseModel]]:
-    """Return the models that may stand at a pydantic location (several where a union is not decided
-    by a tag).
+def _forms_at(model: type[BaseModel], loc: Key) -> list[JsonObject]:
+    """Return the JSON schemas of what may stand at a pydantic location: several where a union is
+    not decided by a tag.
     """
-    options = [model]
+    whole = model.model_json_schema()
+    forms = [whole]
     for part in loc:
-        options = [below for option in options for below in _below(option, part)]
-    return [option for option in options if _is_model(option)]
+        below = []
+        for form in forms:
+            fields = form.get("properties", {})
+            if isinstance(part, int):
+                below.append(form.get("items"))
+            elif part in _tags(form):
+                below.append(form)
+            else:
+                below.append(fields.get(part, form.get("additionalProperties")))
+        forms = [form for one in below if isinstance(one, dict) for form in _plain(one, whole)]
+    return forms
 
 
-def _below(option: Any, part: str | int) -> Iterator[Any]:
-    """Yield the plain types that may stand at a key, an index or a union's tag below a type."""
-    arguments = get_args(option)
-    if isinstance(part, int) or get_origin(option) is dict:
-        yield from _plain(arguments[-1 if get_origin(option) is dict else 0]) if arguments else ()
-    elif _is_model(option) and part in _tags(option):
-        yield option
-    elif _is_model(option) and part in option.model_fields:
-        yield from _plain(option.model_fields[part].annotation)
+def _plain(form: JsonObject, whole: JsonObject) -> list[JsonObject]:
+    """Return the forms that a JSON schema allows, without references and unions."""
+    if "$ref" in form:
+        return _plain(whole["$defs"][form["$ref"].rpartition("/")[2]], whole)
+    options = form.get("anyOf") or form.get("oneOf")
+    if options is None:
+        return [form]
+    return [one for option in options for one in _plain(option, whole)]
 
 
-def _plain(annotation: Any) -> Iterator[Any]:
-    """Yield the types that an annotation allows, without ``Annotated`` and unions."""
-    origin = get_origin(annotation)
-    if origin is Annotated:
-        yield from _plain(get_args(annotation)[0])
-    elif origin in (Union, types.UnionType):
-        for option in get_args(annotation):
-            yield from _plain(option)
-    elif origin is not Literal:
-        yield annotation
-
-
-def _is_model(option: Any) -> bool:
-    return isinstance(option, type) and issubclass(option, BaseModel)
-
-
-def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    field = model.model_fields.get("kind")
-    return () if field is None else get_args(field.annotation)
+def _tags(form: JsonObject) -> list[str]:
+    kind = form.get("properties", {}).get("kind", {})
+    return [kind["const"]] if "const" in kind else kind.get("enum", [])

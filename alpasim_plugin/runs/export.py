@@ -52,8 +52,6 @@ EVAL_CONFIG = "eval-config.yaml"
 WIZARD_CONFIG = "wizard-config.yaml"
 SCENES = "scenes"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
-# AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
-PLAN_US = 5_000_000
 
 
 def write_configs(folder: Path, final: Path, name: str, identity: str) -> None:
@@ -200,7 +198,6 @@ class ExportedRun:
         folder: Below the export.
         rollouts: How many logs it holds.
         failed: How many rollouts failed in the run and are only named in ``failed_rollouts.json``.
-        notes: What AlpaSim's tables will lack.
     """
 
     renderer: str
@@ -208,7 +205,6 @@ class ExportedRun:
     folder: str
     rollouts: int = 0
     failed: int = 0
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -270,7 +266,7 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
             if manifest["status"] != "ok":
                 run.failed += 1
                 continue
-            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1], run)
+            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1])
             run.rollouts += 1
             say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
         for run in runs.values():
@@ -284,7 +280,6 @@ def _export_rollout(
     folder: Path,
     manifest: JsonView,
     scenario: Scenario,
-    run: ExportedRun,
 ) -> None:
     """Copy one log with AlpaSim's names, and mark it complete."""
     source = root / manifest["path"] / LOG_NAME
@@ -301,21 +296,6 @@ def _export_rollout(
     target.mkdir(parents=True)
     copy_log(source, target / LOG_NAME, cameras=names)
     (target / COMPLETE).touch()
-    # Note what AlpaSim's minADE will lack.
-    reach_us = [
-        int(sample.t_us[-1]) - plan.now_us for plan in rollout.plans for sample in plan.samples
-    ]
-    if not reach_us:
-        _note(run, "no minADE: the policy gives no sampled plans")
-    elif min(reach_us) < PLAN_US:
-        shortest = f"{min(reach_us) * 1e-6:g} s"
-        _note(
-            run, f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest}"
-        )
-
-
-def _note(run: ExportedRun, text: str) -> None:
-    run.notes = (*run.notes, text) if text not in run.notes else run.notes
 
 
 def _finish(
