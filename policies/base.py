@@ -50,11 +50,11 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
     return policy
 
 
-def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:
+def plan_times(t_us: int) -> I64:
     """Return the times ``(T,)`` of a plan made at ``t_us``: now and every 0.1 s up to the
     horizon.
     """
-    n = round(horizon_s * 1_000_000 / PLAN_STEP_US)
+    n = round(PLAN_HORIZON_S * 1_000_000 / PLAN_STEP_US)
     return t_us + PLAN_STEP_US * np.arange(n + 1)
 
 

@@ -46,14 +46,14 @@ def temporary_path(path: Path) -> Path:
 
 
 @contextmanager
-def atomic_file(path: Path | str, do_this: str | None = None) -> Iterator[Path]:
+def atomic_file(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path to write; it is renamed to ``path`` when the block ends, and removed
     if the block raises.
 
     The folder must exist. The data are on the disk (fsync) before the rename.
 
     Raises:
-        InfrastructureError: The disk refuses; its hint is ``do_this``.
+        InfrastructureError: The disk refuses.
 
     Example:
         >>> with atomic_file("scene.png") as partial:     # doctest: +SKIP
@@ -67,7 +67,7 @@ def atomic_file(path: Path | str, do_this: str | None = None) -> Iterator[Path]:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise disk_error(path, error, do_this) from error
+        raise disk_error(path, error) from error
     finally:
         # A read-only folder refuses this as well, even for a file that is not there; the write's
         # own error says so.
@@ -76,7 +76,7 @@ def atomic_file(path: Path | str, do_this: str | None = None) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(folder: Path, do_this: str | None = None) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
     block raises.
 
@@ -93,7 +93,7 @@ def atomic_folder(folder: Path, do_this: str | None = None) -> Iterator[Path]:
     except OSError as error:
         if os.path.exists(old) and not os.path.exists(folder):
             old.replace(folder)
-        raise disk_error(folder, error, do_this) from error
+        raise disk_error(folder, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)

@@ -74,21 +74,16 @@ def rolling_exposure(
     return Exposure(rolling(camera.width, camera.height, "rows", backwards=False), start)
 
 
-def bands(request: RenderRequest, apart_px: float = APART_PX) -> list[Band]:
+def bands(request: RenderRequest) -> list[Band]:
     """Return the bands of a request's frame, in the order of their time; without an exposure one,
     at the shutter's end.
-
-    Args:
-        request: With the poses at shutter start and end.
-        apart_px: What neighbouring bands may show a thing apart by; no more than `MOST_BANDS` are
-            made however fast things move.
     """
     height, width = request.camera.height, request.camera.width
     if request.exposure is None:
         return [
             Band(slice(0, height), slice(0, width), None, request.T_world_camera[1], request.actors)
         ]
-    count = min(max(int(np.ceil(motion_px(request) / apart_px)), 1), MOST_BANDS)
+    count = min(max(int(np.ceil(motion_px(request) / APART_PX)), 1), MOST_BANDS)
     return list(bands_of(request, count))
 
 

@@ -97,17 +97,17 @@ def test_a_block_that_raises_leaves_the_old_file(error, tmp_path):
 
 def test_a_block_that_fails_leaves_the_old_folder(tmp_path):
     folder = tmp_path / "deep" / "a"
-    with atomic_folder(folder, "writing") as partial:
+    with atomic_folder(folder) as partial:
         (partial / "x").write_text("old")
     for error, seen in (
         (ValueError("no"), ValueError),
         (OSError(28, "No space left"), InfrastructureError),
     ):
-        with pytest.raises(seen), atomic_folder(folder, "writing") as partial:  # noqa: PT012 - the block is what fails
+        with pytest.raises(seen), atomic_folder(folder) as partial:  # noqa: PT012 - the block is what fails
             (partial / "x").write_text("new")
             raise error
     assert (folder / "x").read_text() == "old"
-    with atomic_folder(folder, "writing") as partial:
+    with atomic_folder(folder) as partial:
         (partial / "y").write_text("new")
     assert [path.name for path in folder.iterdir()] == ["y"]
     assert [path.name for path in folder.parent.iterdir()] == ["a"]

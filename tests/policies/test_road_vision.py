@@ -10,15 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.core.geometry import arc_lengths, inverse
-from policies.base import _targets
+from alpasim_plugin.core.geometry import inverse
 from policies.lane_filter import predict, search, shift, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from policies.road_vision import (
     PaintPoints,
     RidgeFilter,
-    _windows,
     find_paint,
     make_grid,
 )
@@ -49,33 +47,6 @@ def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera):
 
 
 # --- ridges
-
-
-def slow_ridge(value, row, column):
-    """Plain means over the three windows of one cell."""
-    half, gap, flank = (int(w[row]) for w in _windows(GRID))
-    n = value.shape[1]
-
-    def mean(a, b):
-        cells = [float(value[row, c]) for c in range(column + a, column + b + 1) if 0 <= c < n]
-        return sum(cells) / len(cells) if cells else 0.0
-
-    centre = mean(-half, half)
-    left = mean(-gap - flank, -gap)
-    right = mean(gap, gap + flank)
-    return max(min(centre - left, centre - right), 0.0)
-
-
-def test_ridge_response_equals_plain_window_means():
-    value = np.random.default_rng(0).integers(0, 256, GRID.inside.shape, dtype=np.uint8)
-    fast = RIDGES.response(value)
-    for row in range(0, len(GRID.x_m), 9):
-        reach = int((_windows(GRID)[1] + _windows(GRID)[2])[row])
-        seen = np.flatnonzero(GRID.inside[row])
-        for column in range(seen[0] + reach, seen[-1] - reach, 23):
-            assert fast[row, column] == pytest.approx(
-                slow_ridge(value, row, column), rel=1e-6, abs=1e-4
-            )
 
 
 def test_step_edge_is_no_paint_but_a_stroke_is():
@@ -245,36 +216,6 @@ def test_track_needs_three_sightings_and_ends_after_nine_misses():
         track = track_obstacle(track, None, 0.0, 0.1)
         assert track is not None
     assert track_obstacle(track, None, 0.0, 0.1) is None
-
-
-# --- lines
-
-
-@settings(deadline=None, max_examples=examples(40))
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    points=st.integers(2, 60),
-    turn=st.sampled_from([0.02, 0.4, 2.0]),
-)
-def test_lengths_and_targets_are_those_of_the_plain_arithmetic_to_the_bit(seed, points, turn):
-    random = np.random.default_rng(seed)
-    angle = np.cumsum(random.normal(0.0, turn, points))
-    line = np.cumsum(
-        random.uniform(0.0, 2.0, (points, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1),
-        axis=0,
-    )
-    assert np.array_equal(
-        arc_lengths(line),
-        np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]),
-    )
-    (x, y), start = random.normal(0.0, 5.0, 2), int(random.integers(points))
-    distance = (line[:, 0] - x) ** 2 + (line[:, 1] - y) ** 2
-    nearest = start + int(np.argmin(distance[start : start + 8]))
-    far = np.flatnonzero(distance[nearest:] >= 9.0)
-    assert _targets(line.tolist(), float(x), float(y), start, 9.0) == (
-        nearest,
-        nearest + int(far[0]) if len(far) else points - 1,
-    )
 
 
 def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure():
