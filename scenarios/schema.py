@@ -21,6 +21,8 @@ from scenarios.schema_parts import (
     MapSpec,
     Part,
     RoadSpec,
+    field,
+    number,
     within,
 )
 
@@ -64,28 +66,21 @@ class EgoSpec(Part):
 class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
-    buildings: float = Field(
-        default=0.7, ge=0, le=1, description="Share of the roadside covered by facades."
-    )
-    building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
-        default=(6.0, 18.0), description="Least and greatest."
+    buildings: float = number(0, 1, "Share of the roadside covered by facades.", 0.7)
+    building_height_m: tuple[BuildingHeight, BuildingHeight] = field(
+        "Least and greatest.", (6.0, 18.0)
     )
     trees_per_100m: float = within(b.TREES_PER_100M, "Trees per road side.", 4.0)
-    poles_spacing_m: float = Field(
-        default=30.0, ge=0, le=b.POLES_M.high, description="Between lamp posts; 0: none."
+    poles_spacing_m: float = number(0, b.POLES_M.high, "Between lamp posts; 0: none.", 30.0)
+    sky: Literal["clear", "overcast", "dusk"] = field("Sky and light.", "clear")
+    texture: float = number(0, 1, "Contrast of ground and facades.", 1.0)
+    fog_visibility_m: float | None = number(
+        10, 100_000, "Distance at which fog leaves 2 % of a contrast.", None
     )
-    sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
-    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facades.")
-    fog_visibility_m: float | None = Field(
-        default=None,
-        ge=10,
-        le=100_000,
-        description="Distance at which fog leaves 2 % of a contrast.",
+    time: Literal["day", "low_sun", "night"] = field(
+        "Light: of day, of a low sun ahead, or of lamps.", "day"
     )
-    time: Literal["day", "low_sun", "night"] = Field(
-        default="day", description="Light: of day, of a low sun ahead, or of lamps."
-    )
-    rain: float = Field(default=0.0, ge=0, le=200, description="Rain, mm/h; 0: dry.")
+    rain: float = number(0, 200, "Rain, mm/h; 0: dry.", 0.0)
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -106,8 +101,8 @@ class CameraModel(Part):
     name: str = Field(default="front", min_length=1, description="Name that policies request.")
     width: int = within(b.IMAGE_SIDE_PX, "Pixels.", 256)
     height: int = within(b.IMAGE_SIDE_PX, "Pixels.", 144)
-    lens: Literal["pinhole", "opencv", "fisheye", "ftheta"] = Field(
-        default="pinhole", description="Equations: docs/cameras.md."
+    lens: Literal["pinhole", "opencv", "fisheye", "ftheta"] = field(
+        "Equations: docs/cameras.md.", "pinhole"
     )
     hfov_deg: float = Field(
         default=75.0,
@@ -115,11 +110,9 @@ class CameraModel(Part):
         lt=221,
         description="Of pinhole and opencv at most 120.",
     )
-    focal_px: tuple[float, float] | None = Field(
-        default=None, description="In x and y, in place of hfov_deg."
-    )
-    centre_px: tuple[float, float] | None = Field(
-        default=None, description="Where the axis meets the image; none: the middle."
+    focal_px: tuple[float, float] | None = field("In x and y, in place of hfov_deg.", None)
+    centre_px: tuple[float, float] | None = field(
+        "Where the axis meets the image; none: the middle.", None
     )
     coefficients: tuple[float, ...] = Field(
         default=(),
@@ -132,18 +125,18 @@ class CameraModel(Part):
     x_m: float = within(b.MOUNT_M, "Ahead of the rear axle.", 1.6)
     y_m: float = within(b.MOUNT_M, "To the left.", 0.0)
     z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Above the ground.")
-    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
+    yaw_deg: float = number(-180, 180, "Turned to the left.", 0.0)
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
     shutter_us: int = within(
         b.SHUTTER_US,
         "From the first row's exposure to the last one's.",
         0,
     )
-    interval_us: int = Field(
-        default=0,
-        ge=0,
-        le=int(b.PERIOD_US.high),
-        description="Between frames, a multiple of rates.control_us; 0: rates.camera_us.",
+    interval_us: int = number(
+        0,
+        int(b.PERIOD_US.high),
+        "Between frames, a multiple of rates.control_us; 0: rates.camera_us.",
+        0,
     )
 
     @model_validator(mode="after")
@@ -165,8 +158,8 @@ class CameraModel(Part):
 class CameraSet(Part):
     """Cameras of a shipped rig, or of a calibration, in place of a list."""
 
-    rig: Literal["alpasim-4", "alpasim-6", "front", "surround-6"] | None = Field(
-        default=None, description="Name of a shipped rig."
+    rig: Literal["alpasim-4", "alpasim-6", "front", "surround-6"] | None = field(
+        "Name of a shipped rig.", None
     )
     from_: str | None = Field(
         default=None,
@@ -178,11 +171,8 @@ class CameraSet(Part):
         max_length=int(b.CAMERAS.high),
         description="Which of its cameras; none: all.",
     )
-    width: int | None = Field(
-        default=None,
-        ge=b.IMAGE_SIDE_PX.low,
-        le=b.IMAGE_SIDE_PX.high,
-        description="Of every camera; its height follows.",
+    width: int | None = number(
+        b.IMAGE_SIDE_PX.low, b.IMAGE_SIDE_PX.high, "Of every camera; its height follows.", None
     )
     shutter_us: int = within(b.SHUTTER_US, "Rolling shutter of every camera.", 0)
 
@@ -218,13 +208,11 @@ class TimingSpec(Part):
         description="From the first frame; none: 8 s on a built road, else to the end of the log or route.",
     )
     warmup_us: int = within(b.TIME_US, "How long the log is forced from then.", 500_000)
-    stop_at_path_end: bool = Field(
-        default=True,
-        description="End where the recorded path ends, unless the recorded car stands there.",
+    stop_at_path_end: bool = field(
+        "End where the recorded path ends, unless the recorded car stands there.", True
     )
-    timeline: Literal["scenario", "alpasim"] = Field(
-        default="scenario",
-        description="alpasim: start at the recording's first camera frame and force 1.7 s.",
+    timeline: Literal["scenario", "alpasim"] = field(
+        "alpasim: start at the recording's first camera frame and force 1.7 s.", "scenario"
     )
     start_time_offset_us: int = within(
         b.TIME_US,
@@ -236,14 +224,11 @@ class TimingSpec(Part):
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
-    kind: Literal["none", "fixed", "measured"] = Field(
-        default="none", description="No delay, a fixed one, or the measured one."
+    kind: Literal["none", "fixed", "measured"] = field(
+        "No delay, a fixed one, or the measured one.", "none"
     )
     fixed_us: int = within(b.TIME_US, "Delay where kind is fixed.", 0)
-    fixer: bool = Field(
-        default=False,
-        description="With kind measured: the policy also waits for the fixer.",
-    )
+    fixer: bool = field("With kind measured: the policy also waits for the fixer.", False)
 
     @model_validator(mode="after")
     def _fitting(self) -> LatencySpec:
@@ -257,9 +242,9 @@ class LatencySpec(Part):
 class DegradationSpec(Part):
     """How the renderer 3dgs differs from the scene as built."""
 
-    kind: Literal["reconstruction", "cycle", "none"] = Field(
-        default="reconstruction",
-        description="A model stopped early; one fitted to views to the left of the path; none.",
+    kind: Literal["reconstruction", "cycle", "none"] = field(
+        "A model stopped early; one fitted to views to the left of the path; none.",
+        "reconstruction",
     )
     share: float = Field(
         default=0.15,
@@ -267,30 +252,15 @@ class DegradationSpec(Part):
         le=1,
         description="Share of the fit's whole schedule.",
     )
-    shift_m: float = Field(
-        default=1.0,
-        ge=-10,
-        le=10,
-        description="Cycle: how far to the left the views lie.",
-    )
+    shift_m: float = number(-10, 10, "Cycle: how far to the left the views lie.", 1.0)
     views_per_s: float = Field(
         default=6.0,
         gt=0,
         le=30,
         description="Views per second of log that are fitted.",
     )
-    depth_error: float = Field(
-        default=0.1,
-        ge=0,
-        le=0.5,
-        description="Spread of the first points' depth.",
-    )
-    pose_error_m: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="Spread of the poses of these views.",
-    )
+    depth_error: float = number(0, 0.5, "Spread of the first points' depth.", 0.1)
+    pose_error_m: float = number(0, 1, "Spread of the poses of these views.", 0.0)
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -314,10 +284,7 @@ class BackgroundSpec(Part):
         max_length=4,
         description="4 x 4 matrix from the file to the world; may scale.",
     )
-    keep_road: bool = Field(
-        default=False,
-        description="Draw the built road too.",
-    )
+    keep_road: bool = field("Draw the built road too.", False)
 
 
 class VehicleSpec(Part):
@@ -342,19 +309,19 @@ class VehicleSpec(Part):
 class JitterSpec(Part):
     """Ranges within which scenes of other seeds than 0 differ; uniform, relative unless in a unit."""
 
-    length: float = Field(default=0.05, ge=0, le=0.5, description="Of elements.")
-    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Of curvatures.")
-    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Of lanes.")
-    speed: float = Field(default=0.05, ge=0, le=0.5, description="Of ego and actors.")
-    position_m: float = Field(default=1.5, ge=0, le=20, description="Of actors along the road.")
+    length: float = number(0, 0.5, "Of elements.", 0.05)
+    curvature: float = number(0, 0.5, "Of curvatures.", 0.1)
+    lane_width: float = number(0, 0.2, "Of lanes.", 0.02)
+    speed: float = number(0, 0.5, "Of ego and actors.", 0.05)
+    position_m: float = number(0, 20, "Of actors along the road.", 1.5)
     time_us: int = within(b.TIME_US, "Of scripted moments.", 150_000)
 
 
 class RangeSpec(Part):
     """A number drawn uniformly."""
 
-    low: float = Field(description="Smallest value.")
-    high: float = Field(description="Largest value.")
+    low: float = field("Smallest value.")
+    high: float = field("Largest value.")
 
     @model_validator(mode="after")
     def _ordered(self) -> RangeSpec:
@@ -374,35 +341,28 @@ class ChoiceSpec(Part):
 class ScenarioSpec(Part):
     """One scenario file."""
 
-    version: Literal[1] = Field(description="Version of this schema: 1.")
+    version: Literal[1] = field("Version of this schema: 1.")
     scene_id: str | None = Field(
         default=None,
         max_length=100,
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*(@@[-+.0-9e]+)?$",
         description="None: the file's folder and name.",
     )
-    description: str = Field(default="", description="One sentence.")
+    description: str = field("One sentence.", "")
     tags: tuple[str, ...] = Field(
         default=(), max_length=int(b.LISTED.high), description="Keywords."
     )
-    seed: int = Field(
-        default=0,
-        ge=0,
-        le=int(b.SEED.high),
-        description="Scene seed; 0: as written, others jitter the numbers.",
+    seed: int = number(
+        0, int(b.SEED.high), "Scene seed; 0: as written, others jitter the numbers.", 0
     )
-    road: RoadSpec | None = Field(
-        default=None, description="A road to build; give this, log or map."
-    )
-    log: LogSpec | None = Field(default=None, description="A recorded drive to use.")
-    map: MapSpec | None = Field(default=None, description="A map to drive on.")
-    ego: EgoSpec = Field(
-        default=EgoSpec(), description="The expert that drives a built road or a map."
-    )
+    road: RoadSpec | None = field("A road to build; give this, log or map.", None)
+    log: LogSpec | None = field("A recorded drive to use.", None)
+    map: MapSpec | None = field("A map to drive on.", None)
+    ego: EgoSpec = field("The expert that drives a built road or a map.", EgoSpec())
     actors: tuple[ActorSpec, ...] = Field(
         default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users."
     )
-    environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
+    environment: EnvironmentSpec = field("Surroundings.", EnvironmentSpec())
     cameras: (
         Annotated[
             Annotated[
@@ -414,29 +374,19 @@ class ScenarioSpec(Part):
             Discriminator(lambda given: "(list)" if isinstance(given, list | tuple) else "(set)"),
         ]
         | None
-    ) = Field(default=None, description="None: the log's own, or one named front.")
-    rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
-    timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
-    latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
-    degradation: DegradationSpec = Field(
-        default=DegradationSpec(), description="Degradation of the renderer 3dgs."
+    ) = field("None: the log's own, or one named front.", None)
+    rates: RatesSpec = field("Periods of the loop.", RatesSpec())
+    timing: TimingSpec = field("Start, length and warm-up.", TimingSpec())
+    latency: LatencySpec = field("Delay of the policy.", LatencySpec())
+    degradation: DegradationSpec = field("Degradation of the renderer 3dgs.", DegradationSpec())
+    background: BackgroundSpec | None = field("A Gaussian file as background.", None)
+    vehicle: VehicleSpec | None = field("The ego; none: the log's, or the default one.", None)
+    jitter: JitterSpec = field("How other scene seeds than 0 differ.", JitterSpec())
+    variations: dict[str, RangeSpec | ChoiceSpec] = field(
+        "Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed.", {}
     )
-    background: BackgroundSpec | None = Field(
-        default=None, description="A Gaussian file as background."
-    )
-    vehicle: VehicleSpec | None = Field(
-        default=None, description="The ego; none: the log's, or the default one."
-    )
-    jitter: JitterSpec = Field(
-        default=JitterSpec(), description="How other scene seeds than 0 differ."
-    )
-    variations: dict[str, RangeSpec | ChoiceSpec] = Field(
-        default={},
-        description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed.",
-    )
-    samples: tuple[dict[str, Any], ...] = Field(
-        default=(),
-        description="Each dotted key to value; the scene seed picks one, cyclically.",
+    samples: tuple[dict[str, Any], ...] = field(
+        "Each dotted key to value; the scene seed picks one, cyclically.", ()
     )
 
     @property

@@ -30,6 +30,16 @@ def within(bound: b.Bound, description: str | None = None, default: Any = ...) -
     return Field(default, ge=bound.low, le=bound.high, description=description)
 
 
+def number(low: float, high: float, description: str, default: Any = ...) -> Any:
+    """Return the field of a number from ``low`` to ``high``; see `within`."""
+    return Field(default, ge=low, le=high, description=description)
+
+
+def field(description: str, default: Any = ...) -> Any:
+    """Return the field of any other value, which is required without a default."""
+    return Field(default, description=description)
+
+
 BuildingHeight = Annotated[float, within(b.BUILDING_M)]
 Side = Annotated[float, within(b.BODY_M)]  # of a body
 Speed = Annotated[float, within(b.SPEED_MPS)]
@@ -87,21 +97,15 @@ class IntersectionSegment(Part):
     """A junction; the road goes on by ``turn``."""
 
     kind: Literal["intersection"]
-    turn: Turn = Field(default="straight", description="Where the road goes on.")
+    turn: Turn = field("Where the road goes on.", "straight")
     arms: tuple[Turn, ...] = Field(
         default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry."
     )
-    cross_lanes: int = Field(
-        default=1, ge=1, le=4, description="Lanes per direction on the other arms."
-    )
-    arm_length_m: float = Field(
-        default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms."
-    )
-    corner_radius_m: float = Field(
-        default=8.0, ge=3, le=40, description="Size of the kerb's corners."
-    )
-    crosswalks: bool = Field(default=True, description="Crosswalks on every arm.")
-    guide_lines: bool = Field(default=True, description="Dashed lines through the junction.")
+    cross_lanes: int = number(1, 4, "Lanes per direction on the other arms.", 1)
+    arm_length_m: float = number(b.SEGMENT_M.low, 1000, "Length of those arms.", 40.0)
+    corner_radius_m: float = number(3, 40, "Size of the kerb's corners.", 8.0)
+    crosswalks: bool = field("Crosswalks on every arm.", True)
+    guide_lines: bool = field("Dashed lines through the junction.", True)
 
 
 class NarrowGapSegment(Part):
@@ -112,14 +116,9 @@ class NarrowGapSegment(Part):
     gap_m: float = Field(
         default=3.0, gt=2.0, le=8, description="Free width between the parked cars."
     )
-    shift_m: float = Field(
-        default=0.0,
-        ge=-3,
-        le=3,
-        description="The gap's middle, left of the ego lane's.",
-    )
-    cars_left: int = Field(default=2, ge=0, le=8, description="Parked on the left.")
-    cars_right: int = Field(default=2, ge=0, le=8, description="Parked on the right.")
+    shift_m: float = number(-3, 3, "The gap's middle, left of the ego lane's.", 0.0)
+    cars_left: int = number(0, 8, "Parked on the left.", 2)
+    cars_right: int = number(0, 8, "Parked on the right.", 2)
 
 
 SEGMENT_KINDS: dict[str, type[Part]] = {
@@ -147,28 +146,14 @@ SegmentSpec = Annotated[
 class RoadSpec(Part):
     """A road of segments along the ego's path. Driving is on the right."""
 
-    lanes_forward: int = Field(
-        default=1, ge=1, le=6, description="In the ego's direction at the start."
-    )
-    lanes_backward: int = Field(default=1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
-    lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Of every lane.")
-    median_m: float = Field(
-        default=0.0,
-        ge=0,
-        le=30,
-        description="Raised median; 0: markings only.",
-    )
-    shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the lanes.")
-    parking_m: float = Field(
-        default=0.0,
-        ge=0,
-        le=6,
-        description="Parking strip, instead of the shoulder.",
-    )
+    lanes_forward: int = number(1, 6, "In the ego's direction at the start.", 1)
+    lanes_backward: int = number(0, 6, "Oncoming lanes; 0: one-way.", 1)
+    lane_width_m: float = number(2.2, 6, "Of every lane.", 3.5)
+    median_m: float = number(0, 30, "Raised median; 0: markings only.", 0.0)
+    shoulder_m: float = number(0, 6, "Paved strip outside the lanes.", 0.5)
+    parking_m: float = number(0, 6, "Parking strip, instead of the shoulder.", 0.0)
     speed_limit_mps: float | None = within(b.LIMIT_MPS, "Of all lanes.", None)
-    centre_paint: CentrePaint = Field(
-        default="double_yellow", description="Line between the directions."
-    )
+    centre_paint: CentrePaint = field("Line between the directions.", "double_yellow")
     heading_deg: float = within(b.ANGLE_DEG, "Of the road's beginning, from east to the left.", 0.0)
     segments: tuple[SegmentSpec, ...] = Field(
         min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order."
@@ -195,12 +180,9 @@ class LogSpec(Part):
     path: str | None = Field(
         default=None, min_length=1, description="File or folder that source reads."
     )
-    ego: int | str | None = Field(
-        default=None,
-        description="CommonRoad: the vehicle that becomes the ego.",
-    )
-    actors: Literal["replay", "idm", "none"] = Field(
-        default="replay", description="Replay the recorded traffic, let it react, or drop it."
+    ego: int | str | None = field("CommonRoad: the vehicle that becomes the ego.", None)
+    actors: Literal["replay", "idm", "none"] = field(
+        "Replay the recorded traffic, let it react, or drop it.", "replay"
     )
 
     @model_validator(mode="after")
@@ -236,7 +218,7 @@ class MapRoute(Part):
         alias="from",
         description="Start of the rear axle, ROAD:S: metres along the road (of Lanelet2: the lanelet).",
     )
-    to: Place | None = Field(default=None, description="End, ROAD:S.")
+    to: Place | None = field("End, ROAD:S.", None)
 
 
 class MapSpec(Part):
@@ -251,10 +233,8 @@ class MapSpec(Part):
     route: Annotated[
         Annotated[Literal["random"], Tag("(drawn)")] | Annotated[MapRoute, Tag("(named)")],
         Discriminator(lambda given: "(drawn)" if isinstance(given, str) else "(named)"),
-    ] = Field(default="random", description="Where to drive; random: drawn by the scene seed.")
-    vehicles: int = Field(
-        default=6, ge=0, le=100, description="Vehicles near the route, which react (IDM)."
-    )
+    ] = field("Where to drive; random: drawn by the scene seed.", "random")
+    vehicles: int = number(0, 100, "Vehicles near the route, which react (IDM).", 6)
 
     @model_validator(mode="after")
     def _one(self) -> MapSpec:
@@ -272,16 +252,13 @@ class MapSpec(Part):
 
 class _Actor(Part):
     id: ActorId
-    label: Label = Field(default="car", description="Class of road user.")
-    size_m: tuple[Side, Side, Side] | None = Field(
-        default=None, description="Length, width, height; none: as usual."
-    )
+    label: Label = field("Class of road user.", "car")
+    size_m: tuple[Side, Side, Side] | None = field("Length, width, height; none: as usual.", None)
 
 
 class _InLane(_Actor):
-    lane: int | str = Field(
-        default=0,
-        description="Forward lane (0: at the centre line), oncoming lane (-1), or a lane id.",
+    lane: int | str = field(
+        "Forward lane (0: at the centre line), oncoming lane (-1), or a lane id.", 0
     )
     s_m: float = within(
         b.STATION_M, "Centre, along the road from the ego's start (lane id: of that lane)."
@@ -290,17 +267,15 @@ class _InLane(_Actor):
 
 
 class _Adversary(_Actor):
-    role: Literal["adversary"] | None = Field(
-        default=None,
-        description="adversary: up to the place where it acts it chooses its speed, half to one and a half times speed_mps, to be gap_m ahead of the ego.",
+    role: Literal["adversary"] | None = field(
+        "adversary: up to the place where it acts it chooses its speed, half to one and a half times speed_mps, to be gap_m ahead of the ego.",
+        None,
     )
     gap_m: float = within(b.GAP_M, "Of an adversary: from the ego's front to its rear.", 6.0)
 
 
 class _Walker(_Actor):
-    yields: bool = Field(
-        default=False, description="It waits where it would walk into the ego's way."
-    )
+    yields: bool = field("It waits where it would walk into the ego's way.", False)
 
 
 class ParkedActor(_Actor):
@@ -308,15 +283,13 @@ class ParkedActor(_Actor):
 
     kind: Literal["parked"]
     s_m: float = within(b.STATION_M, "Centre, along the road from the ego's start.")
-    side: Literal["left", "right"] = Field(default="right", description="Side of the road.")
+    side: Literal["left", "right"] = field("Side of the road.", "right")
     clearance_m: float = within(
         b.OFFSET_M, "From the outer lane's edge; negative: it stands in the lane.", 0.3
     )
-    count: int = Field(default=1, ge=1, le=40, description="Vehicles in the row.")
+    count: int = number(1, 40, "Vehicles in the row.", 1)
     spacing_m: float = within(b.SPACING_M, "Between their centres.", 7.0)
-    yaw_deg: float = Field(
-        default=0.0, ge=-180, le=180, description="Turned to the left against the lane."
-    )
+    yaw_deg: float = number(-180, 180, "Turned to the left against the lane.", 0.0)
 
 
 class LoggedActor(_Walker):
@@ -389,7 +362,7 @@ class HardBrakeActor(_InLane, _Adversary):
     kind: Literal["hard_brake"]
     speed_mps: float = within(b.CRUISE_MPS, "Speed before braking.")
     brake_at_us: int = within(b.TIME_US, "Start of braking.")
-    decel_mps2: float = Field(default=6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
+    decel_mps2: float = number(b.ACCEL_MPS2.low, 10, "Deceleration.", 6.0)
     end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
 
     @model_validator(mode="after")
@@ -410,12 +383,7 @@ class CutInActor(_Adversary):
     s_m: float = within(b.STATION_M, "Centre at the start.")
     speed_mps: float = within(b.CRUISE_MPS, "Speed.")
     at_us: int = within(b.TIME_US, "Start of the lateral motion.")
-    change_us: int = Field(
-        default=2_500_000,
-        ge=b.PERIOD_US.low,
-        le=b.TIME_US.high,
-        description="Its duration.",
-    )
+    change_us: int = number(b.PERIOD_US.low, b.TIME_US.high, "Its duration.", 2_500_000)
     end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
     decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes then.", 2.0)
 
@@ -432,17 +400,15 @@ class CrossingActor(_Walker):
     """A pedestrian (or cyclist) who crosses, timed against the ego."""
 
     kind: Literal["crossing_pedestrian"]
-    label: Label = Field(default="pedestrian", description="Class of road user.")
+    label: Label = field("Class of road user.", "pedestrian")
     s_m: float = within(b.STATION_M, "Place of crossing.")
-    side: Literal["left", "right"] = Field(
-        default="right", description="Side that the crossing starts from."
-    )
+    side: Literal["left", "right"] = field("Side that the crossing starts from.", "right")
     speed_mps: float = within(b.CRUISE_MPS, "Walking speed.", 1.4)
-    before_ego_s: float = Field(
-        default=1.0,
-        ge=-b.TIME_US.high * 1e-6,
-        le=b.TIME_US.high * 1e-6,
-        description="Reaches the middle of the ego's lane so long before the ego would, undisturbed.",
+    before_ego_s: float = number(
+        -b.TIME_US.high * 1e-6,
+        b.TIME_US.high * 1e-6,
+        "Reaches the middle of the ego's lane so long before the ego would, undisturbed.",
+        1.0,
     )
     margin_m: float = within(
         b.GAP_M, "How far behind the road's edges the walk starts and ends.", 1.0

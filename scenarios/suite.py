@@ -21,7 +21,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.parts import names as part_names
 from alpasim_plugin.core.reading import read_text, real
-from scenarios.schema_parts import Part, within
+from scenarios.schema_parts import Part, field, within
 from scenarios.sources import import_advice, source_of
 
 LIBRARY = Path(__file__).resolve().parent
@@ -122,14 +122,14 @@ class SuiteItem(Part):
     seeds: tuple[Annotated[int, within(SEED)], ...] = Field(
         default=(), max_length=int(SEEDS.high), description="Scene seeds; none: the file's own."
     )
-    set: JsonObject = Field(default={}, description="Dotted key to value, as --set would.")
+    set: JsonObject = field("Dotted key to value, as --set would.", {})
 
 
 class SuiteSpec(Part):
     """A suite file."""
 
-    version: Literal[1] = Field(description="Version of this schema: 1.")
-    description: str = Field(default="", description="One sentence for people.")
+    version: Literal[1] = field("Version of this schema: 1.")
+    description: str = field("One sentence for people.", "")
     scenarios: tuple[Annotated[str, Field(min_length=1)] | SuiteItem, ...] = Field(
         min_length=1,
         max_length=int(LISTED.high),

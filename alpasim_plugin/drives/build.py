@@ -247,18 +247,15 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
     """Return what identifies an import: the images by size and time of change, their poses and
     lenses, and the options.
     """
-    digest = hashlib.sha256(
-        repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map))).encode()
-    )
+    facts: list[object] = [drive.kind, camera_height_m, lane_map and read_bytes(lane_map)]
     for one in drive.pictures:
         status = one.file.stat() if os.path.isfile(one.file) else None
-        digest.update(
-            f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode()
+        changed = status and (status.st_size, status.st_mtime_ns)
+        lens = one.lens.K.tolist(), one.lens.distortion.tolist()
+        facts.append(
+            (str(one.file), changed, one.camera, one.t_us, one.T_world_camera.tolist(), lens)
         )
-        digest.update(
-            one.T_world_camera.tobytes() + one.lens.K.tobytes() + one.lens.distortion.tobytes()
-        )
-    return digest.hexdigest()
+    return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
 def finished(out: Path, key: str) -> JsonObject:
@@ -370,11 +367,11 @@ def _write_transforms(
             "camera": one.camera,
             "use": one.use,
         }
-        exposure = exposures.get(one.name)
-        frames.append(frame | ({} if exposure is None else {"exposure": list(exposure)}))
-    write_json(
-        work / TRANSFORMS_FILE, {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames}
-    )
+        if one.name in exposures:
+            frame["exposure"] = list(exposures[one.name])
+        frames.append(frame)
+    document = {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames}
+    write_json(work / TRANSFORMS_FILE, document)
 
 
 def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
@@ -384,7 +381,7 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
     origin = (
         placed.T_world_source[:3, 3] if only_moved else np.zeros(3)
     )  # a turned frame has no origin to subtract
-    x, y, z = (-float(value) for value in origin)
+    x, y, z = np.negative(origin).tolist()
     cameras = [
         _camera(drive, placed, name)
         for name in drive.cameras

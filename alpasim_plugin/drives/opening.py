@@ -103,32 +103,22 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
             f"{without[0].where}: no t_us, which other photographs have",
             "give every photograph its time, or none",
         )
-    pictures = sorted(
-        (one for one in every if one.file in files),
-        key=lambda one: (str(one.camera), int(one.t_us or 0)),
-    )
-    kept = tuple(
-        sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"})
-    )
+    pictures = [one for one in every if one.file in files]
+    pictures.sort(key=lambda one: (str(one.camera), int(one.t_us or 0)))
+    kept = tuple({str(one.camera): 0 for one in pictures if one.more.get("use") == "never-fitted"})
     unit = document.get("unit")
     if unit not in (None, "m"):
         raise InputError(f"{folder / FILE}, unit: {unit!r}", 'give metres, "unit": "m", or no unit')
     metric = "the file's word that its unit is the metre" if unit else None
-    points = document.get("ply_file_path") if photographs else None
-    cloud = (
-        None
-        if points is None
-        else read_points(inside(folder, folder / str(points), f"{folder / FILE}, ply_file_path"))
-    )
-    given = (
-        None
-        if cloud is None
-        else Points(
-            np.asarray(cloud.means, dtype=np.float64),
-            np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1),
-            np.zeros((len(cloud), 3, 3)),
+    points = None
+    if photographs and document.get("ply_file_path") is not None:
+        path = inside(
+            folder, folder / str(document["ply_file_path"]), f"{folder / FILE}, ply_file_path"
         )
-    )
+        cloud = read_points(path)
+        rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
+        xyz = np.asarray(cloud.means, dtype=np.float64)
+        points = Points(xyz, rgb, np.zeros((len(cloud), 3, 3)))
     return SourceDrive(
         "transforms",
         real(folder).name,
@@ -136,7 +126,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         front,
         kept,
         metric,
-        points=given,
+        points=points,
         notes=tuple(notes),
     )
 

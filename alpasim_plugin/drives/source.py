@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.limits import Bound
 from alpasim_plugin.core.reading import natural_order
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
@@ -21,7 +22,8 @@ JUMP = (
     12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
 )
 LEAST_M = 1.0
-FEWEST, MOST = 8, 400  # photographs of a camera
+UNITS = 30.0  # steps change by so much, at once and for good, between metres and centimetres
+PHOTOGRAPHS = Bound("photographs with poses", "", 8, 400, "give a drive, or a part of a long one")
 PERIOD_US = 100_000  # between photographs without times
 LONGEST = 36_000  # steps between the numbers of names that count time: an hour
 SAME_LENGTH = 0.01  # paths that differ by less are equally long
@@ -57,11 +59,11 @@ class Points:
 
     def joined(self, other: Points) -> Points:
         """Return these and others of the same frame."""
-        mine, theirs = (
-            (self.xyz, self.rgb, self.covariance),
-            (other.xyz, other.rgb, other.covariance),
+        return Points(
+            np.concatenate([self.xyz, other.xyz]),
+            np.concatenate([self.rgb, other.rgb]),
+            np.concatenate([self.covariance, other.covariance]),
         )
-        return Points(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
     @property
     def rise_spread(self) -> F64:
@@ -126,62 +128,44 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
             others; too few; two units of length in one file; a camera that stands or only turns.
     """
     pictures = drive.of(drive.front)
-    if len(pictures) < FEWEST:
-        raise InputError(
-            f"{folder}: {len(pictures)} photographs of the camera {drive.front!r}",
-            f"give at least {FEWEST} photographs with poses along a drive",
-        )
-    if len(pictures) > MOST:
-        raise InputError(
-            f"{folder}: {len(pictures)} photographs of the camera {drive.front!r}, at most {MOST}",
-            "give a part of the drive, or every second photograph with its pose",
-        )
+    camera = f"{folder}, camera {drive.front!r}"
+    PHOTOGRAPHS.check(len(pictures), camera)
     for one in drive.pictures:
         if photographs:
             whole_photograph(one.file, one.lens, one.where)
-        first = drive.of(str(one.camera))[0].lens
-        if (one.lens.width, one.lens.height) != (first.width, first.height):
+        size, first = (one.lens.width, one.lens.height), drive.of(str(one.camera))[0].lens
+        if size != (first.width, first.height):
             raise InputError(
-                f"{one.where}, {one.file}: {one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
+                f"{one.where}, {one.file}: {size} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
                 "give the photographs as they were, each with its camera's name",
             )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     length = float(steps.sum())
     if length == 0 or (drive.metric and length < LEAST_M):
         raise InputError(
-            f"{folder}: the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns",
+            f"{camera}: it moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns",
             "give a part of the drive in which the car moves: depth comes from moving",
         )
-    far = int(np.argmax(steps))
+    usual, far = float(np.median(steps[steps > 0])), int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
-        one = pictures[far + 1]
-        raise InputError(
-            f"{one.where}: a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}",
-            "give all poses in one unit, metres, and one drive at a time",
-        )
-    ratio = _unit_change(steps)
-    if ratio is not None:
-        one = pictures[ratio[0]]
-        raise InputError(
-            f"{one.where}: steps {ratio[1]:.0f} times as long from {one.file.name} on as before it: metres and centimetres mixed?",
-            "give all poses in one unit, metres",
-        )
+        found = f"a step of {steps[far]:.4g}, where the usual step is {usual:.4g}"
+        raise _two_units(pictures[far + 1], found)
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, 5), axis=1)
+    before, after = medians[:-5], medians[5:]
+    changes = np.flatnonzero(
+        (np.maximum(before, after) > UNITS * np.minimum(before, after)) & (before * after > 0)
+    )
+    if len(changes):
+        found = f"steps more than {UNITS:.0f} times as long, or as short, from here on"
+        raise _two_units(pictures[int(changes[0]) + 6], found)
     return drive
 
 
-def _unit_change(steps: F64) -> tuple[int, float] | None:
-    """Return where steps become, at once and for good, more than 30 times longer or shorter, and
-    the factor; None where they do not.
-    """
-    for at in range(3, len(steps) - 3):
-        before, after = (
-            float(np.median(steps[max(0, at - 5) : at])),
-            float(np.median(steps[at : at + 5])),
-        )
-        if min(before, after) > 0 and max(before / after, after / before) > 30:
-            return at + 1, max(before / after, after / before)
-    return None
+def _two_units(one: Picture, found: str) -> InputError:
+    return InputError(
+        f"{one.where}, {one.file.name}: {found}",
+        "give all poses in one unit, metres, and one drive at a time",
+    )
 
 
 def timed(cameras: Sequence[Sequence[Picture]]) -> list[Picture]:

@@ -86,9 +86,9 @@ def import_splat(
         if os.path.exists(out):
             return finished(out, key)
         size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"
-        quality = "what the model was trained with is not known: held-out photographs may have been among it"
-        if not has_photographs:
-            quality = "no photographs: how well the model shows them is not measured"
+        quality = "no photographs: how well the model shows them is not measured"
+        if has_photographs:
+            quality = "what the model was trained with is not known: held-out photographs may have been among it"
         notes = (
             f"the model is {file.name}: {size}",
             *kept.notes,
@@ -132,20 +132,17 @@ def _in_frame(
     Raises:
         InputError: The poses see too little of the model.
     """
-    places = [
-        folder / TRAINED
-        for folder in (file.parent, (poses if os.path.isdir(poses) else poses.parent))
-    ]
-    stated = next((place for place in places if os.path.isfile(place)), None)
+    folders = (file.parent, poses if os.path.isdir(poses) else poses.parent)
+    stated = next((one / TRAINED for one in folders if os.path.isfile(one / TRAINED)), None)
+    frames = {"as it is": np.eye(4)}
+    if stated is not None:
+        frames |= _T_trained_source(stated, drive)
+    models = {name: placed_cloud(cloud, np.linalg.inv(T)) for name, T in frames.items()}
+    shares = {name: _covered(model, drive) for name, model in models.items()}
+    best = max(shares, key=lambda name: shares[name])
+    covered, moved = shares[best], models[best]
     notes: tuple[str, ...] = ()
-    if stated is None:
-        covered, moved = _covered(cloud, drive), cloud
-    else:
-        frames = {"as it is": np.eye(4), **_T_trained_source(stated, drive)}
-        models = {name: placed_cloud(cloud, np.linalg.inv(T)) for name, T in frames.items()}
-        shares = {name: _covered(model, drive) for name, model in models.items()}
-        best = max(shares, key=lambda name: shares[name])
-        covered, moved = shares[best], models[best]
+    if stated is not None:
         seen = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
         notes = (f"the model is taken {best}: from the poses it covers {seen}",)
     if covered < LEAST_COVERED:
@@ -171,11 +168,9 @@ def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
     with parsing(path, "copy it from the trained model again", "no transform and scale"):
         document = read_json_object(path)
         scale = float(document["scale"]) / float(more.get("applied_scale", 1.0))
-        trained = _rigid(document["transform"])
+        trained = np.diag([scale, scale, scale, 1.0]) @ _rigid(document["transform"])
         return {
-            f"in the frame of {path.name}{name}": np.diag([scale, scale, scale, 1.0])
-            @ trained
-            @ np.linalg.inv(_rigid(rows))
+            f"in the frame of {path.name}{name}": trained @ np.linalg.inv(_rigid(rows))
             for name, rows in applied.items()
         }
 

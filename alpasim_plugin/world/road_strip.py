@@ -116,6 +116,7 @@ class MapDraft:
     """A lane map while it is being built."""
 
     lanes: dict[str, Lane] = field(default_factory=dict)
+    links: dict[str, list[str]] = field(default_factory=dict)  # lane -> its successors
     road_edges: list[F64] = field(default_factory=list)
     drivable_areas: list[F64] = field(default_factory=list)
     crosswalks: list[F64] = field(default_factory=list)
@@ -127,18 +128,19 @@ class MapDraft:
         self.lanes[lane.lane_id] = lane
         return lane.lane_id
 
-    def link(self, before: str | None, after: str | None) -> None:
-        """Make one lane the successor of another."""
-        if before is None or after is None:
-            return
-        lane = self.lanes[before]
-        if after not in lane.successors:
-            self.lanes[before] = replace(lane, successors=(*lane.successors, after))
+    def link(self, before: str, after: str) -> None:
+        """Make one lane the successor of another; both may be added later."""
+        following = self.links.setdefault(before, [])
+        if after not in following:
+            following.append(after)
 
     def finish(self) -> LaneMap:
         """Freeze the map."""
         return LaneMap(
-            dict(self.lanes),
+            {
+                key: replace(lane, successors=tuple(self.links.get(key, ())))
+                for key, lane in self.lanes.items()
+            },
             tuple(self.road_edges),
             tuple(self.drivable_areas),
             tuple(self.crosswalks),
@@ -194,10 +196,9 @@ def build_strip(
             "use a smaller curvature or fewer or narrower lanes",
         )
     lines = make_lines(curve, profile)
-    if joint is not None:
-        for key, line in lines.items():
-            if key in joint:
-                line[0] = joint[key]
+    for key, point in (joint or {}).items():
+        if key in lines:
+            lines[key][0] = point
     add_sides(draft, name, lines, profile)
     return _add_lanes(draft, name, lines, profile)
 
@@ -296,7 +297,7 @@ def _lane(
 
 
 def build_taper(
-    draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None
+    draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint
 ) -> tuple[Strip, str]:
     """Add a straight stretch with one slanting lane beside (and running into, or out of) the
     outermost straight one.
@@ -331,15 +332,14 @@ def build_taper(
         else right
     )
     lines = make_lines(curve, profile)
-    if joint is not None:
-        extra = n if kind == "merge" else n - 1
-        for key, line in lines.items():
-            if key in joint and key != "right":
-                line[0] = joint[key]
-        left[0] = joint[f"f{extra}"]
-        centre[0] = joint[f"fc{extra}"]
-        right[0] = joint[f"f{extra + 1}"]
-        edge[0] = joint["right"]
+    extra = n if kind == "merge" else n - 1
+    for key, point in joint.items():
+        if key in lines and key != "right":
+            lines[key][0] = point
+    left[0] = joint[f"f{extra}"]
+    centre[0] = joint[f"fc{extra}"]
+    right[0] = joint[f"f{extra + 1}"]
+    edge[0] = joint["right"]
     if kind == "merge":  # the narrow end: meet the neighbour exactly
         left[-1] = lines[f"f{n - 1}"][-1]
         centre[-1] = lines[f"fc{n - 1}"][-1]

@@ -7,7 +7,7 @@ Junctions have arms, turning lanes, kerbs, crosswalks and stop lines.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,49 +44,30 @@ class Arm:
     heading_rad: float  # outwards
     profile: Profile  # seen outwards: forward lanes leave the junction
     joint: Joint  # points on the junction's border, named as seen outwards
-    out: tuple[
-        str | None, ...
-    ]  # None where the lane does not exist yet (the exit arm's strip comes later)
+    out: tuple[str, ...]
     into: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Junction:
-    """What the main road needs to go on."""
-
-    pose: tuple[float, float, float]  # start of the exit arm
-    joint: Joint  # of the exit arm
-    forward: tuple[str | None, ...]  # connectors of the main road by entry lane index
-    forward_next: tuple[int | None, ...]
-    backward: tuple[
-        str | None, ...
-    ]  # connectors of the oncoming direction by lane index at the entry arm
-    exits: tuple[
-        tuple[str, int], ...
-    ]  # connector id, exit lane index: to be linked once the exit strip exists
-    entries: tuple[tuple[int, str], ...]  # incoming lane index of the exit arm, connector id
-
-
-def build_intersection(
-    draft: MapDraft,
-    name: str,
-    pose: tuple[float, float, float],
-    element: Intersection,
-    profile: Profile,
-    entry_joint: Joint,
-    entry_forward: tuple[str, ...],
-    entry_backward: tuple[str, ...],
-) -> Junction:
-    """Add a junction at the end of a strip.
+def _grow_intersection(
+    draft: MapDraft, name: str, following: str, tip: _Tip, element: Intersection
+) -> Stretch:
+    """Add a junction at the end of the road; ``following`` is the name of the strip that will leave
+    it.
 
     Raises:
-        InputError: The main road leaves by an arm that is not there.
+        InputError: There is no road before it, or the main road leaves by an arm that is not there.
     """
+    if tip.after_junction:
+        raise InputError(
+            f"{name}: two intersections without a road between them",
+            "put a straight between them",
+        )
     if element.turn not in element.arms:
         raise InputError(
             f"{name}: turn: {element.turn}, but the arms are {', '.join(element.arms)}",
             "add that arm",
         )
+    profile = tip.profile
     side = replace(
         profile,
         forward=element.cross_lanes,
@@ -98,11 +79,11 @@ def build_intersection(
         max(profile.right_extent_m(), profile.left_extent_m(), side.right_extent_m())
         + element.corner_radius_m
     )
-    x, y, yaw = pose
+    x, y, yaw = tip.pose
     centre = np.array([x + reach * np.cos(yaw), y + reach * np.sin(yaw)])
     back = replace(profile, forward=profile.backward, backward=profile.forward)
-    arms = [Arm("entry", yaw + np.pi, back, _outward(entry_joint), entry_backward, entry_forward)]
-    exit_pose = pose
+    arriving = tip.forward[: profile.forward]
+    arms = [Arm("entry", yaw + np.pi, back, _outward(tip.joint), tip.backward, arriving)]
     for turn in ("right", "straight", "left"):  # counter-clockwise after the entry
         if turn not in element.arms:
             continue
@@ -110,70 +91,38 @@ def build_intersection(
         at = centre + reach * np.array([np.cos(heading), np.sin(heading)])
         start = (float(at[0]), float(at[1]), float(heading))
         if turn == element.turn:
-            exit_pose = start
+            tip.pose = start
             stub = sample_clothoid(start, 1.0, 0.0, 0.0)
-            joint = {key: line[0] for key, line in make_lines(stub, profile).items()}
-            arms.append(
-                Arm(
-                    turn,
-                    heading,
-                    profile,
-                    joint,
-                    (None,) * profile.forward,
-                    tuple(f"?{k}" for k in range(profile.backward)),
-                )
-            )
+            tip.joint = {key: line[0] for key, line in make_lines(stub, profile).items()}
+            out = tuple(f"{following}_f{k}" for k in range(profile.forward))
+            into = tuple(f"{following}_b{k}" for k in range(profile.backward))
+            arms.append(Arm(turn, heading, profile, tip.joint, out, into))
         else:
             curve = sample_clothoid(start, element.arm_length_m, 0.0, 0.0)
             strip = build_strip(draft, f"{name}_{turn}", curve, side)
             arms.append(
                 Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward)
             )
-    return _connect_all(draft, name, element, arms, exit_pose)
-
-
-def _connect_all(
-    draft: MapDraft,
-    name: str,
-    element: Intersection,
-    arms: list[Arm],
-    exit_pose: tuple[float, float, float],
-) -> Junction:
-    forward: dict[int, str] = {}
-    forward_next: dict[int, int] = {}
+    forward: dict[int, tuple[str, int]] = {}
     backward: dict[int, str] = {}
-    exits: list[tuple[str, int]] = []
-    entries: list[tuple[int, str]] = []
     for a in arms:
         for b in arms:
-            if a is b:
-                continue
             for i, j in _movements(a, b):
                 lane = draft.add(_connector(name, a, b, i, j))
-                if a.name == element.turn:
-                    entries.append((i, lane))
-                else:
-                    draft.link(a.into[i], lane)
-                if b.name == element.turn:
-                    exits.append((lane, j))
-                else:
-                    draft.link(lane, b.out[j])
+                draft.link(a.into[i], lane)
+                draft.link(lane, b.out[j])
                 if a.name == "entry" and b.name == element.turn:
-                    forward[i], forward_next[i] = lane, j
+                    forward[i] = lane, j
                 if a.name == element.turn and b.name == "entry":
                     backward[j] = lane
     _kerbs(draft, arms)
-    _paint(draft, element, arms, list(forward.values()))
-    exit_arm = next(a for a in arms if a.name == element.turn)
-    entry = arms[0]
-    return Junction(
-        exit_pose,
-        exit_arm.joint,
-        tuple(forward.get(i) for i in range(len(entry.into))),
-        tuple(forward_next.get(i) for i in range(len(entry.into))),
-        tuple(backward.get(j) for j in range(len(entry.out))),
-        tuple(exits),
-        tuple(entries),
+    _paint(draft, element, arms, [lane for lane, _ in forward.values()])
+    tip.forward, tip.backward, tip.after_junction = (), (), True
+    taken = [forward.get(i, (None, None)) for i in range(len(arriving))]
+    return Stretch(
+        tuple(lane for lane, _ in taken),
+        tuple(j for _, j in taken),
+        tuple(backward.get(j) for j in range(len(arms[0].out))),
     )
 
 
@@ -182,7 +131,7 @@ def _movements(a: Arm, b: Arm) -> list[tuple[int, int]]:
     the inner, right the outer lane.
     """
     n_in, n_out = len(a.into), len(b.out)
-    if n_in == 0 or n_out == 0:
+    if a is b or n_in == 0 or n_out == 0:
         return []
     angle = float(wrap_angle(b.heading_rad - a.heading_rad - np.pi))
     if abs(angle) < 0.1:
@@ -308,19 +257,16 @@ class _Tip:
 
     pose: tuple[float, float, float]
     profile: Profile
-    joint: Joint | None = None
-    junction: Junction | None = None
-    forward: tuple[
-        str | None, ...
-    ] = ()  # lane ids by index in the next element that will be linked to it
-    backward: tuple[str | None, ...] = ()
+    joint: Joint = field(default_factory=dict)
+    after_junction: bool = False
+    forward: tuple[str, ...] = ()  # lanes by index in the next element that will be linked to it
+    backward: tuple[str, ...] = ()
 
 
 def build_road(
     elements: Sequence[Element],
     profile: Profile,
     start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    step_m: float = 1.0,
 ) -> Road:
     """Build a road from its elements.
 
@@ -328,7 +274,6 @@ def build_road(
         elements: In driving order; an intersection or a change of lane count cannot come first.
         profile: Cross-section at the start.
         start: x, y (metres) and heading of the reference line.
-        step_m: Distance between stations.
 
     Raises:
         InputError: No element, an element where it cannot stand, or a curve tighter than the road
@@ -345,12 +290,12 @@ def build_road(
     for i, element in enumerate(elements):
         name = f"s{i}"
         if isinstance(element, Curve):
-            stretches.append(_grow_curve(draft, name, tip, element, step_m))
+            stretches.append(_grow_curve(draft, name, tip, element))
         elif isinstance(element, LaneTaper):
-            stretches.append(_grow_taper(draft, name, tip, element, step_m))
+            stretches.append(_grow_taper(draft, name, tip, element))
         else:
-            stretches.append(_grow_intersection(draft, name, tip, element))
-    if tip.junction is not None:
+            stretches.append(_grow_intersection(draft, name, f"s{i + 1}", tip, element))
+    if tip.after_junction:
         raise InputError(
             f"element {len(elements) - 1}: an intersection ends the road",
             "add a straight after it",
@@ -358,95 +303,52 @@ def build_road(
     return Road(draft.finish(), tuple(stretches))
 
 
-def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve, step_m: float) -> Stretch:
+def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve) -> Stretch:
     curve = sample_clothoid(
         tip.pose,
         element.length_m,
         element.start_curvature_per_m,
         element.end_curvature_per_m,
-        step_m,
     )
     strip = build_strip(draft, name, curve, tip.profile, tip.joint)
-    _link(draft, tip, strip)
-    indices = tuple(range(len(strip.forward)))
-    _move(tip, curve, strip, strip.forward)
-    return Stretch(strip.forward, indices, strip.backward)
+    _append(draft, tip, curve, strip, strip.forward)
+    return Stretch(strip.forward, tuple(range(len(strip.forward))), strip.backward)
 
 
-def _grow_taper(
-    draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_m: float
-) -> Stretch:
+def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper) -> Stretch:
     before = tip.profile.forward
-    narrow = replace(tip.profile, forward=before - 1 if element.kind == "merge" else before)
-    if narrow.forward < 1 or tip.junction is not None:
+    n = before - 1 if element.kind == "merge" else before
+    if n < 1 or tip.after_junction:
         raise InputError(
-            f"{name} ({element.kind}): {f'{before} forward lanes before it' if narrow.forward < 1 else 'follows an intersection'}",
+            f"{name} ({element.kind}): {before} forward lanes before it, or an intersection",
             "a merge needs two forward lanes and a straight, arc or clothoid before it",
         )
-    curve = sample_clothoid(tip.pose, element.length_m, 0.0, 0.0, step_m)
+    narrow = replace(tip.profile, forward=n)
+    curve = sample_clothoid(tip.pose, element.length_m, 0.0, 0.0)
     strip, slant = build_taper(draft, name, curve, narrow, element.kind, tip.joint)
-    _link(draft, tip, strip)
-    n, forward = narrow.forward, (*strip.forward, slant)
+    wide = tip.forward[before - 1]  # the lane that ends, or beside which a new one opens
+    forward = (*strip.forward, slant)
+    _append(draft, tip, curve, strip, forward)
+    draft.link(wide, slant)
     if element.kind == "merge":
-        draft.link(tip.forward[n], slant)
-        _move(
-            tip, curve, strip, forward
-        )  # the slanting lane's successor is the last straight lane's
         tip.profile = narrow
         return Stretch(forward, (*range(n), n - 1), strip.backward)
-    draft.link(tip.forward[n - 1], slant)
-    _move(tip, curve, strip, forward)
     tip.profile = replace(narrow, forward=n + 1)
     return Stretch(forward, tuple(range(n + 1)), strip.backward)
 
 
-def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersection) -> Stretch:
-    if tip.joint is None or tip.junction is not None:
-        raise InputError(
-            f"{name}: two intersections without a road between them",
-            "put a straight between them",
-        )
-    n = tip.profile.forward
-    forward = tuple(str(f) for f in tip.forward[:n])
-    junction = build_intersection(
-        draft,
-        name,
-        tip.pose,
-        element,
-        tip.profile,
-        tip.joint,
-        forward,
-        tuple(str(b) for b in tip.backward),
-    )
-    tip.pose, tip.joint, tip.junction = junction.pose, junction.joint, junction
-    tip.forward, tip.backward = (), ()
-    return Stretch(junction.forward, junction.forward_next, junction.backward)
-
-
-def _link(draft: MapDraft, tip: _Tip, strip: Strip) -> None:
-    """Connect a new strip to what stands before it."""
-    if tip.junction is not None:
-        for connector, k in tip.junction.exits:
-            draft.link(connector, strip.forward[k])
-        for k, connector in tip.junction.entries:
-            draft.link(strip.backward[k], connector)
-        tip.junction = None
-        return
+def _append(draft: MapDraft, tip: _Tip, curve: F64, strip: Strip, forward: tuple[str, ...]) -> None:
+    """Connect a new strip to what stands before it, and move the road's end to its end."""
     for k, before in enumerate(tip.forward):
         if k < len(strip.forward):
             draft.link(before, strip.forward[k])
-        elif before is not None and before.endswith(
-            "_merge"
-        ):  # a lane that ends runs into the outermost one
+        elif before.endswith("_merge"):  # a lane that ends runs into the outermost one
             draft.link(before, strip.forward[-1])
     for before, after in zip(tip.backward, strip.backward, strict=False):
         draft.link(after, before)
-
-
-def _move(tip: _Tip, curve: F64, strip: Strip, forward: tuple[str, ...]) -> None:
-    end = curve[-1]
-    tip.pose = (float(end[0]), float(end[1]), float(end[2]))
-    tip.joint, tip.forward, tip.backward = strip.joint(), forward, strip.backward
+    x, y, yaw, _ = curve[-1].tolist()
+    tip.pose, tip.joint, tip.after_junction = (x, y, yaw), strip.joint(), False
+    tip.forward, tip.backward = forward, strip.backward
 
 
 def polyline(lane_map: LaneMap, lane_ids: Sequence[str]) -> F64:
