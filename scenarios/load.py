@@ -62,8 +62,7 @@ def load_scenario(
         path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, OpenDRIVE or
             Lanelet2 map, or a name such as ``smoke/straight``.
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene,
-            with the seed in its id. Seed 0 is the file as written, but for its ``variations`` and
-            ``samples``.
+            with the seed in its id. Seed 0 is the file as written, but for its ``variations``.
         overrides: ``key=value`` with dotted keys, applied before validation.
         source: Who reads a recorded log, as `plugins.parts.resolve` takes it; None finds the source
             that recognises the path.

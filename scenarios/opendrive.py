@@ -42,7 +42,6 @@ from scenarios.opendrive_road import (
     placed,
     reference_line,
     road_points,
-    sided,
 )
 from scenarios.opendrive_signals import roadside, traffic_lights
 from scenarios.recorded import SourceFiles
@@ -261,7 +260,6 @@ def lane_map_of(
     Raises:
         InputError: No road has a lane for vehicles.
     """
-    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     lanes, notes = read_lanes(where, odr, T_local_map)
     return bordered(lanes, roadside(odr, lanes, T_local_map)), notes
 
@@ -326,7 +324,6 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         InputError: The file is no map, or broken.
     """
     odr = parse_map(path, files.read_xml(path))
-    odr = replace(odr, roads=tuple(sided(road) for road in odr.roads))
     starts = [road.records[0] for road in odr.roads if road.records]
     origin = (np.round(starts[0].x_m), np.round(starts[0].y_m), 0.0) if starts else (0.0, 0.0, 0.0)
     T_local_map = np.eye(4)

@@ -127,48 +127,6 @@ def gap_m(road: Road) -> float:
     return largest
 
 
-def sided(road: Road) -> Road:
-    """Return a road whose sections all have the lanes of both sides.
-
-    A section of a single side leaves the other side as it was: its lanes go on.
-    """
-    if not any(one.single_side for one in road.sections):
-        return road
-    starts = sorted({one.s_m for one in road.sections})
-    sections = []
-    for start, end in zip(starts, [*starts[1:], road.length_m], strict=True):
-        lanes = [
-            lane for one in _in_force(road, start, 0) for lane in one.lanes if not lane.lane_id
-        ]
-        for sign in (1, -1):
-            for own in _in_force(road, start, sign):
-                begins, ends = own.s_m == start, own not in _in_force(road, end, sign)
-                lanes += [
-                    replace(
-                        lane,
-                        predecessors=lane.predecessors if begins else (lane.lane_id,),
-                        successors=lane.successors
-                        if ends or end == road.length_m
-                        else (lane.lane_id,),
-                    )
-                    for lane in own.side(sign)
-                ]
-        sections.append(Section(start, end, tuple(lanes)))
-    return replace(road, sections=tuple(sections))
-
-
-def _in_force(road: Road, s_m: float, sign: int) -> tuple[Section, ...]:
-    """Return the section, if any, that says at an arc length which lanes a side has; 0 is the
-    middle.
-    """
-    said = [
-        one
-        for one in road.sections
-        if one.s_m <= s_m and (not sign or not one.single_side or one.side(sign))
-    ]
-    return tuple(said[-1:])
-
-
 def cubics_at(records: F64, s_m: F64) -> F64:
     """Return ``(N,)`` the value of the record in force at each arc length; before the first record
     that one is extended, none gives 0.
@@ -215,7 +173,6 @@ class Section:
     s_m: float
     end_m: float
     lanes: tuple[OdrLane, ...]
-    single_side: bool = False  # says nothing of the side on which it has no lane
 
     def side(self, sign: int) -> tuple[OdrLane, ...]:
         """Return the lanes of one side (1 left, -1 right), from the middle outwards."""
@@ -398,6 +355,8 @@ def _road(
         else:
             signals.append(_signal(one, original))
     sections = sorted(element.findall("lanes/laneSection"), key=lambda one: _number(one, "s", 0.0))
+    if any(one.get("singleSide") == "true" for one in sections):
+        raise ValueError("lane sections of a single side, which are not read: write both sides")
     starts = [_number(one, "s", 0.0) for one in sections]
     if starts and not (starts[0] >= 0 and starts[-1] <= road_m):
         raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
@@ -458,7 +417,7 @@ def _section(element: Element, start_m: float, end_m: float) -> Section:
                     one.get("direction") == "reversed",
                 )
             )
-    return Section(start_m, end_m, tuple(lanes), element.get("singleSide") == "true")
+    return Section(start_m, end_m, tuple(lanes))
 
 
 def _cubics(owner: Element, place: str, at: str = "s", start_m: float = 0.0) -> F64:

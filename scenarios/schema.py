@@ -385,9 +385,6 @@ class ScenarioSpec(Part):
     variations: dict[str, RangeSpec | ChoiceSpec] = field(
         "Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed.", {}
     )
-    samples: tuple[dict[str, Any], ...] = field(
-        "Each dotted key to value; the scene seed picks one, cyclically.", ()
-    )
 
     @property
     def built_until_us(self) -> int:

@@ -1,5 +1,4 @@
-"""Seeds make scenes: declared variations, explicit samples, and, for other seeds than 0, jitter of
-the numbers of a scenario file.
+"""Seeds make scenes: declared variations and, for other seeds than 0, jitter of the numbers of a scenario file.
 
 Every drawn number has its own stream, keyed by scene, seed and the number's key path, so adding an
 actor does not change the others.
@@ -44,9 +43,7 @@ AS_WRITTEN = 0  # the scene seed that jitters nothing
 class Drawn:
     """A scenario file as a scene seed makes it."""
 
-    document: (
-        Document  # with overrides, variations and sample written into it, for the positions of keys
-    )
+    document: Document  # with overrides and variations written into it, for the positions of keys
     spec: ScenarioSpec
     scene_id: str
     reseeded: bool  # the seed is another one than the file's
@@ -62,7 +59,7 @@ class Drawn:
 
 
 def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Drawn:
-    """Validate a document and draw its variations, its sample and its jitter.
+    """Validate a document and draw its variations and its jitter.
 
     Args:
         document: Scenario file, or what stands for a recorded log.
@@ -117,7 +114,7 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
 def _varied(
     document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]
 ) -> Document:
-    """Return the document with the variations and the sample of this seed written into it, except
+    """Return the document with the variations of this seed written into it, except
     for keys that an override fixes.
     """
     chosen: JsonObject = {}
@@ -127,8 +124,6 @@ def _varied(
             chosen[key] = float(rng.uniform(rule.low, rule.high))
         else:
             chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
-    if spec.samples:
-        chosen |= spec.samples[spec.seed % len(spec.samples)]
     kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
     return apply_overrides(document, kept, origin="variation")
 
@@ -136,8 +131,7 @@ def _varied(
 def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:
     """Return the specification with road, ego and actors changed within the declared ranges."""
     ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
-    written = [*fixed, *spec.variations, *(key for sample in spec.samples for key in sample)]
-    touched = {_by_id(key, ids) for key in written}
+    touched = {_by_id(key, ids) for key in (*fixed, *spec.variations)}
 
     def walk(part: Any, loc: tuple[str | int, ...]) -> Any:
         if isinstance(part, Part):
@@ -177,7 +171,7 @@ def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[A
 def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
     """Return dotted keys and plain values of a specification; actors go by their ids."""
     if isinstance(part, Part):
-        rules = {"jitter", "variations", "samples"} if not loc else set()
+        rules = {"jitter", "variations"} if not loc else set()
         pairs = [
             (name, getattr(part, name)) for name in type(part).model_fields if name not in rules
         ]

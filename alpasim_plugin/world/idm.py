@@ -177,11 +177,6 @@ def find_leaders(
     driver, body = np.nonzero(near)
     low, high = lines.stations(line, front_s_m - BEHIND_M, front_s_m + horizon_m)
     reach = half_width_m + margin_m
-    half_diagonal = np.hypot(bodies.half_length_m, bodies.half_width_m)[body]
-    may = lines.may_meet(
-        line[driver], bodies.xy[body], reach[driver] + half_diagonal, low[driver], high[driver]
-    )
-    driver, body = driver[may], body[may]
     span = spans(lines, line[driver], bodies, body, low[driver], high[driver])
     gap_m = span.rear - front_s_m[driver]
     ahead = (span.low < reach[driver]) & (span.high > -reach[driver])

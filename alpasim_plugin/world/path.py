@@ -223,8 +223,8 @@ class Lines:
         self.curvature = np.concatenate([path.curvature for path in paths])
         self._x, self._y = np.ascontiguousarray(self.xyz[:, :2].T)
         self._key = self.s + np.repeat(self._base, counts)  # increases over all paths
-        self.gap_m = np.array([float(np.diff(path.s).max()) for path in paths])
-        self._coarse = COARSE if self.gap_m.max() <= DENSE_M else 1
+        gap_m = max(float(np.diff(path.s).max()) for path in paths)
+        self._coarse = COARSE if gap_m <= DENSE_M else 1
 
     def at(self, line: I64, s_m: F64, offset_m: float | F64 = 0.0) -> tuple[F64, F64]:
         """Return points ``(P, 3)`` and headings ``(P,)``; see `Path.at`."""
@@ -264,15 +264,6 @@ class Lines:
             i == self.end[line] - 1,
         )
         return self.s[i] + along, across
-
-    def may_meet(self, line: I64, xy: F64, reach_m: F64, low: I64, high: I64) -> Bool:
-        """Return which points ``(P, 2)`` may lie within ``reach_m (P,)`` of their line between two
-        stations, or of its tangent beyond an end; errs only towards True.
-        """
-        far_m = reach_m + 0.5 * self._coarse * self.gap_m[line] + 0.5
-        close = self._squares(xy, low, high, self._coarse) <= far_m[:, None] ** 2
-        at_end = (low == self.begin[line]) | (high == self.end[line])
-        return close.any(axis=1) | at_end
 
     def _squares(self, xy: F64, low: I64, high: I64, every: int) -> F64:
         """Return the squared distances ``(P, n)`` of points to every n-th station of a range; the

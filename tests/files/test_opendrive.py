@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.errors import InputError
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
 
@@ -63,36 +64,9 @@ def span(lanes, key):
     return round(float(x[0]), 6), round(float(x[-1]), 6)
 
 
-def test_a_section_of_one_side_leaves_the_other_side_as_it_was():
-    lanes, notes = read(
-        road(
-            "1",
-            section(0, lane(1), lane(-1)),
-            section(20, lane(1, 1), lane(2), more='singleSide="true"'),
-            section(30, lane(-1, -1), lane(-2), more='singleSide="true"'),
-        )
-    )
-    assert set(lanes.lanes) == {
-        *("1.0.1", "1.0.-1", "1.1.1", "1.1.2", "1.1.-1"),
-        *("1.2.1", "1.2.2", "1.2.-1", "1.2.-2"),
-    }
-    assert lanes.lanes["1.0.-1"].successors == ("1.1.-1",)
-    assert lanes.lanes["1.1.-1"].successors == ("1.2.-1",)
-    assert lanes.lanes["1.2.2"].successors == ("1.1.2",)
-    assert span(lanes, "1.1.-1") == (20.0, 30.0)
-    assert not notes
-
-
-def test_sections_of_both_sides_may_begin_at_one_place():
-    lanes, notes = read(
-        road(
-            "1",
-            section(0, lane(1), more='singleSide="true"'),
-            section(0, lane(-1), more='singleSide="true"'),
-        )
-    )
-    assert set(lanes.lanes) == {"1.0.1", "1.0.-1"}
-    assert not notes
+def test_a_section_of_one_side_is_refused():
+    with pytest.raises(InputError, match="single side"):
+        read(road("1", section(0, lane(1), more='singleSide="true"')))
 
 
 def test_lanes_that_cannot_be_placed_are_said():

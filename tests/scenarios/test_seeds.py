@@ -114,16 +114,6 @@ def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path):
     assert {s.environment.sky for s in scenes} == {"dusk", "overcast"}
 
 
-def test_explicit_samples_go_round(tmp_path):
-    path = write(
-        tmp_path,
-        "samples:\n  - {actors.lead.s_m: 50}\n  - {actors.lead.s_m: 60, environment.sky: dusk}\n",
-    )
-    places = [measures(load_scenario(path, seed=seed))["place"] for seed in range(4)]
-    assert places == pytest.approx([50.0, 60.0, 50.0, 60.0])
-    assert load_scenario(path, seed=1).environment.sky == "dusk"
-
-
 def test_an_override_wins_over_variation_and_jitter(tmp_path):
     path = write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n")
     s = load_scenario(
