@@ -46,24 +46,17 @@ def given_cameras(drawn: Drawn) -> tuple[CameraSpec, ...] | None:
         cameras = tuple(camera_spec(model) for model in given)
     control_us = drawn.spec.rates.control_us
     names = [camera.name for camera in cameras]
-    for i, camera in enumerate(cameras):
-        with drawn.at("cameras", i):
-            if camera.name in names[:i]:
-                raise InputError(f"two cameras named {camera.name!r}", "give one another name")
-            if camera.interval_us % control_us:
-                raise InputError(
-                    f"interval_us = {camera.interval_us}, no multiple of rates.control_us = {control_us}",
-                    "choose a whole multiple, or 0 for rates.camera_us",
-                )
-            if camera.shutter_us > control_us:
-                raise InputError(
-                    f"shutter_us = {camera.shutter_us}, longer than rates.control_us = {control_us}",
-                    "shorten the exposure, or lengthen the control period",
-                )
     with drawn.at("cameras"):
         RIG_PIXELS.check(sum(camera.width * camera.height for camera in cameras), "cameras")
     for i, camera in enumerate(cameras):
         with drawn.at("cameras", i):
+            if camera.name in names[:i]:
+                raise InputError(f"two cameras named {camera.name!r}", "give one another name")
+            if camera.interval_us % control_us or camera.shutter_us > control_us:
+                raise InputError(
+                    f"interval_us = {camera.interval_us} and shutter_us = {camera.shutter_us} with rates.control_us = {control_us}",
+                    "choose a whole multiple as interval_us, and a shutter that is no longer",
+                )
             check_lens(camera)
     return cameras
 

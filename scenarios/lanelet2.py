@@ -23,7 +23,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, transform_points
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, se2, transform_points
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Signal
 from scenarios.commonroad_map import mark_intersections
@@ -424,10 +424,7 @@ def _sign(osm: Osm, way: str) -> tuple[F64, Box]:
     line = osm.line(osm.nodes(way))
     along = line[-1] - line[0]
     width_m = float(np.hypot(along[0], along[1]))
-    pose = np.eye(4)
-    heading_rad = np.arctan2(along[1], along[0]) + np.pi / 2
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = line.mean(axis=0)
-    pose[2, 3] += SIGN_M + PLATE_M / 2
+    heading_rad = float(np.arctan2(along[1], along[0])) + np.pi / 2
+    x, y, z = line.mean(axis=0).tolist()
+    pose = se2(x, y, heading_rad, z + SIGN_M + PLATE_M / 2)
     return pose, Box(0.05, max(width_m, PLATE_M), PLATE_M)

@@ -9,6 +9,8 @@ Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.usdz` reads the same roads by Alpa
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,7 +22,7 @@ from numpy.typing import ArrayLike
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import densify, project
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
-from alpasim_plugin.core.reading import some_of
+from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from scenarios.map_lines import bordered
 from scenarios.map_route import Spot
@@ -74,6 +76,7 @@ KINDS = {
     "biking": "bike",
     "parking": "parking",
 }
+OFF_THE_ROAD = "points that are not finite or not on a road"
 _SOLID = ("solid", "solid solid", "solid broken", "broken solid")
 
 
@@ -205,24 +208,14 @@ def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
     names none or an impossible one.
     """
     values: dict[str, float] = {}
-    for word in geo_reference.split():
-        key, _, text = word.partition("=")
-        name = next(
-            (n for n in ("lat_0", "lon_0", "alt_0", "h_0") if key.startswith(f"+{n}")), None
-        )
-        try:
-            if name is not None:
-                values["alt_0" if name == "h_0" else name] = float(text)
-        except ValueError:
-            continue  # AlpaSim passes over words it cannot read; real files hold some
-    if (
-        "lat_0" not in values
-        or "lon_0" not in values
-        or abs(values["lat_0"]) > 90
-        or abs(values["lon_0"]) > 180
-    ):
+    for name, text in re.findall(r"\+(lat_0|lon_0|alt_0|h_0)[^\s=]*=(\S*)", geo_reference):
+        # AlpaSim passes over words it cannot read; real files hold some.
+        with contextlib.suppress(ValueError):
+            values["alt_0" if name == "h_0" else name] = float(text)
+    lat_deg, lon_deg = values.get("lat_0", np.nan), values.get("lon_0", np.nan)
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         return None
-    return values["lat_0"], values["lon_0"], values.get("alt_0", 0.0)
+    return lat_deg, lon_deg, values.get("alt_0", 0.0)
 
 
 def earth_xyz(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike) -> F64:
@@ -277,40 +270,37 @@ def read_lanes(
     """
     lanes: dict[str, Lane] = {}
     left_out: Counter[str] = Counter()
+    unlike, apart = [], []
     for road in odr.roads:
+        place = f"{where}, road {road.road_id}"
         for index, section in enumerate(road.sections):
             if not road.records or section.end_m - section.s_m <= 1e-6:
                 left_out["any, in a section without length or geometry"] += len(section.lanes)
-            else:
+                continue
+            with parsing(f"{place}, section {index}", "repair its numbers"):
                 found = _section(road, index, section, T_local_map, left_out)
-                if found is None:
-                    here = f"{where}, road {road.road_id}, section {index}"
-                    raise InputError(
-                        f"{here}: points that are not finite or not on a road", "repair its numbers"
-                    )
-                lanes.update({one.lane_id: one for one in found})
+            lanes.update({one.lane_id: one for one in found})
+        missing = missing_m(road) if road.records else 0.0
+        if missing > MAX_MISSING_M:
+            raise InputError(
+                f"{place}: a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
+                "correct the length of the road, or add the records that lack",
+            )
+        if abs(missing) > JOIN_M:
+            unlike.append(f"{road.road_id} ({-missing:+.2f} m)")
+        gap = gap_m(road)
+        if gap > JOIN_M:
+            apart.append(f"{road.road_id} ({gap:.2f} m)")
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
         raise InputError(
             f"{where}: a map without a lane for vehicles", "use a map with lanes of type driving"
         )
     linked, link_notes = following(odr, lanes)
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
-    unlike = []
-    for road in odr.roads:
-        missing = missing_m(road) if road.records else 0.0
-        if missing > MAX_MISSING_M:
-            raise InputError(
-                f"{where}, road {road.road_id}: a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
-                "correct the length of the road, or add the records that lack",
-            )
-        if abs(missing) > JOIN_M:
-            unlike.append(f"{road.road_id} ({-missing:+.2f} m)")
     if unlike:
         notes.append(
             f"{len(unlike)} reference lines are not as long as their road: {some_of(unlike)}"
         )
-    gaps = {road.road_id: gap_m(road) for road in odr.roads}
-    apart = [f"{key} ({gap:.2f} m)" for key, gap in gaps.items() if gap > JOIN_M]
     if apart:
         notes.append(f"{len(apart)} reference lines whose records do not join: {some_of(apart)}")
     return linked, (*notes, *link_notes, *odr.notes)
@@ -366,8 +356,12 @@ def _signs_by_type(odr: OdrMap) -> tuple[str, ...]:
 
 def _section(
     road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]
-) -> list[Lane] | None:
-    """Return the lanes of a section; None where its numbers give no road."""
+) -> list[Lane]:
+    """Return the lanes of a section.
+
+    Raises:
+        ValueError: Its numbers give no road.
+    """
     s = _stations(road, section)
     line = reference_line(road.records, s)
     if not (
@@ -375,13 +369,13 @@ def _section(
         and np.abs(cubics_at(road.elevation, s)).max() <= MAX_ROAD_M
         and np.isfinite(np.tan(cubics_at(road.superelevation, s))).all()
     ):
-        return None
+        raise ValueError(OFF_THE_ROAD)
     out: list[Lane] = []
     marks = {lane.lane_id: lane.mark for lane in section.lanes}
     for lane, inner_t, outer_t in lane_borders(road, section, s):
         sign = 1 if lane.lane_id > 0 else -1
         if not np.abs(outer_t).max() <= MAX_OFFSET_M:
-            return None
+            raise ValueError(OFF_THE_ROAD)
         kind = KINDS.get(lane.kind)
         wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
         if kind is None or not wide:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Signal
 from scenarios.opendrive_road import (
     CROSSWALK,
@@ -190,10 +191,7 @@ def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float
 
 def _plate(road: Road, one: RoadSignal, T_local_map: F64) -> tuple[F64, Box]:
     """Return the middle of a sign, which faces its traffic, and its size."""
-    pose = np.eye(4)
     heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
-    c, s = np.cos(heading), np.sin(heading)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
-    pose[2, 3] += one.above_m + one.height_m / 2
+    x, y, z = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0].tolist()
+    pose = se2(x, y, heading, z + one.above_m + one.height_m / 2)
     return pose, Box(0.05, one.width_m, one.height_m)
