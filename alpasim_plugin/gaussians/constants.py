@@ -56,12 +56,7 @@ POSE_SIZE = 21
 GEO_FACTOR = 0  # nine columns: R_q diag(s), row by row
 GEO_PEAK = 9  # (log2(opacity) + 4) / 8, see raster_kernels
 GEO_EXTENT = 10  # standard deviations out to the alpha cut
-GEO_REACH = 11  # the largest scale, metres
-GEO_SIZE = 12
-
-# Bounding sphere of one bundle of 16 groups, float64: centre, radius of the means, largest scale.
-BUNDLE = 256
-SPHERE_SIZE = 5
+GEO_SIZE = 11
 
 # One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 +
 # t^2 where s = L11 dx + L12 dy and t = L22 dy: a sum of squares, which keeps its precision for
@@ -76,13 +71,9 @@ G = 7
 B = 8
 Z = 9
 RADIUS_X, RADIUS_Y = 10, 11  # half sizes of the box around the drawn ellipse, pixels
-TOP_Y = 12  # dy of the ellipse's rightmost point
-SLOPE = 13  # dx of the ellipse's middle line per dy
-HALF_WIDTH = 14  # half the ellipse's width at dy = 0
-BLOCK_REACH = (
-    15  # s^2 + t^2 of a 4 x 4 block's centre beyond which no pixel of the block is touched
-)
-RECORD = 16
+# s^2 + t^2 of a 4 x 4 block's centre beyond which no pixel of the block is touched
+BLOCK_REACH = 15
+RECORD = 16  # columns 12 to 14 are empty
 
 TILE = 16  # pixels; a tile is 4 x 4 blocks of 4 x 4 pixels
 EXPONENT_SCALE = math.sqrt(

@@ -14,7 +14,6 @@ from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     BLOCK_REACH,
-    BUNDLE,
     CAM_CX,
     CAM_CY,
     CAM_FX,
@@ -31,12 +30,10 @@ from alpasim_plugin.gaussians.constants import (
     CAM_WIDTH,
     EPS2D_PX2,
     EXPONENT_SCALE,
-    EXTENT_MAX_SIGMA,
     GEO_EXTENT,
     GEO_FACTOR,
     GEO_PEAK,
     GEO_SIZE,
-    HALF_WIDTH,
     L11,
     L12,
     L22,
@@ -51,9 +48,6 @@ from alpasim_plugin.gaussians.constants import (
     RADIUS_X,
     RADIUS_Y,
     RECORD,
-    SLOPE,
-    SPHERE_SIZE,
-    TOP_Y,
     B,
     G,
     R,
@@ -67,79 +61,9 @@ from alpasim_plugin.gaussians.sh import C0, sh_terms
 _sh_terms = njit(cache=True, nogil=True)(sh_terms)
 # Boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw.
 MARGIN_PX = 0.01
-_LOWPASS_REACH_PX = EXTENT_MAX_SIGMA * EPS2D_PX2**0.5 + 0.5
 _CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0
 BLOCK_HALF = 1.5
-
-
-@njit(cache=True, nogil=True, inline="never")
-def bundle_is_out_of_view(sphere, at, pose, camera):
-    """Return whether no Gaussian of a bundle can touch a pixel; errs only towards False.
-
-    A splat's half width on screen is at most 3.33 (f/z s sqrt(1 + slope^2) + sqrt(0.3)) for its
-    largest scale s and the clamped slope, so "right of the image" is the half space x - z (W - cx +
-    1.9)/f > 3.33 s sqrt(1 + slope^2), and likewise for the other edges.
-    """
-    dx = sphere[at] - pose[POSE_CENTRE]
-    dy = sphere[at + 1] - pose[POSE_CENTRE + 1]
-    dz = sphere[at + 2] - pose[POSE_CENTRE + 2]
-    radius, reach = sphere[at + 3], sphere[at + 4] * EXTENT_MAX_SIGMA
-    r = POSE_ROTATION
-    x = pose[r] * dx + pose[r + 1] * dy + pose[r + 2] * dz
-    y = pose[r + 3] * dx + pose[r + 4] * dy + pose[r + 5] * dz
-    z = pose[r + 6] * dx + pose[r + 7] * dy + pose[r + 8] * dz
-    if z + radius < pose[POSE_NEAR]:
-        return True
-    beyond = _LOWPASS_REACH_PX + camera[CAM_REACH]
-    right = (camera[CAM_WIDTH] - camera[CAM_CX] + beyond) / camera[CAM_FX]
-    left = (camera[CAM_CX] + beyond) / camera[CAM_FX]
-    below = (camera[CAM_HEIGHT] - camera[CAM_CY] + beyond) / camera[CAM_FY]
-    above = (camera[CAM_CY] + beyond) / camera[CAM_FY]
-    slope_x = max(abs(camera[CAM_SLOPE_LOW_X]), abs(camera[CAM_SLOPE_HIGH_X]))
-    slope_y = max(abs(camera[CAM_SLOPE_LOW_Y]), abs(camera[CAM_SLOPE_HIGH_Y]))
-    reach_x, reach_y = (
-        reach * np.sqrt(1.0 + slope_x * slope_x),
-        reach * np.sqrt(1.0 + slope_y * slope_y),
-    )
-    return (
-        x - z * right > reach_x + radius * np.sqrt(1.0 + right * right)
-        or -x - z * left > reach_x + radius * np.sqrt(1.0 + left * left)
-        or y - z * below > reach_y + radius * np.sqrt(1.0 + below * below)
-        or -y - z * above > reach_y + radius * np.sqrt(1.0 + above * above)
-    )
-
-
-@kernel
-def colours_in_lanes(coefficients, width, index, out):
-    """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes;
-    lanes left over are zero.
-
-    The colours are most of a cloud's bytes: this passes over them once, where array expressions
-    would pass four times.
-    """
-    n_groups = out.shape[0] // (width * 16)
-    for group in range(n_groups):
-        for lane in range(16):
-            rank = group * 16 + lane
-            at = group * width * 16 + lane
-            if rank < index.shape[0]:
-                source = index[rank] * width
-                for k in range(width):
-                    out[at + k * 16] = coefficients[source + k]
-            else:
-                for k in range(width):
-                    out[at + k * 16] = np.float32(0.0)
-
-
-@kernel
-def spheres_in_view(spheres, poses, camera):
-    """Return for each part, given the bounding sphere of all its Gaussians, whether it may be
-    seen.
-    """
-    seen = np.zeros(poses.shape[0], np.bool_)
-    for i in range(poses.shape[0]):
-        seen[i] = not bundle_is_out_of_view(spheres, i * SPHERE_SIZE, poses[i], camera)
-    return seen
+CHUNK = 16  # groups that a thread takes at once
 
 
 # Three vectors of sixteen lanes, one per axis, are a tuple.
@@ -315,9 +239,6 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     v.store(lanes, Z * 16, z)
     v.store(lanes, RADIUS_X * 16, radius_x + MARGIN_PX)
     v.store(lanes, RADIUS_Y * 16, radius_y + MARGIN_PX)
-    v.store(lanes, TOP_Y * 16, radius_x * mn / c11)
-    v.store(lanes, SLOPE * 16, slope)
-    v.store(lanes, HALF_WIDTH * 16, extent * deviation + MARGIN_PX)
     v.store(lanes, BLOCK_REACH * 16, block_radius * block_radius)
     return chosen
 
@@ -354,7 +275,6 @@ def project_part(
     sh,
     sh_size,
     index,
-    spheres,
     first_id,
     pose,
     camera,
@@ -373,7 +293,6 @@ def project_part(
         sh: See above.
         sh_size: See above.
         index: See above.
-        spheres: See above.
         first_id: Added to a Gaussian's position in its cloud; makes identities unique and ordered
             by part.
         pose: float64 ``(POSE_SIZE,)``, see `constants`.
@@ -382,29 +301,25 @@ def project_part(
         ids: int64 output, one per splat.
     """
     lanes = np.empty(RECORD * 16, np.float32)
-    kept = np.empty(BUNDLE * RECORD, np.float32)
-    kept_ids = np.empty(BUNDLE, np.int64)
     groups = index.shape[0] // 16
     while True:
-        bundle = v.fetch_add(cursor, part + 1, 1)
-        if bundle * BUNDLE >= index.shape[0]:
+        first = v.fetch_add(cursor, part + 1, CHUNK)
+        if first >= groups:
             return
-        if bundle_is_out_of_view(spheres, bundle * SPHERE_SIZE, pose, camera):
-            continue
-        count = 0
-        first = bundle * (BUNDLE // 16)
-        for group in range(first, min(first + BUNDLE // 16, groups)):
+        for group in range(first, min(first + CHUNK, groups)):
             chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes)
+            if chosen == 0:
+                continue
+            count = 0
+            rest = chosen
+            while rest != 0:
+                rest &= rest - 1
+                count += 1
+            out = v.fetch_add(cursor, 0, count)
             while chosen != 0:
                 lane = v.lowest_bit(chosen)
                 chosen &= chosen - 1
                 for field in range(RECORD):
-                    kept[count * RECORD + field] = lanes[field * 16 + lane]
-                kept_ids[count] = index[group * 16 + lane] + first_id
-                count += 1
-        out = v.fetch_add(cursor, 0, count)
-        # No slices: numba would compile the text of an error about their shapes for seconds.
-        for j in range(count * RECORD):
-            records[out * RECORD + j] = kept[j]
-        for j in range(count):
-            ids[out + j] = kept_ids[j]
+                    records[out * RECORD + field] = lanes[field * 16 + lane]
+                ids[out] = index[group * 16 + lane] + first_id
+                out += 1

@@ -21,7 +21,6 @@ from alpasim_plugin.core.types import F32, F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
 from alpasim_plugin.gaussians.constants import (
-    BUNDLE,
     FAR_M,
     NEAR_M,
     POSE_ANTIALIAS,
@@ -32,14 +31,13 @@ from alpasim_plugin.gaussians.constants import (
     POSE_SIZE,
     POSE_TURN,
     RECORD,
-    SPHERE_SIZE,
     TILE,
     Z,
 )
-from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, tile_offsets
+from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
-from alpasim_plugin.gaussians.raster.project_kernels import project_part, spheres_in_view
+from alpasim_plugin.gaussians.raster.project_kernels import project_part
 from alpasim_plugin.gaussians.raster.raster_kernels import composite_tiles
 
 Part = tuple[Any, ...]
@@ -85,15 +83,12 @@ def rasterize_prepared(
         for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
             moves = None if T is None or T_start is None else (np.asarray(T, np.float64), T_start)
             pose[POSE_TURN:] = still if moves is None else camera.motion(*moves)
-    spheres = np.array([prepared.sphere for prepared, _ in nodes], np.float64).reshape(-1)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
-    parts: list[Part] = []
-    room = 0
-    for i in np.flatnonzero(spheres_in_view(spheres, poses, view)).tolist():
-        prepared = nodes[i][0]
-        room += len(prepared.spheres) // SPHERE_SIZE * BUNDLE
-        first_id = ends[i] - prepared.n_input
-        parts.append((*prepared.arrays(), first_id, poses[i]))
+    parts: list[Part] = [
+        (*prepared.arrays(), end - prepared.n_input, pose)
+        for (prepared, _), end, pose in zip(nodes, ends, poses, strict=True)
+    ]
+    room = sum(len(prepared.index) for prepared, _ in nodes)
     records = np.empty(room * RECORD, np.float32)
     ids = np.empty(room, np.int64)
     workers = threads if room > WORTH_THREADS else 1
@@ -184,15 +179,16 @@ def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int)
     # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(2048, -(-count // 64))
-    histogram = np.empty((-(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1), np.int64)
-    boxes = np.empty(4 * count, np.int32)
-    starts = np.empty(tiles_x * tiles_y + 1, np.int64)
+    histogram = np.empty((-(-count // chunk_size), tiles_x * tiles_y), np.int64)
+    boxes = np.empty((count, 4), np.int32)
     workers = threads if count > WORTH_THREADS else 1
-    chunks = (np.zeros(1, np.int64), count, chunk_size, order, records)
-    run_on_threads(workers, count_tiles, *chunks, tiles_x, tiles_y, boxes, histogram)
-    lists = np.empty(tile_offsets(histogram, tiles_x, starts), np.int32)
+    chunks = (np.zeros(1, np.int64), count, chunk_size, order)
+    run_on_threads(workers, count_tiles, *chunks, records, tiles_x, tiles_y, boxes, histogram)
+    starts = np.concatenate([[0], np.cumsum(histogram.sum(axis=0))])
+    before = np.cumsum(histogram, axis=0) - histogram
+    lists = np.empty(starts[-1], np.int32)
     chunks[0][:] = 0
-    run_on_threads(workers, fill_tiles, *chunks, boxes, tiles_x, histogram, lists)
+    run_on_threads(workers, fill_tiles, *chunks, boxes, tiles_x, starts[:-1] + before, lists)
     return TileLists(tiles_x, starts, lists)
 
 

@@ -18,6 +18,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
+    BLOCK_REACH,
     EPS2D_PX2,
     EXPONENT_SCALE,
     EXTENT_MAX_SIGMA,
@@ -25,6 +26,7 @@ from alpasim_plugin.gaussians.constants import (
     NEAR_M,
     RADIUS_X,
     RADIUS_Y,
+    RECORD,
     U,
     V,
 )
@@ -300,19 +302,18 @@ def _records(
     c11, c12, c22, det = _covariance(m, n)
     extent = _extent(log_opacity)
     radius_x, radius_y = extent * c11.sqrt(), extent * c22.sqrt()
-    deviation, slope = (det / c22).sqrt(), c12 / c22
-    l11 = EXPONENT_SCALE / deviation
-    l12 = -l11 * slope
+    l11 = EXPONENT_SCALE * (c22 / det).sqrt()
+    l12 = -l11 * c12 / c22
     l22 = EXPONENT_SCALE * c22.rsqrt()
     peak = (log_opacity / np.log(2) + 4) / 8
     corner = torch.hypot(BLOCK_HALF * (l11 + l12.abs()), BLOCK_HALF * l22)
     block = (peak - CUT).clamp(min=0).sqrt() + corner + 1e-3
-    columns = [
-        *(*uv.T, l11, l12, l22, peak, *colour.T, depth),
-        *(radius_x + MARGIN_PX, radius_y + MARGIN_PX, radius_x * c12 / c11, slope),
-        *(extent * deviation + MARGIN_PX, block.square()),
-    ]
-    return torch.stack([column.float() for column in columns], dim=1)
+    reach = radius_x + MARGIN_PX, radius_y + MARGIN_PX
+    columns = [*uv.T, l11, l12, l22, peak, *colour.T, depth, *reach]
+    records = torch.zeros(len(uv), RECORD)
+    records[:, : len(columns)] = torch.stack(columns, dim=1)
+    records[:, BLOCK_REACH] = block.square()
+    return records
 
 
 class _Composite(torch.autograd.Function):
