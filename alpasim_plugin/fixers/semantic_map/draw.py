@@ -11,12 +11,10 @@ rows i to i + 1.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
@@ -30,9 +28,8 @@ from alpasim_plugin.fixers.semantic_map.prepare import (
     Segments,
     Triangles,
     actor_boxes,
-    require_box,
 )
-from alpasim_plugin.fixers.semantic_map.raster import BAND, draw_bands, rows_of
+from alpasim_plugin.fixers.semantic_map.raster import BAND, draw_bands
 from alpasim_plugin.fixers.semantic_map.style import (
     BOX_COLOURS,
     BOX_EDGE_PX,
@@ -42,23 +39,9 @@ from alpasim_plugin.fixers.semantic_map.style import (
     WIDTH_DEFINED_AT_PX,
     box_class,
 )
-from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads, thread_count
 
-MARGIN_RAD = 0.1  # half of the widest line reaches this far into the view from outside
-NO_SPHERES = np.zeros((0, 4))
 EDGE_STYLE = np.array((BOX_EDGE_PX, EDGE_BIAS_M, *COLOURS["box_edge"]))
-
-
-class _Buffers(threading.local):
-    """Arrays reused between frames, one set per calling thread."""
-
-    def __init__(self) -> None:
-        self.strokes = np.empty((4096, kernels.STROKE))
-        self.shapes = np.empty((4096, kernels.SHAPE))
-
-
-_buffers = _Buffers()
 
 
 def draw_map(
@@ -80,33 +63,17 @@ def draw_map(
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
             depend on it.
         rows: The part of the image to draw and to return; None: all.
-
-    Raises:
-        InputError: A pose that is not rigid or not finite, a box of impossible size, or an invalid
-            camera.
     """
     rows = slice(0, camera.height) if rows is None else rows
-    view, pose = view_of(scene, camera, T_world_camera)
-    faces, edges = actor_geometry(actors, scene, pose)
-    n_lines, strokes = project_strokes((scene.segments, edges), pose, view)
-    shapes = project_shapes((scene.triangles, faces), pose, view)
+    view, pose = _view_of(scene, camera, T_world_camera)
+    faces, edges = _actor_geometry(actors, scene, pose)
+    lines, box_edges = (_strokes(part, pose, view) for part in (scene.segments, edges))
+    shapes = np.concatenate([_shapes(part, pose, view) for part in (scene.triangles, faces)])
     image: U8 = np.empty((rows.stop, camera.width, 3), np.uint8)
-    stroke_rows = np.empty((len(strokes), 2), np.int64)
-    shape_rows = np.empty((len(shapes), 2), np.int64)
+    band = np.full(1, rows.start // BAND, np.int64)
     stretch = camera.width / camera.height
-    rows_of(strokes, shapes, stretch, rows.stop, stroke_rows, shape_rows)
     run_on_threads(
-        thread_count(threads),
-        draw_bands,
-        np.full(1, rows.start // BAND, np.int64),
-        strokes[:n_lines],
-        strokes[n_lines:],
-        stroke_rows[:n_lines],
-        stroke_rows[n_lines:],
-        shapes,
-        shape_rows,
-        stretch,
-        image,
+        thread_count(threads), draw_bands, band, lines, box_edges, shapes, stretch, image
     )
     return image[rows]
 
@@ -133,33 +100,19 @@ def draw_exposed_map(
     return out
 
 
-def view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
+def _view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
     """Return the view as `kernels` reads it, and the pose ``(3, 4)`` that maps the scene's own
     coordinates into the camera's.
     """
-    if camera.width < 1 or camera.height < 1:
-        raise InputError(
-            f"camera {camera.name}: {camera.width} x {camera.height} pixels", "give at least one"
-        )
     K = np.asarray(camera.K, dtype=np.float64)
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise InputError(
-            f"camera {camera.name}: K = {K.tolist()}", "give intrinsics with positive focal lengths"
-        )
-    require_rigid(T_world_camera, "camera pose of the semantic map")
-    image_corners = [[u, v, 1.0] for u in (0, camera.width) for v in (0, camera.height)]
-    corners = np.array(image_corners) @ np.linalg.inv(K).T
-    half_angle = float(np.arctan(np.hypot(corners[:, 0], corners[:, 1]).max()))
-    half = min(half_angle + MARGIN_RAD, np.pi)
     intrinsics = (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2])
-    scale = camera.width / WIDTH_DEFINED_AT_PX
-    view = np.array([*intrinsics, camera.width, camera.height, np.cos(half), np.sin(half), scale])
+    view = (*intrinsics, camera.width, camera.height, camera.width / WIDTH_DEFINED_AT_PX)
     T = np.array(T_world_camera, dtype=np.float64)
     T[:3, 3] -= scene.origin  # the difference of large coordinates is taken here, once, in float64
-    return view, np.ascontiguousarray(inverse(T)[:3])
+    return np.array(view), np.ascontiguousarray(inverse(T)[:3])
 
 
-def actor_geometry(
+def _actor_geometry(
     actors: Sequence[ActorBox], scene: PreparedMap, pose: F64
 ) -> tuple[Triangles, Segments]:
     """Return the faces and edges of road users, the nearest first, so that hidden ones are not
@@ -168,8 +121,6 @@ def actor_geometry(
     Boxes cut by the near plane show their inner faces; other boxes are marked closed, so that faces
     turned away are culled.
     """
-    for actor in actors:
-        require_box(f"actor box ({actor.label})", actor.T_world_box, actor.box)
     poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
     boxes = [actor.box for actor in actors]
     lengths = [(box.length_m, box.width_m, box.height_m) for box in boxes]
@@ -188,30 +139,17 @@ def actor_geometry(
     triangles = corners[:, TRIANGLES].reshape(-1, 3, 3)
     faces = Triangles(triangles, np.repeat(uncut, n), shade, np.repeat(style, n, axis=0))
     ends = corners[:, EDGES].reshape(-1, 2, 3)
-    return faces, Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)), NO_SPHERES)
+    return faces, Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
 
 
-def project_strokes(parts: Sequence[Segments], pose: F64, view: F64) -> tuple[int, F64]:
-    """Return how many strokes the first part has, and the strokes of all parts ``(N, STROKE)``."""
-    while True:
-        out = _buffers.strokes
-        counts = [0]
-        for part in parts:
-            lines = part.ends, part.style, part.spheres
-            counts.append(int(kernels.strokes(*lines, pose, view, out, counts[-1])))
-        if counts[-1] <= len(out):
-            return counts[1], out[: counts[-1]]
-        _buffers.strokes = np.empty((counts[-1] * 5 // 4, kernels.STROKE))
+def _strokes(part: Segments, pose: F64, view: F64) -> F64:
+    """Return the strokes of segments ``(N, STROKE)``."""
+    out = np.empty((len(part.ends), kernels.STROKE))
+    return out[: kernels.strokes(part.ends, part.style, pose, view, out)]
 
 
-def project_shapes(parts: Sequence[Triangles], pose: F64, view: F64) -> F64:
-    """Return the shapes of all parts ``(N, SHAPE)``."""
-    while True:
-        out = _buffers.shapes
-        count = 0
-        for part in parts:
-            flat = part.corners, part.closed, part.shade, part.style
-            count = int(kernels.shapes(*flat, pose, view, out, count))
-        if count <= len(out):
-            return out[:count]
-        _buffers.shapes = np.empty((count * 5 // 4, kernels.SHAPE))
+def _shapes(part: Triangles, pose: F64, view: F64) -> F64:
+    """Return the shapes of triangles ``(N, SHAPE)``."""
+    out = np.empty((2 * len(part.corners), kernels.SHAPE))
+    flat = part.corners, part.closed, part.shade, part.style
+    return out[: kernels.shapes(*flat, pose, view, out)]

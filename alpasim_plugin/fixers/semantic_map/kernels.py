@@ -8,12 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.kernels import kernel
-from alpasim_plugin.fixers.semantic_map.prepare import GROUP
 from alpasim_plugin.fixers.semantic_map.style import DEPTH_MAX_M, NEAR_M
 
-# Entries of a view: focal lengths, skew and centre in pixels, image size, cosine and sine of the
-# half angle of the cone that holds the view, pixels of this image for one of the style.
-FX, SKEW, FY, CX, CY, WIDTH, HEIGHT, COS_HALF, SIN_HALF, SCALE = range(10)
+# Entries of a view: focal lengths, skew and centre in pixels, image size, pixels of this image for
+# one of the style.
+FX, SKEW, FY, CX, CY, WIDTH, HEIGHT, SCALE = range(8)
 # Columns of a stroke: ends in pixels with 1/depth, half width without fade in pixels, bias, colour.
 X0, Y0, I0, X1, Y1, I1, HALF, BIAS, RED = range(9)
 STROKE = 11
@@ -31,17 +30,6 @@ def _project(view, x, y, z):
 
 
 @kernel
-def _in_view(x, y, z, radius, view):
-    """Return whether a sphere can reach the view: the depths between near and far, and the cone
-    around the axis.
-    """
-    if z + radius <= NEAR_M or z - radius >= DEPTH_MAX_M:
-        return False
-    across = np.sqrt(x * x + y * y)
-    return view[COS_HALF] <= 0.0 or across * view[COS_HALF] - z * view[SIN_HALF] <= radius
-
-
-@kernel
 def _to_camera(pose, p):
     """Map a point of the scene into the camera's axes by the upper ``(3, 4)`` of a transform."""
     return (
@@ -52,18 +40,10 @@ def _to_camera(pose, p):
 
 
 @kernel
-def strokes(ends, style, spheres, pose, view, out, count):
-    """Project segments ``(S, 2, 3)`` into strokes after the first ``count``; return how many there
-    are then. Beyond the capacity of ``out`` they are counted, not written.
-    """
-    seen = True
+def strokes(ends, style, pose, view, out):
+    """Project segments ``(S, 2, 3)`` into strokes; return how many can be seen."""
+    count = 0
     for s in range(ends.shape[0]):
-        if s % GROUP == 0 and spheres.shape[0] > 0:
-            sphere = spheres[s // GROUP]
-            x, y, z = _to_camera(pose, sphere)
-            seen = _in_view(x, y, z, sphere[3], view)
-        if not seen:
-            continue
         ax, ay, az = _to_camera(pose, ends[s, 0])
         bx, by, bz = _to_camera(pose, ends[s, 1])
         if (az < NEAR_M and bz < NEAR_M) or (az >= DEPTH_MAX_M and bz >= DEPTH_MAX_M):
@@ -87,13 +67,12 @@ def strokes(ends, style, spheres, pose, view, out, count):
             continue
         if max(v0, v1) < -half or min(v0, v1) > view[HEIGHT] + half:
             continue
-        if count < out.shape[0]:
-            row = out[count]
-            row[X0], row[Y0], row[I0] = u0, v0, 1.0 / z0
-            row[X1], row[Y1], row[I1] = u1, v1, 1.0 / z1
-            row[HALF] = half
-            for k in range(4):
-                row[BIAS + k] = style[s, 1 + k]
+        row = out[count]
+        row[X0], row[Y0], row[I0] = u0, v0, 1.0 / z0
+        row[X1], row[Y1], row[I1] = u1, v1, 1.0 / z1
+        row[HALF] = half
+        for k in range(4):
+            row[BIAS + k] = style[s, 1 + k]
         count += 1
     return count
 
@@ -136,10 +115,11 @@ def _clip(raw, kept):
 
 
 @kernel
-def shapes(corners, closed, shade, style, pose, view, out, count):
-    """Project triangles ``(T, 3, 3)`` into shapes after the first ``count``; return how many there
-    are then. Beyond the capacity of ``out`` they are counted, not written.
+def shapes(corners, closed, shade, style, pose, view, out):
+    """Project triangles ``(T, 3, 3)`` into shapes, at most two of each; return how many can be
+    seen.
     """
+    count = 0
     raw = np.empty((3, 4))
     kept = np.empty((4, 4))
     pixels = np.empty((4, 2))
@@ -149,14 +129,8 @@ def shapes(corners, closed, shade, style, pose, view, out, count):
             raw[k, 3] = shade[s, k]
         if closed[s] and _faces_away(raw[0], raw[1], raw[2]):
             continue
-        mx = (raw[0, 0] + raw[1, 0] + raw[2, 0]) / 3
-        my = (raw[0, 1] + raw[1, 1] + raw[2, 1]) / 3
-        mz = (raw[0, 2] + raw[1, 2] + raw[2, 2]) / 3
-        reach2 = 0.0
-        for k in range(3):
-            apart2 = (raw[k, 0] - mx) ** 2 + (raw[k, 1] - my) ** 2 + (raw[k, 2] - mz) ** 2
-            reach2 = max(reach2, apart2)
-        if not _in_view(mx, my, mz, np.sqrt(reach2), view):
+        nearest = min(raw[0, 2], raw[1, 2], raw[2, 2])
+        if nearest >= DEPTH_MAX_M:
             continue
         n = _clip(raw, kept)
         for k in range(n):
@@ -169,17 +143,16 @@ def shapes(corners, closed, shade, style, pose, view, out, count):
                 outside |= high < 0.0 or low > view[WIDTH + axis]
             if outside:
                 continue
-            if count < out.shape[0]:
-                row = out[count]
-                for corner, i in enumerate((0, k, k + 1)):
-                    inverse = 1.0 / kept[i, 2]
-                    row[4 * corner] = pixels[i, 0]
-                    row[4 * corner + 1] = pixels[i, 1]
-                    row[4 * corner + 2] = inverse
-                    row[4 * corner + 3] = kept[i, 3] * inverse
-                row[NEAREST] = 1.0 / min(kept[0, 2], kept[k, 2], kept[k + 1, 2])
-                row[FARTHEST] = 1.0 / max(kept[0, 2], kept[k, 2], kept[k + 1, 2])
-                for c in range(7):
-                    row[S_BIAS + c] = style[s, c]
+            row = out[count]
+            for corner, i in enumerate((0, k, k + 1)):
+                inverse = 1.0 / kept[i, 2]
+                row[4 * corner] = pixels[i, 0]
+                row[4 * corner + 1] = pixels[i, 1]
+                row[4 * corner + 2] = inverse
+                row[4 * corner + 3] = kept[i, 3] * inverse
+            row[NEAREST] = 1.0 / min(kept[0, 2], kept[k, 2], kept[k + 1, 2])
+            row[FARTHEST] = 1.0 / max(kept[0, 2], kept[k, 2], kept[k + 1, 2])
+            for c in range(7):
+                row[S_BIAS + c] = style[s, c]
             count += 1
     return count

@@ -27,7 +27,6 @@ from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.world.paint import painted_lines
 
 POLE_HEIGHT_M = 3.0  # of poles given as one point
-GROUP = 32  # segments that share a bounding sphere
 # Depth bias of a crosswalk, so that lines on it stay visible.
 CROSSWALK_BIAS_M = -0.4
 # Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
@@ -74,7 +73,6 @@ class Segments:
 
     ends: F64  # (S, 2, 3) metres
     style: F64  # (S, 5) width at 1280 px, bias towards the camera in metres, r, g, b
-    spheres: F64  # (G, 4) centre and radius around each GROUP of segments
 
 
 @dataclass(frozen=True)
@@ -229,17 +227,7 @@ def _segments(lines: Sequence[Polyline]) -> Segments:
         if len(line) > 1:
             ends.append(np.stack([line[:-1], line[1:]], axis=1))
             style.append(np.tile((width_px, 0.0, *COLOURS[colour]), (len(line) - 1, 1)))
-    joined = np.concatenate(ends)
-    return Segments(joined, np.concatenate(style), _spheres(joined))
-
-
-def _spheres(ends: F64) -> F64:
-    out = np.zeros((-(-len(ends) // GROUP), 4))
-    for g in range(len(out)):
-        points = ends[g * GROUP : (g + 1) * GROUP].reshape(-1, 3)
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        out[g] = (*centre, np.linalg.norm(points - centre, axis=1).max())
-    return out
+    return Segments(np.concatenate(ends), np.concatenate(style))
 
 
 def triangulate(name: str, ring: F64) -> F64:

@@ -41,20 +41,6 @@ SLACK = 0.4  # a sample lies at most so far from the centre, along an axis
 
 
 @kernel
-def rows_of(strokes, shapes, stretch, height, stroke_rows, shape_rows):
-    """Write the first and last image row that each stroke and shape can touch."""
-    for i in range(strokes.shape[0]):
-        stroke = strokes[i]
-        reach = stroke[HALF] / stretch
-        stroke_rows[i, 0] = int(max(min(stroke[Y0], stroke[Y1]) - reach - 1.0, 0.0))
-        stroke_rows[i, 1] = int(min(max(stroke[Y0], stroke[Y1]) + reach + 1.0, height - 1))
-    for i in range(shapes.shape[0]):
-        shape = shapes[i]
-        shape_rows[i, 0] = int(max(min(shape[1], shape[5], shape[9]) - 1.0, 0.0))
-        shape_rows[i, 1] = int(min(max(shape[1], shape[5], shape[9]) + 1.0, height - 1))
-
-
-@kernel
 def _pack(red, green, blue, fade):
     return np.uint32(
         np.uint32(red * fade + 0.5)
@@ -70,15 +56,21 @@ def _fade(inverse):
 
 
 @kernel
-def _touch(touched, line, begin, end):
-    """Note the columns of a row of the band that were written."""
-    if end >= 0:
-        touched[line, 0] = min(touched[line, 0], begin)
-        touched[line, 1] = max(touched[line, 1], end)
+def _rows(low, high, band_row, height):
+    """Return the first and one past the last row of a band that lie between two coordinates."""
+    first = max(int(max(low - 1.0, 0.0)), band_row)
+    last = min(int(min(high + 1.0, height - 1.0)), band_row + BAND - 1)
+    return first, last + 1
 
 
 @kernel
-def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched):
+def _draw_stroke(stroke, band_row, height, width, stretch, depth, colour):
+    extent = stroke[HALF] / stretch
+    low = min(stroke[Y0], stroke[Y1]) - extent
+    high = max(stroke[Y0], stroke[Y1]) + extent
+    first_row, end_row = _rows(low, high, band_row, height)
+    if first_row >= end_row:
+        return
     x0 = stroke[X0]
     y0 = stroke[Y0]
     i0 = stroke[I0]
@@ -92,7 +84,7 @@ def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched)
     slack = SLACK * np.sqrt(1.0 + stretch * stretch)
     limit2 = (reach + slack) * (reach + slack)
     reach_y = reach / stretch + SLACK
-    for row in range(max(rows[0], band_row), min(rows[1], band_row + BAND - 1) + 1):
+    for row in range(first_row, end_row):
         yc = row + 0.5
         low = 0.0
         high = 1.0
@@ -110,8 +102,6 @@ def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched)
         left = int(max(min(xa, xb) - reach - SLACK - 1.0, 0.0))
         right = int(min(max(xa, xb) + reach + SLACK + 1.0, width))
         vy = (yc - y0) * stretch
-        begin = width
-        end = -1
         for column in range(left, min(right + 1, width)):
             vx = column + 0.5 - x0
             t = min(max((vx * dx + vy * sy) * over, 0.0), 1.0)
@@ -146,15 +136,15 @@ def _draw_stroke(stroke, rows, band_row, width, stretch, depth, colour, touched)
                 if mask >> s & 1 and np.float32(inverse) > depth[first + s]:
                     depth[first + s] = inverse
                     colour[first + s] = packed
-            begin = min(begin, column)
-            end = column
-        _touch(touched, row - band_row, begin, end)
 
 
 @kernel
-def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
+def _draw_shape(shape, band_row, height, width, depth, colour):
     x = shape[0:12:4]
     y = shape[1:12:4]
+    first_row, end_row = _rows(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), band_row, height)
+    if first_row >= end_row:
+        return
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     if area == 0.0:
         return
@@ -182,7 +172,7 @@ def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
     far = shape[FARTHEST]
     near = shape[NEAREST]
     bias = shape[S_BIAS]
-    for row in range(max(rows[0], band_row), min(rows[1], band_row + BAND - 1) + 1):
+    for row in range(first_row, end_row):
         yc = row + 0.5
         low = max(min(x[0], x[1], x[2]) - 1.0, 0.0)
         high = min(max(x[0], x[1], x[2]) + 1.0, np.float64(width))
@@ -194,8 +184,6 @@ def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
                 high = min(high, xk - rest / a + 1.0)
             elif rest < 0.0:
                 high = -1.0
-        begin = width
-        end = -1
         r0 = c0 * (yc - y[1]) - a0 * x[1]
         r1 = c1 * (yc - y[2]) - a1 * x[2]
         r2 = c2 * (yc - y[0]) - a2 * x[0]
@@ -239,59 +227,38 @@ def _draw_shape(shape, rows, band_row, width, depth, colour, touched):
             for s in range(COUNT):
                 if mask >> s & 1:
                     colour[first + s] = packed
-            begin = min(begin, column)
-            end = column
-        _touch(touched, row - band_row, begin, end)
 
 
 @kernel
-def draw_bands(
-    cursor, lines, boxes_edges, line_rows, edge_rows, shapes, shape_rows, stretch, image
-):
+def draw_bands(cursor, lines, box_edges, shapes, stretch, image):
     """Draw bands of rows until none is left: lines, then shapes, then the edges of boxes."""
     height, width = image.shape[0], image.shape[1]
-    depth = np.zeros(BAND * width * COUNT, np.float32)
-    colour = np.zeros(BAND * width * COUNT, np.uint32)
-    touched = np.empty((BAND, 2), np.int64)
+    depth = np.empty(BAND * width * COUNT, np.float32)
+    colour = np.empty(BAND * width * COUNT, np.uint32)
     while True:
         band_row = fetch_add(cursor, 0, 1) * BAND
         if band_row >= height:
             return
-        end_row = min(band_row + BAND, height) - 1
-        touched[:, 0] = width
-        touched[:, 1] = -1
+        depth[:] = np.float32(0.0)
+        colour[:] = np.uint32(0)
         for i in range(lines.shape[0]):
-            if line_rows[i, 0] <= end_row and line_rows[i, 1] >= band_row:
-                _draw_stroke(
-                    lines[i], line_rows[i], band_row, width, stretch, depth, colour, touched
-                )
+            _draw_stroke(lines[i], band_row, height, width, stretch, depth, colour)
         for i in range(shapes.shape[0]):
-            if shape_rows[i, 0] <= end_row and shape_rows[i, 1] >= band_row:
-                _draw_shape(shapes[i], shape_rows[i], band_row, width, depth, colour, touched)
-        for i in range(boxes_edges.shape[0]):
-            if edge_rows[i, 0] <= end_row and edge_rows[i, 1] >= band_row:
-                _draw_stroke(
-                    boxes_edges[i], edge_rows[i], band_row, width, stretch, depth, colour, touched
-                )
-        _resolve(band_row, end_row, depth, colour, touched, image)
+            _draw_shape(shapes[i], band_row, height, width, depth, colour)
+        for i in range(box_edges.shape[0]):
+            _draw_stroke(box_edges[i], band_row, height, width, stretch, depth, colour)
+        _resolve(band_row, colour, image)
 
 
 @kernel
-def _resolve(band_row, end_row, depth, colour, touched, image):
-    """Average the samples of a band into the image and clear the buffers."""
-    width = image.shape[1]
-    for row in range(band_row, end_row + 1):
-        image[row, :, :] = 0
-        first = (row - band_row) * width * COUNT
-        left = touched[row - band_row, 0]
-        right = touched[row - band_row, 1] + 1
-        for column in range(left, right):
-            samples = colour[first + column * COUNT : first + (column + 1) * COUNT]
+def _resolve(band_row, colour, image):
+    """Average the samples of a band into the image."""
+    height, width = image.shape[0], image.shape[1]
+    for row in range(band_row, min(band_row + BAND, height)):
+        for column in range(width):
+            first = ((row - band_row) * width + column) * COUNT
             for channel in range(3):
                 total = np.uint32(COUNT // 2)
                 for s in range(COUNT):
-                    total += (samples[s] >> (8 * channel)) & 255
+                    total += (colour[first + s] >> (8 * channel)) & 255
                 image[row, column, channel] = total // COUNT
-        if left < right:
-            depth[first + left * COUNT : first + right * COUNT] = 0.0
-            colour[first + left * COUNT : first + right * COUNT] = 0
