@@ -280,9 +280,10 @@ def test_raster_equals_the_plain_one_bit_by_bit():
     fast = draw_map(scene, PIN, at(), boxes)
     view, pose = draw.view_of(scene, PIN, at())
     faces, edges = draw.actor_geometry(boxes, scene, pose)
-    first, strokes = draw.project_strokes((scene.segments, edges), pose, view)
-    shapes = draw.project_shapes((scene.triangles, faces), pose, view)
-    plain = draw_reference(strokes, first, shapes, PIN)
+    lines, box_edges = (draw.strokes_of(part, pose, view) for part in (scene.segments, edges))
+    shapes = [draw.shapes_of(part, pose, view) for part in (scene.triangles, faces)]
+    strokes = np.concatenate([lines, box_edges])
+    plain = draw_reference(strokes, len(lines), np.concatenate(shapes), PIN)
     different = np.abs(plain.astype(int) - fast).max(axis=2) > 0
     assert different.sum() <= 2  # a sample within rounding of an edge
     assert (fast.max(axis=2) > 0).mean() > 0.1

@@ -65,10 +65,10 @@ def draw_map(
         rows: The part of the image to draw and to return; None: all.
     """
     rows = slice(0, camera.height) if rows is None else rows
-    view, pose = _view_of(scene, camera, T_world_camera)
-    faces, edges = _actor_geometry(actors, scene, pose)
-    lines, box_edges = (_strokes(part, pose, view) for part in (scene.segments, edges))
-    shapes = np.concatenate([_shapes(part, pose, view) for part in (scene.triangles, faces)])
+    view, pose = view_of(scene, camera, T_world_camera)
+    faces, edges = actor_geometry(actors, scene, pose)
+    lines, box_edges = (strokes_of(part, pose, view) for part in (scene.segments, edges))
+    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
     image: U8 = np.empty((rows.stop, camera.width, 3), np.uint8)
     band = np.full(1, rows.start // BAND, np.int64)
     stretch = camera.width / camera.height
@@ -100,7 +100,7 @@ def draw_exposed_map(
     return out
 
 
-def _view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
+def view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
     """Return the view as `kernels` reads it, and the pose ``(3, 4)`` that maps the scene's own
     coordinates into the camera's.
     """
@@ -112,7 +112,7 @@ def _view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tup
     return np.array(view), np.ascontiguousarray(inverse(T)[:3])
 
 
-def _actor_geometry(
+def actor_geometry(
     actors: Sequence[ActorBox], scene: PreparedMap, pose: F64
 ) -> tuple[Triangles, Segments]:
     """Return the faces and edges of road users, the nearest first, so that hidden ones are not
@@ -142,13 +142,13 @@ def _actor_geometry(
     return faces, Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
 
 
-def _strokes(part: Segments, pose: F64, view: F64) -> F64:
+def strokes_of(part: Segments, pose: F64, view: F64) -> F64:
     """Return the strokes of segments ``(N, STROKE)``."""
     out = np.empty((len(part.ends), kernels.STROKE))
     return out[: kernels.strokes(part.ends, part.style, pose, view, out)]
 
 
-def _shapes(part: Triangles, pose: F64, view: F64) -> F64:
+def shapes_of(part: Triangles, pose: F64, view: F64) -> F64:
     """Return the shapes of triangles ``(N, SHAPE)``."""
     out = np.empty((2 * len(part.corners), kernels.SHAPE))
     flat = part.corners, part.closed, part.shade, part.style
