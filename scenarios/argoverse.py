@@ -157,7 +157,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
     ]
     strange = Counter(mark for mark in raw_marks if mark not in PAINTS)
     notes += [
-        f"{count} lane edges have the mark type {mark!r}: taken as paint 'unknown'"
+        f"{count} lane edges have the mark type {mark!r}: taken as unknown lane markings"
         for mark, count in sorted(strange.items())
     ]
     return lane_map, tuple(notes)

@@ -136,7 +136,7 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
     if swapped:
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
     if root.find("lanelet/*/lineMarking") is None:
-        notes.append("the file has no line markings: the paint of all lane edges is unknown")
+        notes.append("the file has no line markings: those of all lane edges are unknown")
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )

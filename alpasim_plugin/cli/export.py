@@ -146,7 +146,7 @@ def export_recording(
     if len(cells) != 1:
         names = "; ".join(one.name for one in cells[:SHOWN_CELLS])
         raise InputError(
-            f"{root}: {len(cells)} finished cells of scene, policy and seed: {names}",
+            f"{root}: {len(cells)} finished rollouts of scene, policy and seed: {names}",
             "Choose one by --scene, --policy and --seed, or name a rollout's folder.",
         )
     return export_mcap(run, cells[0], read_logs(run, cells[0]), path)

@@ -99,7 +99,7 @@ def view(
         "of": len(made.known),
         "notes": list(made.notes),
     }
-    size = f"{made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
+    size = f"{made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} rollouts"
     lines = [
         *(f"note     {note}" for note in made.notes),
         f"page     {shlex.quote(str(page))}, {size}",
@@ -136,7 +136,7 @@ def cells_wanted(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wante
         return asked
     if asked.scenes or asked.policies or asked.seeds:
         raise InputError(
-            f"{cell}: --scene, --policy or --seed beside a rollout, which has one of each",
+            f"{cell}: --scene, --policy or --seed with a rollout, which has one of each",
             "Name its run folder.",
         )
     found = named_rollout(rollouts, cell)

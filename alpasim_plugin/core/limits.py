@@ -145,7 +145,9 @@ LATERAL_OFFSET_M = Bound(
 BODY_M = Bound("side of a body", "m", 0.01, 200, "trains and buildings beside the road included")
 VEHICLE_M = Bound("side of the ego", "m", 0.3, 30, "from a wheelbarrow to a road train")
 AXLE_M = Bound("axle distance", "m", -30, 30, "axles lie inside the body")
-OFFSET_M = Bound("offset beside a lane", "m", -100, 100, "farther aside is no lane any more")
+OFFSET_M = Bound(
+    "offset beside a lane", "m", -100, 100, "a larger lateral offset is no lane any more"
+)
 MOUNT_M = Bound("camera mount", "m", -30, 30, "cameras stand on the vehicle")
 DISTANCE_M = Bound("distance", "m", 0, 20_000, "as long as a road")
 STATION_M = Bound("place along a road", "m", -20_000, 20_000, "as long as a road")

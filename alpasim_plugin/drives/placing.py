@@ -92,7 +92,7 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     notes = [found_up, scale_note, mount_note]
     if strip is None:
         notes.append(
-            f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be judged by these "
+            f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be measured by these "
             "photographs (simrun bench real); a drive needs photographs taken along a road"
         )
     return PlacedDrive(
@@ -297,7 +297,7 @@ def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
     }
 
 
-NO_MAP = "no map: the road is the driven path, 3.5 m wide, without paint"
+NO_MAP = "no map: the road is the driven path, 3.5 m wide, without lane markings"
 
 
 def given_map(

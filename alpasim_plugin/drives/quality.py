@@ -173,7 +173,7 @@ def _page(
         "\n".join(f"- {escape(note)}" for note in notes),
         f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
         f"| photographs | number | PSNR, dB | SSIM |\n|---|---|---|---|\n{rows}".rstrip(),
-        "## Coverage of the lower half of the picture",
+        "## Coverage of the lower half of the image",
         f"| metres to the left of the path | covered |\n|---|---|\n{covered}",
     ]
     if ground:

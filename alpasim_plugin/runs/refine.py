@@ -54,7 +54,7 @@ class PictureFolderReader:
         self.names = tuple(sorted(names, key=natural_order))
         if not self.names:
             raise self._refusal(
-                "no .png files", "give a folder of pictures named in order, such as 000000.png"
+                "no .png files", "give a folder of images named in order, such as 000000.png"
             )
         height, width = self._read(self.names[0]).shape[:2]
         unstated = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED)
@@ -78,14 +78,14 @@ class PictureFolderReader:
             image = self._read(name)
             if image.shape[:2] != (self.format.height, self.format.width):
                 found = f"{name} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
-                raise self._refusal(found, "give pictures of one size")
+                raise self._refusal(found, "give images of one size")
             yield TimedFrame(image, index, 1)
 
     def _read(self, name: str) -> U8:
         image = read_image(self.path / name, cv2.IMREAD_UNCHANGED)
         if image.dtype != np.uint8:
             raise self._refusal(
-                f"{name} has {8 * image.dtype.itemsize} bits a channel", "give pictures of 8 bits"
+                f"{name} has {8 * image.dtype.itemsize} bits a channel", "give images of 8 bits"
             )
         kind = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB}.get(
             image.ndim if image.ndim == 2 or image.shape[2] == 3 else 0
@@ -93,7 +93,7 @@ class PictureFolderReader:
         if kind is None:
             raise self._refusal(
                 f"{name} has {image.shape[2]} channels",
-                "give grey or colour pictures without transparency",
+                "give grey or colour images without transparency",
             )
         return np.asarray(cv2.cvtColor(image, kind), dtype=np.uint8)
 
@@ -141,7 +141,7 @@ class PictureFolderWriter:
         done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if not done:
             raise InfrastructureError(
-                f"{self.path}/{name}: the encoder refused", "check the picture's size"
+                f"{self.path}/{name}: the encoder refused", "check the image's size"
             )
         write_bytes(self._partial / name, png.tobytes())
         self.count += 1
@@ -319,7 +319,7 @@ def check_names(files: RefineFiles) -> None:
             path.suffix or any(file.suffix != ".png" for file in path.iterdir())
         ):
             raise InputError(
-                f"{path}: the {role} is a folder with other things than pictures",
+                f"{path}: the {role} is a folder with other things than images",
                 "name a new folder or file",
             )
         if os.path.exists(path) and not files.overwrite:

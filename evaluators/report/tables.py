@@ -193,7 +193,7 @@ def _pair_note(entry: JsonView) -> str:
     counts = [(entry.get("n_cells"), "pair"), (entry.get("n_scenes"), "scene")]
     texts = [plural(int(count), noun) for count, noun in counts if count is not None]
     if entry.get("n_missing"):
-        texts.append(f"{entry['n_missing']} cells lack a partner")
+        texts.append(f"{entry['n_missing']} rollouts lack a partner")
     return ", ".join(texts)
 
 

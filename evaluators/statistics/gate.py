@@ -107,7 +107,7 @@ class GateSpec(_Strict):
         description="RENDERER, POLICY or both with a slash to compare with; none: the first, or the same of a stored baseline.",
     )
     renderers: tuple[str, ...] = Field(
-        default=(), description="Renderers to judge; none: all but the baseline."
+        default=(), description="Renderers to test; none: all but the baseline."
     )
     min_scenes: int = Field(default=1, ge=1, description="Fewest scenes that both sides must have.")
     population: Literal["suite", "scenes"] = Field(
@@ -119,7 +119,10 @@ class GateSpec(_Strict):
         default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run."
     )
     max_missing: float = Field(
-        default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric."
+        default=0.0,
+        ge=0.0,
+        lt=1.0,
+        description="Share of rollouts that may lack a pair, per metric.",
     )
     metrics: dict[str, MetricRule] = Field(default={}, min_length=1, description="Metric to rule.")
     boundary_margin: float | None = Field(

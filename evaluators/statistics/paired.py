@@ -59,7 +59,7 @@ from evaluators.statistics.verdicts import (
 Table = dict[str, dict[str, JsonObject]]  # RENDERER -> METRIC -> numbers
 
 LISTED = 50  # missing cells named per metric; the count is always whole
-NO_PAIR = "no scene-seed cell has this metric on both sides"
+NO_PAIR = "no scene and seed has this metric on both sides"
 
 
 class Pair(NamedTuple):

@@ -196,4 +196,4 @@ def _named(cells: Sequence[WatchedCell]) -> str:
     names = [cell.name for cell in cells[:NAMED]]
     if len(cells) > NAMED:
         names.append(f"and {len(cells) - NAMED} more")
-    return f"{plural(len(cells), 'cell')}: {'; '.join(names)}"
+    return f"{plural(len(cells), 'rollout')}: {'; '.join(names)}"

@@ -236,7 +236,7 @@ def test_cells_that_one_side_lacks_are_left_out_and_counted():
     assert (found["diff"], found["n_cells"], found["n_missing"]) == (1.0, 2, 2)
     empty = pair([[1.0, None]], [[None, 2.0]])
     assert (empty["diff"], empty["verdict"]) == (None, "undecided")
-    assert empty["reason"] == "no scene-seed cell has this metric on both sides"
+    assert empty["reason"] == "no scene and seed has this metric on both sides"
 
 
 def test_a_metric_without_a_better_side_gets_no_verdict():

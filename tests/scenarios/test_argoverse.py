@@ -135,7 +135,7 @@ def test_unknown_mark_type_and_category_are_noted(tmp_path):
     log = read_argoverse(write_argoverse(tmp_path / "x", annotations=rows, document=document))
     assert log.lane_map.lanes["1"].left_paint == "unknown"
     assert log.actors[0].label == "other"
-    assert "1 lane edges have the mark type 'ZIGZAG': taken as paint 'unknown'" in log.notes
+    assert "1 lane edges have the mark type 'ZIGZAG': taken as unknown lane markings" in log.notes
     assert "1 tracks of the unknown category 'UNICORN' are labelled 'other'" in log.notes
 
 

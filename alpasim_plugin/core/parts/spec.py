@@ -276,7 +276,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "lane-camera": (
             "policies.lane_camera:LaneCamera",
-            "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior",
+            "lane markings and obstacles from one front camera, by OpenCV; the route is a weak prior",
         ),
         "learned": (
             "policies.learned:Learned",

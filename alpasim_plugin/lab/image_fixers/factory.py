@@ -38,16 +38,16 @@ image = FixerFactory(
     RenderStepSettings,
     _image_session,
     {
-        "difix": "arm of the comparison: DiFix3D+, one step from the render, frame by frame; to be trained",
-        "harmonizer": "arm of the comparison: DiffusionHarmonizer, one step from the render, frame by frame; to be trained",
-        "harmonizer-temporal": "arm of the comparison: DiffusionHarmonizer, looking at its last four outputs; to be trained",
+        "difix": "system of the comparison: DiFix3D+, one step from the render, frame by frame; to be trained",
+        "harmonizer": "system of the comparison: DiffusionHarmonizer, one step from the render, frame by frame; to be trained",
+        "harmonizer-temporal": "system of the comparison: DiffusionHarmonizer, with its last four outputs; to be trained",
     },
 )
 windows = FixerFactory(
     NoiseWindowSettings,
     _window_session,
     {
-        "gsfix3d": "arm of the comparison: GSFix3D, eight steps from noise, frame by frame; to be trained",
-        "3dgs-enhancer": "arm of the comparison: 3DGS-Enhancer, eight steps from noise in windows; recorded clips only; to be trained",
+        "gsfix3d": "system of the comparison: GSFix3D, eight steps from noise, frame by frame; to be trained",
+        "3dgs-enhancer": "system of the comparison: 3DGS-Enhancer, eight steps from noise in windows; recorded clips only; to be trained",
     },
 )

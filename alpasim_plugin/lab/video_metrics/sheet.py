@@ -27,7 +27,7 @@ def sheet(columns: Mapping[str, Sequence[U8]], rows: Sequence[str]) -> U8:
     if len(sizes) != 1 or any(len(column) != len(rows) for column in columns.values()):
         raise EvaluatorError(
             f"{', '.join(columns)}: sizes {sorted(sizes)}, lengths {[len(column) for column in columns.values()]} for {len(rows)} rows",
-            "give each column one picture of one size per row",
+            "give each column one image of one size per row",
         )
     parts = []
     for at, (title, column) in enumerate(columns.items()):

@@ -70,7 +70,7 @@ def _pair(previous: U8, frame: U8, flow: F32) -> float:
     valid = (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     if not valid.any():
         raise EvaluatorError(
-            "two neighbouring frames: flow that leaves the picture everywhere",
+            "two neighbouring frames: flow that leaves the image everywhere",
             "look at the video",
         )
     warped = cv2.remap(

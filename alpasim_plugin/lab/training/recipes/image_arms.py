@@ -59,7 +59,7 @@ def _temporal(name: str, about: str, references: Literal["own", "clean"]) -> Rec
 IMAGE_ARMS = (
     Recipe(
         "difix",
-        "DiFix3D+: one step from the render, transformer and decoder trained on pictures",
+        "DiFix3D+: one step from the render, transformer and decoder trained on images",
         (
             Stage(
                 "difix",
@@ -76,7 +76,7 @@ IMAGE_ARMS = (
     ),
     Recipe(
         "harmonizer",
-        "DiffusionHarmonizer: one step from the render, transformer and autoencoder trained on pictures",
+        "DiffusionHarmonizer: one step from the render, transformer and autoencoder trained on images",
         (HARMONIZER,),
         fixer="harmonizer",
     ),
