@@ -68,14 +68,14 @@ def interval(value: Any, centre: float | None = None) -> tuple[float, float] | N
     return None if half is None or centre is None else (centre - half, centre + half)
 
 
-def decimals(*values: float | None, digits: int = 3, most: int = 4) -> int:
-    """Choose how many decimals show ``digits`` significant digits of the largest of the values (at
-    most ``most``).
+def decimals(*values: float | None, digits: int = 3) -> int:
+    """Choose how many decimals show ``digits`` significant digits of the largest of the values, at
+    most four.
     """
     largest = max((abs(v) for v in values if v is not None), default=0.0)
     if largest == 0.0:
         return 1
-    return min(most, max(0, digits - 1 - math.floor(math.log10(largest))))
+    return min(4, max(0, digits - 1 - math.floor(math.log10(largest))))
 
 
 def fixed(value: float, places: int, sign: bool = False) -> str:
@@ -97,6 +97,13 @@ def short(value: float | None, unit: str = "") -> str:
 def scale_and_unit(metric: MetricInfo, unit: str) -> tuple[float, str]:
     """Return factor and unit of a metric's printed differences: points where it is a share."""
     return (100.0, "points") if metric.in_percent else (1.0, unit)
+
+
+def printed(metric: MetricInfo, *values: float, sign: bool = False) -> list[str]:
+    """Print values of a metric in its printed unit, with decimals that match."""
+    scale, _ = scale_and_unit(metric, "")
+    places = 1 if metric.in_percent else decimals(*(scale * value for value in values))
+    return [fixed(scale * value, places, sign=sign) for value in values]
 
 
 def count_of(mean: float, n: int) -> str:

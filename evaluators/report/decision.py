@@ -8,7 +8,7 @@ import numpy as np
 
 from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.numbers import decimals, fixed, labelled, scale_and_unit
+from evaluators.numbers import labelled, printed, scale_and_unit
 from evaluators.opening import Run
 from evaluators.report.charts import INK, MUTED, VARIANT, Chart, chart_of, new_axes
 from evaluators.report.gate import tone_of_cause
@@ -51,12 +51,12 @@ def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[JsonOb
     rows = []
     for name, asked in decision["question"]["metrics"].items():
         state = last[name]
-        scale, unit = _scale(known.info(name))
-        values = [state["diff"], asked["margin"], *state["interval"]]
-        places = decimals(*(None if value is None else scale * value for value in values))
+        facts = known.info(name)
+        scale, unit = _scale(facts)
+        ends = [value for value in (state["diff"], *state["interval"]) if value is not None]
+        texts = iter(printed(facts, asked["margin"], *ends, sign=True)[1:])
         diff, low, high = (
-            None if value is None else fixed(scale * value, places, sign=True)
-            for value in (state["diff"], *state["interval"])
+            None if value is None else next(texts) for value in (state["diff"], *state["interval"])
         )
         interval = f"{low or WORST_CASE} to {high or WORST_CASE}"
         rows.append(

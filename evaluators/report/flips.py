@@ -6,16 +6,12 @@ import base64
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NotRequired
 
-import cv2
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import inside, read_bytes, read_json_as
-from alpasim_plugin.core.reading.images import decode_image
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
@@ -23,12 +19,10 @@ from evaluators.numbers import Cell, fixed, missing, short
 from evaluators.opening import Run
 from evaluators.statistics.variants import Base, Variant, axis_bases
 
-MAX_WIDTH = 1600  # pixels of an inlined strip
 FLIPS_NAME = "flips.json"
 MAX_FLIP_ROWS = 400
 # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
 FlipKey = tuple[str, str, str, int, str]
-MAX_BYTES = 90_000  # above this a strip is encoded again
 
 
 def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
@@ -42,27 +36,6 @@ def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
         for i, renderer in enumerate(run.renderers)
         for j, policy in enumerate(run.policies)
     }
-
-
-def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
-    """Encode an image as a ``data:`` address, smaller where it is large; None where it is not a
-    readable image.
-    """
-    try:
-        data = read_bytes(path, SOURCE_BYTES)
-        image = decode_image(data, path)
-    except InputError:
-        return None  # the report says that the image is absent
-    height, width = image.shape[:2]
-    if len(data) > MAX_BYTES or width > MAX_WIDTH:
-        if width > MAX_WIDTH:
-            size = (MAX_WIDTH, round(height * MAX_WIDTH / width))
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        done, buffer = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
-        if done and buffer.size < len(data):
-            data = buffer.tobytes()
-            height, width = image.shape[:2]
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode(), width, height
 
 
 @dataclass(frozen=True)
@@ -159,26 +132,26 @@ class FlipRow:
     Attributes:
         time: When the plans diverged, since the first frame.
         gap: How far apart they were then.
-        pictures: (side, colour, data address, width, height) at that time.
-        why_not: Why there are no images.
+        pictures: (side, colour, data address) at that time.
+        why_not: Why there are no pictures.
         links: (side, colour, clip, folder).
     """
 
     flip: Flip
     time: Cell
     gap: Cell
-    pictures: tuple[tuple[str, int, str, int, int], ...]
+    pictures: tuple[tuple[str, int, str], ...]
     why_not: str
     links: tuple[tuple[str, int, str | None, str | None], ...]
 
 
 def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
-    """Lay out the flips with their images, as far as a budget goes.
+    """Lay out the flips with their pictures, as far as a budget goes.
 
     Args:
         run: The run; ``flips.json`` holds when plans diverged and where the frames of that time
             are.
-        budget_bytes: Most bytes of images to inline.
+        budget_bytes: Most bytes of pictures to inline.
 
     Returns:
         The rows, how many more flips there are, and the number of pairs compared.
@@ -192,7 +165,7 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     rows = []
     for flip in flips[:MAX_FLIP_ROWS]:
         row = _row(run, flip, known.get(flip.key) or {"reason": unknown}, spent < budget_bytes)
-        spent += sum(len(src) for _, _, src, _, _ in row.pictures)
+        spent += sum(len(src) for _, _, src in row.pictures)
         rows.append(row)
     return rows, len(flips) - len(rows), compared
 
@@ -254,9 +227,8 @@ def _row(run: Run, flip: Flip, entry: Mapping[str, Any], has_room: bool) -> Flip
     for name, colour, _ in sides:
         path = inside(run.folder, str(frames.get(name)))
         if has_room and path is not None and os.path.isfile(path):
-            encoded = inline_jpeg(path)
-            if encoded is not None:
-                pictures.append((name, colour, *encoded))
+            data = base64.b64encode(read_bytes(path, SOURCE_BYTES)).decode()
+            pictures.append((name, colour, f"data:image/jpeg;base64,{data}"))
     why = str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
     return FlipRow(
         flip,

@@ -19,11 +19,11 @@ from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_E
 from evaluators.numbers import (
     DASH,
     count_of,
-    decimals,
     finite,
     fixed,
     interval,
     plural,
+    printed,
     scale_and_unit,
     short,
 )
@@ -317,17 +317,16 @@ def differences_of(run: Run) -> dict[str, Difference]:
         if tone in ("worse", "better") and (number, metric_name) not in shown:
             tone = "unclear"
         bounds = interval(entry.get("ci95"), float(entry["diff"]))
-        values = [scale * value for value in (float(entry["diff"]), *(bounds or ()))]
-        places = 1 if metric.in_percent else decimals(*values)
-        texts = [fixed(value, places, sign=True) for value in values]
+        values = [float(entry["diff"]), *(bounds or ())]
+        texts = printed(metric, *values, sign=True)
         baseline = variant_name(run, str(entry.get("baseline") or "the baseline"))
         verdict = f"{VERDICTS.get(tone, '')} {baseline}"
         if tone in ("worse", "better") and entry.get("verdict") != "worse":
             verdict += " on these scenes"
         found[key] = Difference(
             baseline,
-            values[0],
-            (values[1], values[2]) if bounds else None,
+            scale * values[0],
+            (scale * bounds[0], scale * bounds[1]) if bounds else None,
             scale * (finite(entry.get("margin")) or 0.0),
             tone,
             verdict,

@@ -19,9 +19,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
-from alpasim_plugin.log.run_folder.schema import WHY_NAME
+from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
 from evaluators.metrics.outcomes import (
     OUTCOMES,
     POLICY_FAULT,
@@ -147,7 +146,6 @@ def _at(own: Own, name: str, t_us: int) -> float | None:
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a note
 COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
-CLIP = "front.mp4"
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,6 @@ def rollout_block(run: Run) -> RolloutBlock:
     what they are, and ``data``, a number a rollout with four digits, null where it is missing.
     """
     rollouts = run.rollouts[:MAX_ROLLOUTS]
-    parents = [os.path.split(r.path) for r in rollouts]
     texts = {
         "scene": [r.scene for r in rollouts],
         "renderer": [r.renderer for r in rollouts],
@@ -200,7 +197,7 @@ def rollout_block(run: Run) -> RolloutBlock:
     document = {
         "renderers": run.renderers,
         "texts": texts,
-        "state": _states(run, parents),
+        "state": [_state(run, rollout) for rollout in rollouts],
         "numbers": numbers,
     }
     plain = json.dumps(document, separators=(",", ":")).encode()
@@ -218,35 +215,17 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.4g}")
 
 
-def _states(run: Run, parents: Sequence[tuple[str, str]]) -> list[int]:
-    """Return what each rollout ended with, and which files of it are there, as bits."""
-    has_clips = str((run.info.get("config") or {}).get("video") or "none") != "none"
-    names: dict[str, frozenset[str]] = {}
-    states = []
-    for rollout, (parent, leaf) in zip(run.rollouts, parents, strict=False):
-        state = 0 if rollout.ok else FAILED
-        if rollout.ok:
-            had = outcomes_of(rollout)
-            state |= COLLIDED if rollout.flag(*COLLISION) else OTHERWISE if had else 0
-        if parent not in names:
-            names[parent] = frozenset()
-            path = run.folder / parent
-            if (
-                parent and os.path.isdir(path) and real(path).is_relative_to(real(run.folder))
-            ):  # links may lead out of the run
-                with os.scandir(path) as found:
-                    names[parent] = frozenset(
-                        one.name for one in found if one.is_dir(follow_symlinks=False)
-                    )
-        if leaf in names[parent]:
-            state |= HAS_FOLDER | (
-                HAS_CLIP if has_clips and os.path.isfile(run.folder / parent / leaf / CLIP) else 0
-            )
-            state |= (
-                HAS_WHY
-                if state & (COLLIDED | OTHERWISE)
-                and os.path.isfile(run.folder / parent / leaf / WHY_NAME)
-                else 0
-            )
-        states.append(state)
-    return states
+def _state(run: Run, rollout: Rollout) -> int:
+    """Return what a rollout ended with, and which files of it are there, as bits."""
+    if not rollout.ok:
+        state = FAILED
+    elif rollout.flag(*COLLISION):
+        state = COLLIDED
+    else:
+        state = OTHERWISE if outcomes_of(rollout) else 0
+    folder = run.folder / rollout.path
+    if rollout.path and os.path.isdir(folder):
+        state |= HAS_FOLDER
+        state |= HAS_CLIP if os.path.isfile(folder / VIDEO_NAME) else 0
+        state |= HAS_WHY if os.path.isfile(folder / WHY_NAME) else 0
+    return state

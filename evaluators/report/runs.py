@@ -26,7 +26,7 @@ from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
 from alpasim_plugin.log.run_folder.shapes import Summary
 from evaluators.metrics import MetricTable
-from evaluators.numbers import DASH, decimals, finite, fixed, interval
+from evaluators.numbers import DASH, finite, interval, printed
 
 CHECK = "simrun check run RUN says what is damaged"
 
@@ -255,10 +255,8 @@ def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
     if mean is None:
         return DASH
     facts = MetricTable.of_run(entry.info).shown(metric)
-    scale, unit = (100.0, "%") if facts.in_percent else (1.0, str(numbers.get("unit") or ""))
-    values = [value * scale for value in (mean, *(interval(numbers.get("ci95_clustered")) or ()))]
-    places = 1 if facts.in_percent else decimals(*values)
-    texts = [fixed(value, places) for value in values]
+    unit = "%" if facts.in_percent else str(numbers.get("unit") or "")
+    texts = printed(facts, mean, *(interval(numbers.get("ci95_clustered")) or ()))
     spread = f"({' to '.join(texts[1:])})" if len(texts) > 1 else ""
     return " ".join(filter(None, (texts[0], unit, spread)))
 

@@ -21,6 +21,7 @@ from evaluators.numbers import (
     interval,
     missing,
     plural,
+    printed,
     scale_and_unit,
     short,
 )
@@ -159,12 +160,10 @@ def _pair_row(variant: str, metric: MetricInfo, entry: JsonView) -> PairRow:
     diff_cell = missing(reason or "no pair has this metric valid on both sides")
     bounds_cell = missing(reason or "it needs at least two scenes")
     if difference is not None:
-        values = [value * scale for value in (difference, *bounds)]
-        places = 1 if metric.in_percent else decimals(*values)
-        texts = [fixed(value, places, sign=True) for value in values]
-        diff_cell = Cell(f"{texts[0]}\u00a0{unit}".strip("\u00a0"), note, sort=values[0])
+        texts = printed(metric, difference, *bounds, sign=True)
+        diff_cell = Cell(f"{texts[0]}\u00a0{unit}".strip("\u00a0"), note, sort=scale * difference)
         if bounds:
-            bounds_cell = Cell(" to ".join(texts[1:]), note, sort=values[2] - values[1])
+            bounds_cell = Cell(" to ".join(texts[1:]), note, sort=scale * (bounds[1] - bounds[0]))
     p_cell = missing(reason or "no test was made")
     if p is not None:
         text = "< 0.001" if p < 0.001 else fixed(p, 3)

@@ -9,11 +9,10 @@ from typing import Any
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
 from evaluators.numbers import (
-    decimals,
     finite,
-    fixed,
     interval,
     plural,
+    printed,
     scale_and_unit,
     short,
 )
@@ -36,9 +35,7 @@ def difference_text(entry: JsonView, metric: MetricInfo) -> str:
         return str(entry.get("reason") or "no difference")
     scale, unit = scale_and_unit(metric, metric.unit)
     bounds = interval(entry.get("ci95"), difference) or ()
-    values = [value * scale for value in (difference, *bounds)]
-    places = 1 if metric.in_percent else decimals(*values)
-    numbers = [fixed(value, places, sign=True) for value in values]
+    numbers = printed(metric, difference, *bounds, sign=True)
     text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
     n, p = int(entry.get("n_scenes") or 0), finite(entry.get("p_value"))
     if p is not None and 1 < n < FEW_SCENES:

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import CameraSpec, RolloutLog
 from alpasim_plugin.log import read_asl
@@ -183,38 +183,33 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
         arms: Where the run has one renderer, its policies stand side by side.
     """
     by_policy = arms and len(run.renderers) == 1 and len(run.policies) > 1
+    fixed, side = ("renderer", "policy") if by_policy else ("policy", "renderer")
     base = baseline_of(run)
     sides = run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
-
-    def split(rollout: Rollout) -> tuple[str, str]:
-        """Return what a cell holds fixed, and what stands side by side in it."""
-        names = rollout.renderer, rollout.policy
-        return names if by_policy else names[::-1]
-
-    def place(rollout: Rollout) -> tuple[int, str, int, int]:
-        """Return the order of rollouts."""
-        fixed, side = split(rollout)
-        return run.scenes.index(rollout.scene), fixed, rollout.seed, sides.index(side)
-
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     takes: Counter[tuple[str, str, str, int]] = Counter()
-    for rollout in sorted(run.rollouts, key=place):
+    for rollout in sorted(run.rollouts, key=lambda one: sides.index(getattr(one, side))):
         if wanted.takes(rollout):
-            key = (rollout.scene, split(rollout)[0], rollout.seed, takes[rollout.cell])
+            take = takes[rollout.cell]
             takes[rollout.cell] += 1
+            key = (rollout.scene, getattr(rollout, fixed), rollout.seed, take)
             grouped.setdefault(key, []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        fixed = split(flip.other)[0]
+        other, held = flip.other, getattr(flip.other, fixed)
         # a cell shows one policy behind all renderers, or the other way round
-        if split(flip.base)[0] == fixed and wanted.takes(flip.other):
-            flips.setdefault((flip.other.scene, fixed, flip.other.seed), []).append(flip)
+        if getattr(flip.base, fixed) == held and wanted.takes(other):
+            flips.setdefault((other.scene, held, other.seed), []).append(flip)
     cells = [
         WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
         for key, members in grouped.items()
     ]
-    # stable: equal ones stay in the run's order
-    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))
+
+    def rank(cell: WatchedCell) -> tuple[int, float, int, str, int, int]:
+        place = run.scenes.index(cell.scene), cell.policy, cell.seed, cell.take
+        return ORDER.index(cell.interest), -cell.apart_m, *place
+
+    return sorted(cells, key=rank)
 
 
 def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted) -> list[WatchedCell]:
@@ -363,14 +358,11 @@ def index_data(
         report: Address of the run's report, or "".
     """
     ids = {cell.id for cell in here}
-    stated: dict[str, JsonView] = {}
-    for table in (run.summary.get("metrics") or {}).values():
-        stated |= table
+    tables = (run.summary.get("metrics") or {}).values()
     metrics = {}
-    for name in run.table.ordered({*run.table, *stated}):
+    for name in run.table.ordered({*run.table, *(name for table in tables for name in table)}):
         metric = run.table.shown(name)
-        unit = metric.unit or str(stated.get(name, {}).get("unit") or "")
-        metrics[name] = {"unit": unit, "help": metric.help, "flag": metric.is_flag}
+        metrics[name] = {"unit": metric.unit, "help": metric.help, "flag": metric.is_flag}
     bases = [cell.side(flip.base) for cell in cells for flip in cell.flips]
     rows = []
     for cell in cells:
