@@ -155,9 +155,9 @@ class Progress(progress.Progress):
         """Print an interim analysis: scenes, and each metric's interval and verdict."""
         scenes = plural(state.n_scenes, "scene")
         parts = []
-        for one in state.metrics:
-            low, high = ("unbounded" if end is None else f"{end:+.4g}" for end in one.interval)
-            parts.append(f"{one.metric} {low} to {high} {one.answer}")
+        for name, look in state.metrics.items():
+            low, high = ("unbounded" if end is None else f"{end:+.4g}" for end in look["interval"])
+            parts.append(f"{name} {low} to {high} {look['verdict']}")
         self.say(f"{scenes}, {rollouts} of at most {ceiling} rollouts: {'; '.join(parts)}")
 
     def noticed(self, text: str) -> None:

@@ -30,7 +30,6 @@ from evaluators.statistics.decision import (
     Question,
     State,
     least_scenes,
-    look_as_dict,
     outcome_of,
     question_as_dict,
     scene_harm,
@@ -113,7 +112,7 @@ class SequentialTest:
     driven: dict[str, JsonObject] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)  # binding metrics of which a pair has no value
-    state: State = State(0, "open", ())
+    state: State = field(default_factory=lambda: State(0, "open", {}))
     failed: Outcome = Outcome("pass")
     stopped: str = ""
 
@@ -158,7 +157,7 @@ class SequentialTest:
             one.metric for one in asked if one.binding and np.isnan(values[one.metric]).any()
         ]
         self.state = state_after(self.question, values, len(self.order))
-        self.looks.append(look_as_dict(self.state, len(self.driven)))
+        self.looks.append({**vars(self.state), "rollouts": len(self.driven)})
         if self.failed.cause != "pass":
             self.stopped = "rollouts failed"
         elif self.state.answer != "open":

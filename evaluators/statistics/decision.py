@@ -188,28 +188,17 @@ def closed(log_e: F64) -> F64:
         return np.asarray(np.log(least) + scale)
 
 
-@dataclass(frozen=True)
-class MetricState:
-    """What is known of one metric after n scenes.
+class MetricLook(TypedDict):
+    """What is known of one metric after the scenes of an interim analysis."""
 
-    Attributes:
-        metric: Its name.
-        answer: ``non-inferior``, ``worse`` or ``undecided``.
-        n_scenes: Scenes with a difference.
-        diff: Mean difference in the metric's own sign; None without scenes.
-        interval: Bounds in the metric's own sign; each is wrong in at most a share alpha of runs,
-            over all interim analyses. None: no bound yet.
-        e_good: Greatest e-value so far against what the good answer denies.
-        e_bad: The same for the bad answer, adjusted for several metrics.
-    """
-
-    metric: str
-    answer: str
-    n_scenes: int
-    diff: float | None
-    interval: tuple[float | None, float | None]
-    e_good: float
-    e_bad: float
+    verdict: str  # non-inferior, worse or undecided
+    n_scenes: int  # with a difference
+    diff: float | None  # mean, in the metric's own sign; None without scenes
+    # bounds in the metric's own sign: each is wrong in at most a share alpha of runs, over all
+    # interim analyses; None: no bound yet
+    interval: list[float | None]
+    e_good: float  # greatest e-value so far against what the good answer denies
+    e_bad: float  # the same for the bad answer, adjusted for several metrics
 
 
 @dataclass(frozen=True)
@@ -219,12 +208,12 @@ class State:
     Attributes:
         n_scenes: Scenes driven.
         answer: Over all metrics.
-        metrics: One each, in the order of the question.
+        metrics: By name, in the order of the question.
     """
 
     n_scenes: int
     answer: Answer
-    metrics: tuple[MetricState, ...]
+    metrics: Mapping[str, MetricLook]
 
 
 def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> State:
@@ -252,7 +241,7 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
     binding = [asked.binding for asked in question.metrics]
     all_good = is_good[binding].all(axis=0) & any(binding)
     answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
-    states = []
+    states: dict[str, MetricLook] = {}
     for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
         x = values[asked.metric]
         center = float(np.nanmean(x)) if np.isfinite(x).any() else None
@@ -262,10 +251,15 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
         e_good, e_bad = (
             float(np.exp(min(path[i, -1], 700.0))) if n else 0.0 for path in (log_good, log_bad)
         )
-        word = WORDS[_first(is_good[i], is_bad[i])]
-        n_known = metric_evidence.draws.n
-        states.append(MetricState(asked.metric, word, n_known, center, (low, high), e_good, e_bad))
-    return State(n, answer, tuple(states))
+        states[asked.metric] = {
+            "verdict": WORDS[_first(is_good[i], is_bad[i])],
+            "n_scenes": metric_evidence.draws.n,
+            "diff": center,
+            "interval": [low, high],
+            "e_good": e_good,
+            "e_bad": e_bad,
+        }
+    return State(n, answer, states)
 
 
 def least_scenes(question: Question, most: int = MOST_SCENES) -> int | None:
@@ -376,12 +370,12 @@ def outcome_of(question: Question, state: State, ceiling: str) -> Outcome:
     if state.answer == "good":
         return Outcome("pass")
     if state.answer == "bad":
-        worse = [metric.metric for metric in state.metrics if metric.answer == WORDS["bad"]]
+        worse = [name for name, look in state.metrics.items() if look["verdict"] == WORDS["bad"]]
         return Outcome("regression", tuple(f"{name} is worse" for name in worse))
     left = [
         asked.metric
-        for asked, metric in zip(question.metrics, state.metrics, strict=True)
-        if asked.binding and metric.answer == WORDS["open"]
+        for asked in question.metrics
+        if asked.binding and state.metrics[asked.metric]["verdict"] == WORDS["open"]
     ]
     return Outcome("undecided", (f"{', '.join(left) or 'nothing'} undecided: {ceiling}",))
 
@@ -399,17 +393,6 @@ class AskedRecord(TypedDict):
     alpha: float  # probability of a wrong decision over all interim analyses
     rule: str  # how several metrics are joined
     metrics: dict[str, MetricAsked]
-
-
-class MetricLook(TypedDict):
-    """One metric at one interim analysis."""
-
-    verdict: str
-    n_scenes: int
-    diff: float | None
-    interval: list[float | None]  # each end holds over all analyses with probability 1 - alpha
-    e_good: float
-    e_bad: float
 
 
 class Look(TypedDict):
@@ -449,20 +432,6 @@ def question_as_dict(question: Question) -> AskedRecord:
             asked.metric: {"margin": asked.margin, "binding": asked.binding}
             for asked in question.metrics
         },
-    }
-
-
-def look_as_dict(state: State, rollouts: int) -> Look:
-    """Return an interim analysis for JSON."""
-    metrics: dict[str, MetricLook] = {}
-    for metric in state.metrics:
-        facts = vars(metric) | {"verdict": metric.answer, "interval": list(metric.interval)}
-        metrics[metric.metric] = {key: facts[key] for key in MetricLook.__annotations__}  # type: ignore[assignment]
-    return {
-        "n_scenes": state.n_scenes,
-        "rollouts": rollouts,
-        "answer": state.answer,
-        "metrics": metrics,
     }
 
 

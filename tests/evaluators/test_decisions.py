@@ -36,13 +36,8 @@ def test_a_decision_stays_and_intervals_only_shrink_however_often_one_looks():
     assert answers[0] == "open"
     assert answers[-1] == "good"
     assert answers == sorted(answers, key=["open", "good"].index)
-    for k in range(2):
-        ends = np.array(
-            [
-                [np.nan if end is None else end for end in state.metrics[k].interval]
-                for state in states
-            ]
-        )
+    for name in values:
+        ends = np.array([state.metrics[name]["interval"] for state in states], dtype=np.float64)
         ends = ends[np.isfinite(ends).all(axis=1)]
         assert np.all(np.diff(ends[:, 0]) >= -1e-9)
         assert np.all(np.diff(ends[:, 1]) <= 1e-9)
@@ -57,7 +52,7 @@ def test_a_metric_without_a_better_side_is_judged_by_the_size_of_the_change(shif
             0.0, 0.2, 200
         )  # fewer cannot have shown a scene that is 4 m to one side
         state = state_after(asked(("lateral_bias_m", 0.2)), {"lateral_bias_m": x}, 200)
-        assert (state.answer, state.metrics[0].answer) == (answer, word)
+        assert (state.answer, state.metrics["lateral_bias_m"]["verdict"]) == (answer, word)
 
 
 def test_higher_is_better_turns_the_sign_of_what_is_printed_only():
@@ -65,8 +60,8 @@ def test_higher_is_better_turns_the_sign_of_what_is_printed_only():
         asked(("progress", 0.1)), {"progress": np.full(60, 0.5)}, 100
     )  # positive is worse: half of the progress is lost
     assert gone.answer == "bad"
-    assert gone.metrics[0].diff == pytest.approx(-0.5)
-    low, high = gone.metrics[0].interval
+    assert gone.metrics["progress"]["diff"] == pytest.approx(-0.5)
+    low, high = gone.metrics["progress"]["interval"]
     assert -1.0 <= low < -0.5 < high < -0.1
 
 
@@ -75,7 +70,7 @@ def test_one_metric_that_is_worse_decides_and_one_that_need_not_decide_does_not_
     rare = metric_question("offroad", 0.01, binding=False)
     question = Question((metric_question("lateral_distance_m", 0.1), rare))
     open_rare = state_after(question, {"lateral_distance_m": x, "offroad": np.zeros(200)}, 200)
-    assert (open_rare.answer, open_rare.metrics[1].answer) == ("good", "undecided")
+    assert (open_rare.answer, open_rare.metrics["offroad"]["verdict"]) == ("good", "undecided")
     both = Question(
         (
             metric_question("lateral_distance_m", 0.1),
@@ -99,18 +94,15 @@ def test_scenes_without_a_pair_leave_the_evidence_as_it_was():
         state_after(question, {"offroad": holed}, 60),
         state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60),
     )
-    assert with_holes.metrics[0].n_scenes == 37
-    assert with_holes.metrics[0] == without.metrics[0]
+    assert with_holes.metrics["offroad"]["n_scenes"] == 37
+    assert with_holes.metrics == without.metrics
 
 
 def test_nothing_is_decided_on_nothing():
     question = asked(("lateral_distance_m", 0.1))
     nothing = state_after(question, {"lateral_distance_m": np.full(4, np.nan)}, 40)
-    assert (nothing.answer, nothing.metrics[0].diff, nothing.metrics[0].interval) == (
-        "open",
-        None,
-        (None, None),
-    )
+    look = nothing.metrics["lateral_distance_m"]
+    assert (nothing.answer, look["diff"], look["interval"]) == ("open", None, [None, None])
 
 
 def test_the_scenes_that_a_good_answer_takes_are_counted_before_any_is_driven():
