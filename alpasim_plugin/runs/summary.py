@@ -18,6 +18,7 @@ from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
+from alpasim_plugin.log.run_folder.rows import rollouts_of_table
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, SUMMARY
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
@@ -25,7 +26,7 @@ from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import fixers
 from evaluators import censoring
 from evaluators.metrics import METRICS, MetricTable
-from evaluators.statistics.outcomes import outcome_table, rollouts_of
+from evaluators.statistics.outcomes import outcome_table, times_of
 from evaluators.statistics.summary import NO_BASES, by_policy, numbers
 from evaluators.statistics.variants import base_named, variants_in
 
@@ -70,7 +71,7 @@ def write_summary(
     cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
     summary = {
         "preset": preset,
-        "outcomes": outcome_table(*rollouts_of(manifests)),
+        "outcomes": outcome_table(rollouts_of_table(rollouts), times_of(manifests)),
         **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": {

@@ -189,12 +189,10 @@ def min_ade(
             last = int(np.searchsorted(usable, plan.now_us + round(horizon_s * 1e6)))
             if first <= last < len(usable):
                 span = slice(first, last + 1)
-                reach = [k for k in range(len(plan.samples)) if _covers(samples, k, usable[span])]
-                errors = [
-                    _errors(samples, k, usable[span], target_xyz[span], preset).mean()
-                    for k in reach
-                ]
-                values[i, j] = min(errors, default=np.nan)
+                errors = _errors(samples, usable[span], target_xyz[span], preset)
+                values[i, j] = min(
+                    (error.mean() for error in errors if error is not None), default=np.nan
+                )
     reason = "the log, the target or every sample ends before the horizon"
     return [
         series(name, now_us, column, np.isfinite(column), reason)
@@ -227,14 +225,10 @@ def _min_ade_by_index(
         samples = trajectory_table(plan.samples, rollout.T_rig_box, origin, preset)
         until = min(plan.now_us + longest_us, float(line_us[-1]))
         span = np.flatnonzero((line_us >= plan.query_us) & (line_us <= until))
-        if not all(_covers(samples, k, line_us[span]) for k in range(len(plan.samples))):
+        found = _errors(samples, line_us[span], target_xyz[span], preset)
+        errors = np.stack([error for error in found if error is not None] or [np.zeros(0)])
+        if len(errors) < len(found):
             return []
-        errors = np.stack(
-            [
-                _errors(samples, k, line_us[span], target_xyz[span], preset)
-                for k in range(len(plan.samples))
-            ]
-        )
         running = np.cumsum(errors, axis=1) / np.arange(1, len(span) + 1)
         best = running.min(axis=0)
         after_now = int(np.searchsorted(line_us, plan.now_us)) + 1
@@ -251,14 +245,21 @@ def _min_ade_by_index(
     ]
 
 
-def _covers(samples: TrajectoryTable, k: int, t_us: I64) -> bool:
-    t = samples.t_us[samples.rows(k)]
-    return len(t) > 0 and (len(t_us) == 0 or bool(t[0] <= t_us[0] and t_us[-1] <= t[-1]))
-
-
-def _errors(samples: TrajectoryTable, k: int, t_us: I64, target_xyz: F64, preset: Preset) -> F64:
-    off = held(samples.position(k, t_us), preset) - target_xyz
-    return np.asarray(np.linalg.norm(off[:, : 3 if preset.min_ade_with_z else 2], axis=1))
+def _errors(
+    samples: TrajectoryTable, t_us: I64, target_xyz: F64, preset: Preset
+) -> list[F64 | None]:
+    """Return the distances ``(M,)`` of each sample from a target ``(M, 3)`` at times ``(M,)``; None
+    of one that does not cover them.
+    """
+    out: list[F64 | None] = []
+    for k in range(len(samples.start) - 1):
+        t = samples.t_us[samples.rows(k)]
+        if not len(t) or (len(t_us) and (t[0] > t_us[0] or t_us[-1] > t[-1])):
+            out.append(None)
+            continue
+        off = held(samples.position(k, t_us), preset) - target_xyz
+        out.append(np.linalg.norm(off[:, : 3 if preset.min_ade_with_z else 2], axis=1))
+    return out
 
 
 FACTORY = with_preset(evaluate_plans)

@@ -183,30 +183,20 @@ PRESETS: dict[str, Preset] = {
 
 DEFAULT = "strict"  # for verdicts of our own; the others are conventions that are named
 
-# Least and greatest share of contacts, in percent, that fall between two logged instants, in two
-# samples (docs/metrics.md).
-UNSEEN = {"100 ms": (2, 5), "200 ms": (3, 14), "500 ms": (8, 49)}
+# Least and greatest share of contacts that fall between two logged instants, in two samples
+# (docs/metrics.md).
+AT_INSTANTS = (
+    "contact at logged instants only: missed are 2 to 5 % of contacts at steps of 100 ms, "
+    f"3 to 14 % at 200 ms, 8 to 49 % at 500 ms; --preset {DEFAULT} looks between them too"
+)
 
 
 def contact_note(name: str) -> str:
     """Say what a preset that looks for contact at logged instants only does not see; empty for
     others, and for unknown ones.
-
-    >>> contact_note("strict")
-    ''
-    >>> contact_note("paper")[:84]
-    'contact at logged instants only: missed are 2 to 5 % of contacts at steps of 100 ms,'
     """
     chosen = PRESETS.get(name)
-    if chosen is None or chosen.contact == "between_steps":
-        return ""
-    first, *others = (
-        f"{low} to {high} %{{}} at {{}}{step}" for step, (low, high) in UNSEEN.items()
-    )
-    missed = ", ".join(
-        [first.format(" of contacts", "steps of "), *(note.format("", "") for note in others)]
-    )
-    return f"contact at logged instants only: missed are {missed}; --preset {DEFAULT} looks between them too"
+    return AT_INSTANTS if chosen is not None and chosen.contact == "at_steps" else ""
 
 
 HELP = {
@@ -219,19 +209,12 @@ HELP = {
 
 def described() -> dict[str, str]:
     """Return PRESET -> what it is, and what it does not see, the default first."""
-    order = sorted(PRESETS, key=lambda name: name != DEFAULT)
-    return {
-        name: "; ".join(
-            filter(
-                None,
-                (
-                    HELP.get(name) or PRESETS[name].reproduces,
-                    "" if PRESETS[name].protocol else contact_note(name),
-                ),
-            )
-        )
-        for name in order
-    }
+    texts = {}
+    for name in sorted(PRESETS, key=lambda name: name != DEFAULT):
+        chosen = PRESETS[name]
+        note = "" if chosen.protocol else contact_note(name)
+        texts[name] = "; ".join(filter(None, (HELP.get(name) or chosen.reproduces, note)))
+    return texts
 
 
 def preset(name: str | Preset) -> Preset:

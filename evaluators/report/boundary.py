@@ -15,17 +15,15 @@ def sentence_of(record: JsonView) -> str:
     Args:
         record: The member ``boundary`` of ``summary.json``.
     """
-    names = names_of(record)
     texts = []
     for name, facts in record["variants"].items():
         if "value" in facts:
-            texts.append(f"{names[name]} fails {facts['fails']} {number(facts, record['unit'])}")
+            texts.append(f"{name} fails {facts['fails']} {number(facts, record['unit'])}")
         else:
-            texts.append(f"{names[name]} has no boundary: {facts['reason']}")
+            texts.append(f"{name} has no boundary: {facts['reason']}")
     for name, facts in record["differences"].items():
-        other = names[facts["baseline"]]
         difference = number(facts, record["unit"], sign=True)
-        texts.append(f"{names[name]} minus {other}: {difference}")
+        texts.append(f"{name} minus {facts['baseline']}: {difference}")
     low, high = (f"{value:g}" for value in record["range"])
     text = f"{record['parameter']} from {low} to {high}: {'; '.join(texts)}"
     least, most = (f"{value:g}" for value in record["reachable"])
@@ -44,15 +42,6 @@ def number(facts: JsonView, unit: str, sign: bool = False) -> str:
     return f"{value} {unit} ({low} to {high})".replace("  ", " ")
 
 
-def names_of(record: JsonView) -> dict[str, str]:
-    """Name variants by what they do not share: the renderer, the policy, or both."""
-    parts = [name.split("/") for name in record["variants"]]
-    for column in (0, 1):
-        if all(len(one) == 2 for one in parts) and len({one[1 - column] for one in parts}) == 1:
-            return {"/".join(one): one[column] for one in parts}
-    return {name: name for name in record["variants"]}
-
-
 def boundary_section(record: JsonView | None) -> dict[str, Any] | None:
     """Return the section of a run that searched for boundaries, None of any other."""
     return None if record is None else {"title": record["sentence"], "charts": [chart(record)]}
@@ -60,10 +49,10 @@ def boundary_section(record: JsonView | None) -> dict[str, Any] | None:
 
 def chart(record: JsonView) -> Chart:
     """Draw every driven point, a row for each variant and seed, with boundaries and intervals."""
-    names = names_of(record)
+    names = list(record["variants"])
     unit = f", {record['unit']}" if record["unit"] else ""
     axes = new_axes(f"{record['parameter']}{unit}", "")
-    axes.set_yticks(range(len(names)), list(names.values()), parse_math=False)
+    axes.set_yticks(range(len(names)), names, parse_math=False)
     for row, facts in enumerate(record["variants"].values()):
         colour = VARIANT[row % len(VARIANT)]
         seeds = list(facts["outcomes"].values())

@@ -9,7 +9,7 @@ from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
 from evaluators.statistics.paired import Pair, Table, compare_pairs, pairs_within
-from evaluators.statistics.variants import Variant, base_named, choices, variants_in
+from evaluators.statistics.variants import Base, Variant, base_named, choices, variants_in
 
 
 @dataclass(frozen=True)
@@ -114,46 +114,40 @@ def compare_runs(
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
     # what differs in their weights are other variants, whatever their names
     notes = (f"other weights: {', '.join(changed)}",) if changed else ()
+    foreign = not {*table.policies} & {*base.policies}
+    if foreign and len(base.policies) == len(table.policies) == 1:
+        note = f"policy {table.policies[0]} is compared with policy {base.policies[0]}"
+        notes = (note, *notes)
+    elif foreign and (named is None or named.policy is None):
+        raise InputError(
+            f"policies {base.policies} and {table.policies}: none in common",
+            "compare runs of one policy each or of the same policies, or name one with "
+            "--baseline RENDERER/POLICY",
+        )
+    if named is None:
+        named = Base(renderer=base.renderers[0]) if len(base.renderers) == 1 else Base()
+    elif named.policy is not None:
+        foreign = False
+    several = len(table.policies) > 1 or named.policy is not None
     pairs = []
-    if named is not None and named.policy is not None:
-        for variant in variants_in(table):
-            other = named.of(variant)
-            if other in base_variants:
-                pairs.append(Pair(variant.name, variant, other, f"{first.folder}: {other.name}"))
-        if not pairs:
+    for variant in variants_in(table):
+        other = named.of(variant)
+        if foreign:
+            other = Variant(other.renderer, base.policies[0])
+        if other.renderer not in base.renderers:
             raise InputError(
-                f"baseline {baseline!r}: behind no renderer of {second.folder}",
-                "name RENDERER/POLICY",
-            )
-    else:
-        policy_of = {policy: policy for policy in table.policies if policy in base.policies}
-        if not policy_of:
-            if len(base.policies) != 1 or len(table.policies) != 1:
-                raise InputError(
-                    f"policies {base.policies} and {table.policies}: none in common",
-                    "compare runs of one policy each or of the same policies, or name one with "
-                    "--baseline RENDERER/POLICY",
-                )
-            policy_of = {table.policies[0]: base.policies[0]}
-            note = f"policy {table.policies[0]} is compared with policy {base.policies[0]}"
-            notes = (note, *notes)
-        renderer_of = dict.fromkeys(table.renderers, baseline or base.renderers[0])
-        if baseline is None and len(base.renderers) > 1:
-            renderer_of = {name: name for name in table.renderers}
-        lone = [name for name, other in renderer_of.items() if other not in base.renderers]
-        if lone:
-            raise InputError(
-                f"renderers {lone} of {second.folder}: {first.folder} has "
+                f"renderer {variant.renderer} of {second.folder}: {first.folder} has "
                 f"{', '.join(base.renderers)}",
                 "name one by --baseline",
             )
-        several = len(table.policies) > 1
-        for variant in variants_in(table):
-            renderer = renderer_of[variant.renderer]
-            other = Variant(renderer, policy_of.get(variant.policy, ""))
-            if other in base_variants:
-                key = variant.name if several else variant.renderer
-                pairs.append(Pair(key, variant, other, f"{first.folder}: {renderer}"))
+        if other in base_variants:
+            called = other.name if named.policy is not None else other.renderer
+            key = variant.name if several else variant.renderer
+            pairs.append(Pair(key, variant, other, f"{first.folder}: {called}"))
+    if not pairs:
+        raise InputError(
+            f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
+        )
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
     paired = compare_pairs(table, pairs, metrics, base, listed)
     return Comparison(paired, notes, metrics=metrics)

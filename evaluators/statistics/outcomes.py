@@ -9,6 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import KEYS
 from evaluators.metrics.outcomes import (
     CONTACT_SIDES,
     ENDINGS,
@@ -27,42 +28,17 @@ LISTED = 20  # cells named per outcome in summary.json
 DISTANCE = "lateral_distance_m"
 
 
-def rollouts_of(manifests: Iterable[JsonView]) -> tuple[list[Rollout], Times]:
-    """Return manifests as rows, and when their outcomes began."""
-    rows: list[Rollout] = []
-    times: dict[tuple[str, str, str, int], dict[str, float]] = {}
+def times_of(manifests: Iterable[JsonView]) -> Times:
+    """Return when the outcomes of manifests began."""
+    times: dict[tuple[str, str, str, int], Mapping[str, float]] = {}
     for manifest in manifests:
-        metrics = {
-            name: facts["value"] if facts["valid"] else None
-            for name, facts in (manifest.get("metrics") or {}).items()
-        }
-        numbers = {
-            name: value
-            for name, value in metrics.items()
-            if isinstance(value, int | float) or value is None
-        }
-        error = manifest.get("error") or {}
-        row = Rollout(
-            manifest["renderer"],
-            manifest["policy"],
-            manifest["scene"],
-            int(manifest["seed"]),
-            manifest["status"],
-            str(error.get("failure_class") or ""),
-            str(error.get("message") or ""),
-            metrics=numbers,
-        )
-        rows.append(row)
-        began = {
-            event["metric"]: float(event["t_s"])
-            for event in manifest.get("events") or []
-            if "t_s" in event
-        }
+        began = {event["metric"]: float(event["t_s"]) for event in manifest.get("events") or ()}
         contact = [began[side] for side in CONTACT_SIDES if side in began]
         if contact:
             began |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
-        times.setdefault(row.cell, began)
-    return rows, times
+        renderer, policy, scene, seed = (manifest[key] for key in KEYS)
+        times.setdefault((renderer, policy, scene, seed), began)
+    return times
 
 
 def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, JsonObject]:

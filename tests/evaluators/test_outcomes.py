@@ -11,7 +11,8 @@ import pytest
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
-from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.rows import Rollout, rollouts_of_table
+from alpasim_plugin.log.run_folder.writer import rollout_table
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import (
     OUTCOMES,
@@ -22,7 +23,7 @@ from evaluators.metrics.outcomes import (
 )
 from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
-from evaluators.statistics.outcomes import outcome_table, rollouts_of
+from evaluators.statistics.outcomes import outcome_table, times_of
 
 DT_S, V = 0.1, 8.0
 T = np.arange(0.0, 12.0, DT_S)
@@ -199,16 +200,15 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
     broken = manifest("b", "two") | {
         "status": "failed",
         "metrics": {},
-        "error": {"failure_class": "policy", "found": "ValueError"},
+        "error": {"failure_class": "policy", "message": "ValueError"},
     }
     lost = manifest("b", "three") | {
         "status": "failed",
         "metrics": {},
-        "error": {"failure_class": "renderer", "found": "no"},
+        "error": {"failure_class": "renderer", "message": "no"},
     }
-    table = outcome_table(
-        *rollouts_of([manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost])
-    )
+    manifests = [manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost]
+    table = outcome_table(rollouts_of_table(rollout_table(manifests)), times_of(manifests))
     assert table["clean/a"]["endings"] == {"reached the end": 1}
     assert table["clean/b"]["endings"] == {"off-road": 1, "policy fault": 1, "not run": 1}
     (cell,) = table["clean/b"]["outcomes"]["offroad"]["cells"]
