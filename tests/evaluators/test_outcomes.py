@@ -183,7 +183,7 @@ def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest()
 def test_outcomes_are_counted_by_arm_with_place_and_time():
     def manifest(policy, scene, **flags: float):
         metrics = {
-            name: {"value": value, "valid": True}
+            name: {"value": value, "valid": True, "reason": ""}
             for name, value in ({"progress": 1.0} | flags).items()
         }
         events = [{"metric": name, "t_s": 3.1} for name in flags]
@@ -193,6 +193,8 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
             "scene": scene,
             "seed": 0,
             "status": "ok",
+            "path": "",
+            "wall_s": 1.0,
             "metrics": metrics,
             "events": events,
         }
