@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -20,6 +21,7 @@ from jinja2 import (
 from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Series
@@ -28,7 +30,6 @@ from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.numbers import DASH, plural
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
-from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.boundary import boundary_section
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
@@ -43,6 +44,7 @@ from evaluators.report.provenance import (
     provenance,
 )
 from evaluators.report.rollouts import read_series, rollout_block
+from evaluators.viewer.above import still_map
 from evaluators.viewer.worst import worst_change
 
 MAX_SCENE_PLOTS = 24
@@ -51,7 +53,7 @@ LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
 STYLES = ("theme.css", "report.css")
-SCRIPTS = ("theme.js", "report.js", "rollouts.js")
+SCRIPTS = ("theme.js", "report.js", "above.js", "rollouts.js")
 
 
 def write_report(run_dir: Path | str | Run) -> Path:
@@ -184,12 +186,12 @@ def by_interest(run: Run) -> list[str]:
     """
 
     def interest(scene: str) -> tuple[int, float]:
-        rollouts = run.by_scene.get(scene, ())
+        rollouts = run.by_scene[scene]
         events = sum(len(outcomes_of(r)) if has_ended(r) else 1 for r in rollouts)
         far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
         return events, max(far, default=0.0)
 
-    return sorted(run.scenes, key=interest, reverse=True)
+    return sorted(run.by_scene, key=interest, reverse=True)
 
 
 def scene_views(
@@ -197,31 +199,23 @@ def scene_views(
     series: Series,
     interesting: list[str],
     variant_of: Mapping[tuple[str, str], tuple[int, int]],
-) -> tuple[list[SceneView], list[str]]:
+) -> tuple[list[JsonObject], list[str]]:
     """Lay out the most telling scenes within the limits of count and size.
 
     Returns:
-        The drawings (in the order of the run where all are shown at once, else the most telling
+        The maps (in the order of the run where all are shown at once, else the most telling
         first), and the scenes not drawn.
     """
-    drawn: dict[str, SceneView] = {}
+    drawn: dict[str, JsonObject] = {}
     spent = 0
     for scene in interesting:
-        rollouts = run.by_scene.get(scene, ())
-        if not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
-            continue
         content = run.scene_data(scene)
-        if content is None:
+        if content is None or len(content["ego_log"]["x_m"]) < 2:
             continue
+        if len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+            break
         with parsing(run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
-            view = scene_view(scene, content, rollouts, series, variant_of)
-        if view is not None:
-            drawn[scene] = view
-            spent += (
-                len(view.lanes)
-                + len(view.lines)
-                + len(view.edges)
-                + sum(len(t.d) for t in view.tracks)
-            )
+            drawn[scene] = still_map(scene, content, run.by_scene[scene], series, variant_of)
+        spent += len(json.dumps(drawn[scene]))
     order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]

@@ -28,15 +28,6 @@
     });
   }
 
-  // Legend: show or hide one renderer's drives in every map.
-  for (const toggle of all("button[data-variant]")) {
-    toggle.addEventListener("click", () => {
-      const shown = toggle.getAttribute("aria-pressed") !== "true";
-      toggle.setAttribute("aria-pressed", String(shown));
-      document.getElementById("views").classList.toggle("no-variant-" + toggle.dataset.variant, !shown);
-    });
-  }
-
   // A link to a folded part opens it.
   for (const link of all("nav a")) {
     link.addEventListener("click", () => { all(":scope > details", document.querySelector(link.hash)).forEach((fold) => { fold.open = true; }); });
