@@ -133,7 +133,7 @@ class FlipRow:
         time: When the plans diverged, since the first frame.
         gap: How far apart they were then.
         pictures: (side, colour, data address) at that time.
-        why_not: Why there are no pictures.
+        why_not: Why there are no images.
         links: (side, colour, clip, folder).
     """
 
