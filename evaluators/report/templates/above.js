@@ -66,13 +66,14 @@
     const shown = (one) => !hidden.has(String(one.colour % 8));
     for (const track of scene.tracks.filter(shown)) { trace(track.line); stroke(colour("variant-" + (track.colour % 8)), 2, 0.85, DASHES[track.dash % 3]); }
     for (const mark of scene.marks.filter((one) => shown(one) && one.size)) {
-      const own = colour("variant-" + (mark.colour % 8)), r = 6 * px;
+      const own = colour("variant-" + (mark.colour % 8)), r = 4 * px;
       box(mark);
       stroke(own, 1.3);
       context.beginPath();
       if (mark.kind === "collision") context.arc(mark.x, mark.y, r, 0, 7); else context.rect(mark.x - r, mark.y - r, 2 * r, 2 * r);
-      stroke(colour("card"), 5);
-      stroke(own, 2.2);
+      for (const [name, width] of [["ink", 6], ["card", 3.5]]) stroke(colour(name), width);
+      context.fillStyle = own;
+      context.fill();
     }
     const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((one) => one * 100 * scale > canvas.width * 0.08) ?? 1000;
     const long = (metres * 100 * scale) / ratio, bottom = canvas.height / ratio - 8;
