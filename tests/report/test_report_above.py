@@ -86,8 +86,6 @@ def test_a_road_user_is_where_it_is_at_the_first_event_and_leaves_its_way():
     users = [one for one in drawn(rollout, content, own)["users"] if "way" in one]
     place = lead.track.xyz[np.searchsorted(lead.track.t_us, scenario.start_us + 4_000_000), :2]
     origin = [content["ego_log"][axis][0] for axis in ("x_m", "y_m")]
-    away_m = [
-        np.hypot(*([one["x"] / 100, one["y"] / 100] + np.array(origin) - place)) for one in users
-    ]
+    away_m = [np.hypot(*(np.array([one["x"], one["y"]]) / 100 + origin - place)) for one in users]
     assert min(away_m) < 3.0
     assert users[int(np.argmin(away_m))]["size"][1] == round(100 * lead.box.width_m)
