@@ -5,7 +5,7 @@ dash with a reason where missing.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -122,6 +122,17 @@ def duration(seconds: float | None) -> str:
         return f"{short(seconds)}\u00a0s"
     minutes = seconds / 60
     return f"{fixed(minutes, 0)}\u00a0min" if minutes < 120 else f"{fixed(minutes / 60, 1)}\u00a0h"
+
+
+def listed_counts(counts: Mapping[str, int]) -> str:
+    """Name every cause with its count."""
+    return ", ".join(f"{cause} {count}" for cause, count in counts.items())
+
+
+def percents(shares: Sequence[float]) -> str:
+    """Print the ends of a range of shares, once where they are equal."""
+    texts = dict.fromkeys(fixed(100 * share, 1) for share in shares)
+    return f"{' to '.join(texts)}\u00a0%"
 
 
 def plural(n: int, noun: str, many: str = "") -> str:

@@ -22,8 +22,8 @@ from evaluators.numbers import Cell, plural, short
 from evaluators.opening import Run
 from evaluators.report import tables
 from evaluators.report.gate import worst_of, write_gate
+from evaluators.report.html import command_of
 from evaluators.report.overview import overview_of
-from evaluators.report.provenance import provenance
 from evaluators.report.terminal import forest_lines
 from evaluators.statistics.gate import GateVerdict
 
@@ -97,7 +97,7 @@ def write_summary_md(run: Run) -> Path:
             note=". ".join(filter(None, (INTERVAL_NOTE, note))) + ".",
             pair_heads=PAIR_HEADS,
             pairs=pairs,
-            command=_in_block(provenance(run)["command"]),
+            command=_in_block(command_of(run)),
             **_first_screen(run),
         )
     write_text(path, cut(text))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import shlex
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -25,31 +26,23 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Series
-from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
+from alpasim_plugin.log.run_folder.schema import AGAIN, KEYS, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
-from evaluators.numbers import DASH, plural
+from evaluators.numbers import DASH, listed_counts, percents, plural, short
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.boundary import boundary_section
 from evaluators.report.decision import decision_section
-from evaluators.report.fixers import COLUMNS, fixer_rows, speed
+from evaluators.report.fixers import pool_text, refused
 from evaluators.report.flips import colours_of, flip_bases, flip_rows
 from evaluators.report.gate import gate_section
 from evaluators.report.overview import TONES, overview_of
-from evaluators.report.provenance import (
-    LEDGER_COLUMNS,
-    failure_rows,
-    invalid_rows,
-    ledger,
-    provenance,
-)
 from evaluators.report.rollouts import read_series, rollout_block
 from evaluators.viewer.above import still_map
 from evaluators.viewer.worst import worst_change
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
-LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
 STYLES = ("theme.css", "report.css")
@@ -89,8 +82,6 @@ def render_report(run: Run) -> str:
         style=Markup(style),
         script=Markup(script),
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        plural=plural,
-        dash=DASH,
         **context(run),
     )
 
@@ -103,7 +94,7 @@ def environment_of(*packages: str) -> Environment:
     compiled = None
     with suppress(OSError, RuntimeError):
         compiled = FileSystemBytecodeCache()
-    return Environment(
+    environment = Environment(
         loader=ChoiceLoader([PackageLoader(package) for package in packages]),
         bytecode_cache=compiled,
         autoescape=True,
@@ -111,6 +102,9 @@ def environment_of(*packages: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals.update(plural=plural, short=short, dash=DASH)
+    environment.filters.update(listed_counts=listed_counts, percents=percents)
+    return environment
 
 
 def asset(environment: Environment, name: str) -> str:
@@ -129,7 +123,6 @@ def context(run: Run) -> dict[str, Any]:
     views, no_view = scene_views(run, series, looked_at, variant_of)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary, run.table)
-    failures, more_failures = failure_rows(run)
     # every column has the colour of its renderer, or of its policy where there is one renderer
     colours = {}
     for i, variant in enumerate(run.variants):
@@ -137,6 +130,8 @@ def context(run: Run) -> dict[str, Any]:
         colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
+    speeds = [entry.get("stages") or {} for entry in (run.summary.get("speed") or {}).values()]
+    cells = (run.summary.get("failures") or {}).get("cells") or ()
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -158,7 +153,6 @@ def context(run: Run) -> dict[str, Any]:
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
-        "invalid": invalid_rows(run),
         "metric_rows": rows,
         "pair_rows": pairs,
         "coloured": run.policies if by_policy else run.renderers,
@@ -167,17 +161,20 @@ def context(run: Run) -> dict[str, Any]:
         "views": views,
         "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
-        "fixers": fixer_rows(run.summary),
-        "fixer_columns": COLUMNS,
-        "speed": speed(run),
+        "refused": refused,
+        "pool": pool_text(run.summary.get("pool") or {}),
+        "stages": list(dict.fromkeys(name for stages in speeds for name in stages)),
         "every_rollout": rollout_block(run),
-        "failures": failures,
-        "more_failures": more_failures,
-        "ledger": ledger(run, LEDGER_RATES),
-        "ledger_columns": LEDGER_COLUMNS,
-        "ledger_rates": LEDGER_RATES,
-        "provenance": provenance(run),
+        "failed": [rollout for rollout in run.rollouts if not rollout.ok],
+        "hints": {tuple(cell[key] for key in KEYS): cell["error"].get("hint") for cell in cells},
+        "command": command_of(run),
     }
+
+
+def command_of(run: Run) -> str:
+    """Return the command that made a run."""
+    command = run.info.get("command") or ""
+    return command if isinstance(command, str) else shlex.join(map(str, command))
 
 
 def by_interest(run: Run) -> list[str]:

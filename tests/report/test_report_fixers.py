@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from evaluators.numbers import DASH
-from evaluators.report.fixers import COLUMNS, fixer_cautions, fixer_rows
+from evaluators.report.fixers import fixer_cautions
 
 DRAFTED = {
     "label": "onefixer-tiny, untrained (identity)",
@@ -40,19 +39,6 @@ def test_untrained_weights_and_refused_frames_are_cautions():
     assert refused.replace("\u00a0", " ") == (
         "onefixer-s: the fixer failed on 4 frames of 69 (black 1, nan 3); the raw frames were passed on."
     )
-
-
-def test_what_only_drafts_have_is_a_dash_for_whole_blocks():
-    drafted, blocks = fixer_rows(SUMMARY)
-    assert [cell.text.replace("\u00a0", " ") for cell in drafted["cells"][3:]] == [
-        "75.0 %",
-        "2.00",
-        "0.0190 m",
-        "0",
-    ]
-    assert [cell.text for cell in blocks["cells"][3:6]] == [DASH] * 3
-    assert blocks["cells"][6].text == "4"
-    assert len(drafted["cells"]) == len(COLUMNS)
 
 
 def test_a_frame_that_the_render_itself_had_black_is_not_the_fixers_failure():

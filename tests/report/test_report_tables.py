@@ -6,8 +6,8 @@ from typing import Any
 
 from evaluators.numbers import DASH
 from evaluators.opening import read_run
-from evaluators.report.fixers import speed
-from evaluators.report.provenance import ledger
+from evaluators.report.fixers import pool_text
+from evaluators.report.html import render_report
 from evaluators.report.tables import metric_rows, pair_rows
 from evaluators.report.terminal import metric_lines
 
@@ -86,20 +86,17 @@ def test_pair_without_shared_cells_keeps_its_reason():
     assert row.verdict == "undecided"
 
 
-def test_speed_keeps_stages_that_only_some_renderers_have(usual_run):
+def test_speed_and_what_numbers_leave_out_are_on_the_page(usual_run):
     run = read_run(usual_run)
-    table = speed(run)
-    assert table.stages == ("render", "policy", "log", "control", "actors")
-    assert table.pool.startswith(
+    assert pool_text(run.summary["pool"]).startswith(
         "2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total"
     )
-
-
-def test_ledger_bounds_cover_what_failed(usual_run):
-    rows = {row["renderer"]: row for row in ledger(read_run(usual_run), ("offroad",))}
-    assert rows["clean/lane-camera"]["bounds"][0].text == "0.0\u00a0%"
-    assert rows["onefixer/lane-camera"]["bounds"][0].text == "0.0 to 8.3\u00a0%"
-    assert rows["3dgs/lane-camera"]["counts"][1].detail == "renderer 1"
+    page = render_report(run)
+    stages = re.findall(r'<tr><th scope="row">(\w+)</th>', page[page.index('id="table-stages"') :])
+    assert stages[:5] == ["render", "policy", "log", "control", "actors"]
+    ledger = page[page.index('id="table-ledger"') : page.index('id="provenance"')]
+    assert "0.0 to 8.3\u00a0%" in ledger
+    assert '<span class="detail">renderer 1</span>' in ledger
 
 
 def test_the_terminal_prints_means_intervals_and_counts_and_breaks_no_name(

@@ -135,7 +135,7 @@ def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_r
     assert "was driven until it was decided" in said.err
     page = render_report(read_run(decided_run[0]))
     assert 'id="decision"' in page
-    assert page.count("<svg") >= 2
+    assert 'class="chart"' in page
 
 
 def test_a_damaged_record_is_refused(decided_run, tmp_path):
