@@ -148,24 +148,21 @@ def _boxes(
     path's own direction.
     """
     s, left, _ = frame.place(at)
-    piece = np.floor(s / PIECE_M).astype(np.int64)
-    label = np.zeros(len(cells), dtype=np.int64)
-    for number in np.unique(piece):
-        mine = piece == number
-        grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
-        grid[cells[mine, 0], cells[mine, 1]] = True
-        label[mine] = scipy.ndimage.label(grid, structure=np.ones((3, 3)))[0][
-            cells[mine, 0], cells[mine, 1]
-        ]
+    group = np.stack([np.floor(s / PIECE_M), left > 0], axis=1)
+    pairs = scipy.spatial.KDTree(cells).query_pairs(1.5, output_type="ndarray")
+    pairs = pairs[(group[pairs[:, 0]] == group[pairs[:, 1]]).all(axis=1)]
+    near = scipy.sparse.coo_matrix(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells))
+    )
+    count, label = scipy.sparse.csgraph.connected_components(near, directed=False)
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
     out: list[Obstacle] = []
-    for one in np.unique(np.stack([label, piece, left > 0], axis=1).astype(np.int64), axis=0):
-        mine = (label == one[0]) & (piece == one[1]) & ((left > 0) == bool(one[2]))
+    for number in range(count):
+        mine = label == number
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))
         along = frame.along[k]
         across = np.array([-along[1], along[0]])
         u, v = at[mine] @ along, at[mine] @ across
-        half = CELL_M / 2
         middle = along * (u.max() + u.min()) / 2 + across * (v.max() + v.min()) / 2
         top = float(tops[mine].max())
         base = float(height_at(ground, middle[None])[0])
@@ -174,15 +171,9 @@ def _boxes(
             close = tree.query_ball_point(middle, NEAR_M + float(np.ptp(v)) / 2)
             spread = float(np.median(points.spread[close])) if close else UNSEEN_M
         uncertainty = round(float(np.hypot(CELL_M / 2, spread)), 2)
-        box = Box(float(np.ptp(u)) + 2 * half, float(np.ptp(v)) + 2 * half, top)
+        box = Box(float(np.ptp(u)) + CELL_M, float(np.ptp(v)) + CELL_M, top)
         name = f"{STANDING_ID}{len(out) + 1:03d}-within-{uncertainty:g}m"
-        out.append(
-            Obstacle(
-                name,
-                box,
-                np.array([*middle, base + top / 2]),
-                float(np.arctan2(along[1], along[0])),
-                uncertainty,
-            )
-        )
+        heading_rad = float(np.arctan2(along[1], along[0]))
+        xyz = np.array([*middle, base + top / 2])
+        out.append(Obstacle(name, box, xyz, heading_rad, uncertainty))
     return out

@@ -78,13 +78,10 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     """Place tracks, and return the points that at least three views place alike, with how well each
     is known.
     """
-    if not tracks.count:
-        return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     cameras = [view.camera for view in views]
-    first = place(tracks, cameras)
-    tracks = tracks.only(
-        np.asarray(first.error_px < 3 * ERROR_PX)
-    )  # observations that do not fit are left out once
+    if tracks.count:  # observations that do not fit are left out once
+        error_px = place(tracks, cameras).error_px
+        tracks = tracks.only(np.asarray(error_px < 3 * ERROR_PX))
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     found = place(tracks, cameras)
@@ -254,16 +251,9 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
         warped = cv2.warpPerspective(
             shown, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
-        inside = cv2.warpPerspective(
-            np.full_like(shown, 255),
-            H,
-            (camera.width, camera.height),
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        )
         moved, good = _flow(image, np.asarray(warped, dtype=np.uint8), at)
-        cells = np.clip(np.rint(moved), 0, [camera.width - 1, camera.height - 1]).astype(np.int64)
-        good &= inside[cells[:, 1], cells[:, 0]] > 0
         there = cv2.perspectiveTransform(moved[:, None].astype(np.float64), H).reshape(-1, 2)
+        good &= ((there >= 0) & (there < [other.width, other.height])).all(axis=1)
         which = np.nonzero(good)[0]
         rows.append(_rows(which, j, there[which]))
     found = np.concatenate(rows)
@@ -276,13 +266,13 @@ def _rows(track: I64, view: int, at: F64) -> F64:
 
 def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
     """Return where points moved to, and which came back to where they were."""
-    options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": 2}
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        image, warped, at, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-    )  # type: ignore[call-overload]
-    back, again, _ = cv2.calcOpticalFlowPyrLK(
-        warped, image, moved, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-    )  # type: ignore[call-overload]
+    options = {
+        "winSize": (WINDOW_PX, WINDOW_PX),
+        "maxLevel": 2,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, at, at.copy(), **options)  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(warped, image, moved, at.copy(), **options)  # type: ignore[call-overload]
     good = (found.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - at, axis=1) < BACK_PX)
     return moved, good & (np.linalg.norm(moved - at, axis=1) < MOST_PX)
 

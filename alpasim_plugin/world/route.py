@@ -73,9 +73,8 @@ class LaneIndex:
     def containing_many(self, xy: F64) -> list[tuple[str, ...]]:
         """Return `containing` for each of ``(N, 2+)`` points at once."""
         points = shapely.points(np.ascontiguousarray(xy[:, :2]))
-        which, lane = self._tree.query(points, predicate="intersects")
         found: list[list[int]] = [[] for _ in range(len(xy))]
-        for i, j in zip(which.tolist(), lane.tolist(), strict=True):
+        for i, j in self._tree.query(points, predicate="intersects").T.tolist():
             found[i].append(j)
         return [tuple(self.ids[j] for j in sorted(js)) for js in found]
 
@@ -227,17 +226,12 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     Samples in no lane's reach name no lane.
     """
     total = float(arc_lengths(path)[-1])
-    at = (
-        np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
-        if total > 0
-        else np.zeros(1)
-    )
+    at = np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
     points, headings = path[:1], np.array([first_heading_rad])
     if total > 0:
         points = resample(path, at)
-        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - resample(
-            path, np.maximum(at - SAMPLE_M / 2, 0.0)
-        )
+        before = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
+        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - before
         headings = np.arctan2(ahead[:, 1], ahead[:, 0])
     inside = index.containing_many(points)
     layers: list[dict[str, tuple[float, str | None]]] = []
