@@ -29,6 +29,9 @@ from alpasim_plugin.world.idm import (
     Bodies,
     IdmParams,
     Leader,
+    allowed_speeds,
+    at_place,
+    bend_speeds,
     bodies_from,
     concatenate,
     find_leader,
@@ -38,7 +41,7 @@ from alpasim_plugin.world.idm import (
     spans,
 )
 from alpasim_plugin.world.path import Lines, Path
-from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
+from alpasim_plugin.world.signals import LightAhead, give_way_gap_m, lights_on, red_gap_m
 from scenarios.ego_path import track_on_path
 from scenarios.schema import EgoSpec
 
@@ -55,7 +58,6 @@ MAX_ACCEL_MPS2 = 2.0
 MAX_BRAKE_MPS2 = 7.0
 MAX_JERK_MPS3 = 10.0
 STOP_JERK_MPS3 = 5.0
-COMFORT_BRAKE_MPS2 = 1.5
 MIN_GAP_M = 2.5
 
 
@@ -197,6 +199,8 @@ def drive(
     followers: Sequence[Follower],
     end_us: int,
     signals: Sequence[Signal] | None = None,
+    give_way: Sequence[Signal] = (),
+    posted_mps: F64 | None = None,
 ) -> tuple[Trajectory, tuple[Actor, ...]]:
     """Drive from time 0 to ``end_us``, or to the end of the path.
 
@@ -209,13 +213,20 @@ def drive(
         followers: Drivers that react to the ego and to each other.
         end_us: Last time.
         signals: Traffic lights, at which all stop.
+        give_way: Lines at which all let others pass.
+        posted_mps: Speed limit at each vertex of the path.
 
     Returns:
         The ego's log (rig poses), and the followers as they drove.
     """
     table = ScriptedTracks(scripts, end_us)
-    expert = _Expert(path, s0_m, vehicle, ego, table, lights_on(path, signals))
-    cars = [_Car(follower, lights_on(follower.path, signals)) for follower in followers]
+    expert = _Expert(
+        path, s0_m, vehicle, ego, table,
+        lights_on(path, signals), lights_on(path, give_way), posted_mps,
+    )  # fmt: skip
+    cars = [
+        _Car(one, lights_on(one.path, signals), lights_on(one.path, give_way)) for one in followers
+    ]
     lines = Lines([car.f.path for car in cars]) if cars else None
     half_widths = np.array([car.f.box.width_m / 2 for car in cars])
     log_s, log_t = [expert.s], [0]
@@ -234,8 +245,8 @@ def drive(
             leaders = find_leaders(
                 lines, np.arange(len(cars)), fronts, half_widths, everybody, horizons, own_row
             )
-            for car, leader in zip(cars, leaders, strict=True):
-                car.decide(leader, t)
+            for car, leader, own in zip(cars, leaders, own_row.tolist(), strict=True):
+                car.decide(leader, everybody, own, t)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)
@@ -252,17 +263,6 @@ def drive(
     return ego_log, tuple(car.driven(times) for car in cars)
 
 
-def speed_limits(path: Path, cruise_mps: float, max_lateral_accel_mps2: float) -> F64:
-    """Return the speed ``(N,)`` that bends allow, reachable with a comfortable brake from
-    everywhere before them.
-    """
-    k = np.abs(path.curvature)
-    v2 = np.minimum(cruise_mps**2, max_lateral_accel_mps2 / np.maximum(k, 1e-6))
-    # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
-    rising = v2 + 2 * COMFORT_BRAKE_MPS2 * path.s
-    return np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
-
-
 class _Expert:
     """The ego while it drives."""
 
@@ -274,10 +274,14 @@ class _Expert:
         ego: EgoSpec,
         table: ScriptedTracks,
         lights: Sequence[LightAhead],
+        give_way: Sequence[LightAhead],
+        posted_mps: F64 | None,
     ) -> None:
         self.path, self.vehicle, self.table, self.lights = path, vehicle, table, lights
+        self.give_way = give_way
         self.line = Lines([path])
-        self.limit = speed_limits(path, ego.cruise_mps, ego.max_lateral_accel_mps2)
+        most_mps = np.minimum(ego.cruise_mps, np.inf if posted_mps is None else posted_mps)
+        self.limit = allowed_speeds(path, most_mps, ego.max_lateral_accel_mps2)
         self.s, self.a, self.cap = s0_m, 0.0, float("inf")
         self.v = min(ego.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
         self.params = IdmParams(
@@ -310,7 +314,10 @@ class _Expert:
                 closing = self.v - leader.speed_mps
                 accel = idm_acceleration(self.v, leader.gap_m, closing, self.params)
                 wanted = min(wanted, accel)
-        red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
+        red_m = min(
+            red_gap_m(self.lights, self.front_s, self.v, t_us),
+            give_way_gap_m(self.give_way, self.path, self.front_s, others, -1),
+        )
         if red_m < np.inf:
             wanted = min(wanted, idm_acceleration(self.v, red_m, self.v, self.params))
         if t_us % LOOKAHEAD_US == 0:
@@ -331,22 +338,29 @@ class _Expert:
 class _Car:
     """A follower while it drives."""
 
-    def __init__(self, f: Follower, lights: Sequence[LightAhead]) -> None:
+    def __init__(
+        self, f: Follower, lights: Sequence[LightAhead], give_way: Sequence[LightAhead]
+    ) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
         self.params = IdmParams(**f.params)
-        self.lights = lights
+        self.lights, self.give_way = lights, give_way
+        self.wanted_mps = bend_speeds(f.path, self.params)
         self.log_s = [self.s]
 
     @property
     def front_s(self) -> float:
         return self.s + self.f.box.length_m / 2
 
-    def decide(self, leader: Leader, t_us: int) -> None:
+    def decide(self, leader: Leader, bodies: Bodies, own: int, t_us: int) -> None:
         closing = self.v - leader.speed_mps
-        red_m = red_gap_m(self.lights, self.front_s, self.v, t_us)
+        stop_m = min(
+            red_gap_m(self.lights, self.front_s, self.v, t_us),
+            give_way_gap_m(self.give_way, self.f.path, self.front_s, bodies, own),
+        )
+        params = at_place(self.params, self.f.path, self.wanted_mps, self.s)
         self.a = min(
-            idm_acceleration(self.v, leader.gap_m, closing, self.params),
-            idm_acceleration(self.v, red_m, self.v, self.params),
+            idm_acceleration(self.v, leader.gap_m, closing, params),
+            idm_acceleration(self.v, stop_m, self.v, params),
         )
 
     def advance(self, dt_s: float) -> None:

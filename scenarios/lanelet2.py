@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -245,7 +245,6 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         there = {name: s_m, f"-{name}": lengths[name] - s_m}
         return [Spot(key, at_m) for key, at_m in there.items() if key in lanes]
 
-    heads = _heads(osm, lanes)
     notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     if unread:
         notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
@@ -260,7 +259,8 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
             poles=_posts(osm),
             signs=tuple(_sign(osm, way) for way in osm.ways("traffic_sign")),
         ),
-        heads,
+        _heads(osm, lanes),
+        _give_way(osm, lanes),
         lengths,
         spots,
         osm.origin,
@@ -391,17 +391,9 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
             if osm.rules[ref].tags.get("subtype") == "traffic_light":
                 line = next(iter(osm.rules[ref].of("ref_line", "way")), f"end of {key}")
                 held.setdefault((line, ref), []).append(key)
-    signals = []
-    for (line, ref), keys in held.items():
-        lane = lanes[keys[0]]
-        assert lane.left is not None
-        assert lane.right is not None
-        ends = np.stack([lane.left[-1], lane.right[-1]])
-        if line in osm.items["way"]:
-            ends = osm.line(osm.nodes(line))[[0, -1]]
-        along = lane.centre[-1, :2] - lane.centre[-2, :2]
-        heading_rad = float(np.arctan2(along[1], along[0]))
-        signals.append(Signal(ends, heading_rad, (), 0, ref, tuple(keys)))
+    signals = [
+        _stop(osm, line, ref, [lanes[key] for key in keys]) for (line, ref), keys in held.items()
+    ]
     if not signals:
         return ()
     middles = np.array([signal.stop.mean(axis=0)[:2] for signal in signals])
@@ -411,6 +403,30 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
         Head(signal, str(number), line, line)
         for signal, number, (line, _) in zip(signals, junction, held, strict=True)
     )
+
+
+def _give_way(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Signal, ...]:
+    """Return the lines at which lanelets give way, where no traffic light goes before the rule."""
+    found = []
+    for ref, rule in osm.rules.items():
+        if rule.tags.get("subtype") == "right_of_way" and rule.tags.get("fallback") != "yes":
+            line = next(iter(rule.of("ref_line", "way")), "")
+            keys = [key for key in rule.of("yield", "relation") if key in lanes]
+            found += [_stop(osm, line, ref, [lanes[key]]) for key in keys]
+    return tuple(found)
+
+
+def _stop(osm: Osm, line: str, name: str, lanes: Sequence[Lane]) -> Signal:
+    """Return the line at which lanelets wait: a way, or the end of the first one."""
+    first = lanes[0]
+    assert first.left is not None
+    assert first.right is not None
+    ends = np.stack([first.left[-1], first.right[-1]])
+    if line in osm.items["way"]:
+        ends = osm.line(osm.nodes(line))[[0, -1]]
+    along = first.centre[-1, :2] - first.centre[-2, :2]
+    heading_rad = float(np.arctan2(along[1], along[0]))
+    return Signal(ends, heading_rad, (), 0, name, tuple(lane.lane_id for lane in lanes))
 
 
 def _posts(osm: Osm) -> tuple[F64, ...]:

@@ -20,10 +20,12 @@ from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
+from scenarios.ego_path import grid
 from scenarios.expert import drive
 from scenarios.map_lines import bordered, ground_of
 from scenarios.map_route import LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
+from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
 from scenarios.street_map import CYCLE, GREEN_S, Head, StreetMap, with_cycles
@@ -71,16 +73,40 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         head for head in street.heads if any(key in lane_map.lanes for key in head.signal.lanes)
     ]
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-    lane_map = replace(lane_map, signals=_timed(heads, line, front_m, spec.ego.cruise_mps))
+    lane_map = replace(
+        lane_map,
+        signals=_timed(heads, line, front_m, spec.ego.cruise_mps),
+        give_way=tuple(
+            one for one in street.give_way if any(key in lane_map.lanes for key in one.lanes)
+        ),
+    )
     driven = _until(line, goal_m + front_m + 1.0)
     duration_us = spec.timing.duration_us
     end_us = round(LONGEST_S * 1e6)
     if duration_us is not None:
         end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
     rng = stream(drawn.scene_id, spec.seed, "scenario/map/vehicles")
-    followers = place_followers(LaneGraph(lane_map.lanes), way, line, spec.map.vehicles, rng)
+    followers = place_followers(lane_map, way, line, spec.map.vehicles, rng)
+    walkers = place_walkers(
+        lane_map,
+        driven,
+        front_m,
+        spec.ego.cruise_mps,
+        spec.map.pedestrians,
+        grid(end_us),
+        stream(drawn.scene_id, spec.seed, "scenario/map/pedestrians"),
+    )
     ego_log, vehicles = drive(
-        driven, 0.0, vehicle, spec.ego, (), followers, end_us, lane_map.signals
+        driven,
+        0.0,
+        vehicle,
+        spec.ego,
+        walkers,
+        followers,
+        end_us,
+        lane_map.signals,
+        lane_map.give_way,
+        graph.limits_mps(way, driven),
     )
     return RecordedLog(
         drawn.scene_id,
@@ -89,7 +115,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         ground_of(lane_map, ego_log.xyz),
         ego_log,
         vehicle,
-        vehicles,
+        (*vehicles, *walkers),
         (),
         street.origin,
         files.content_hash,

@@ -152,6 +152,17 @@ class LaneGraph:
             parts.append(end)
         return smooth_path(np.concatenate(parts))
 
+    def limits_mps(self, way: Way, line: Path) -> F64:
+        """Return the speed limit at each vertex of a way's line; infinite where none is known."""
+        after = (*way.lane_ids[1:], "")
+        lengths = [  # a lane that one changes from lies beside the next one
+            0.0 if then in self.beside(key) else self.length_m[key]
+            for key, then in zip(way.lane_ids, after, strict=True)
+        ]
+        ends_m = np.cumsum(lengths) - way.start_m
+        limits = [self.lanes[key].speed_limit_mps or np.inf for key in way.lane_ids]
+        return np.array(limits)[np.searchsorted(ends_m[:-1], line.s)]
+
     def _abreast(self, lane_id: str, other: str, at_m: float) -> float:
         """Return the arc length on a neighbour beside a place on a lane."""
         return at_m / self.length_m[lane_id] * self.length_m[other]

@@ -1,19 +1,22 @@
 """Vehicles on the lanes of a map around a route. They follow their lanes with the Intelligent Driver
-Model and stop at red lights.
+Model, stop at red lights and give way at lines for it.
 
-Nobody here gives way at a junction. So no vehicle is placed whose way would cross or join the ego's,
-or that of another vehicle; those who start behind one another share their way.
+Where two ways cross or join, a rule decides who goes first: lights that are never open for both, or
+a line to give way on one of them. Without a rule the vehicle is not placed; those who start behind
+one another share their way.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-import shapely
+import scipy
 
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import LaneMap
+from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.signals import LightAhead, lights_on
 from scenarios.expert import Follower
 from scenarios.map_route import LaneGraph, Way
 from scenarios.traffic import SIZES
@@ -22,56 +25,107 @@ WAY_M = 300.0  # a vehicle is placed with the lanes that it will drive along
 SHORTEST_WAY_M = 60.0
 ROOM_M = 20.0  # between two vehicles at the start
 CLOSE_M = 2.0  # lines nearer than this meet
+HEAD_ON = -0.5  # cosine between two ways, below which they run against each other
+EVERY = 4  # vertex of a line, a metre apart, is looked at
+RULED_M = 60.0  # a rule is looked for so far before the place where they do
 SPEED_MPS = (7.0, 11.0)
-BEND_MPS2 = 3.0  # lateral acceleration in the sharpest bend of its way
+SLOWEST_MPS = 3.0  # whatever limits say
+BEND_MPS2 = 3.0  # lateral acceleration in bends
 TRIES = 8  # for each vehicle
 
 
+@dataclass(frozen=True)
+class _Drawn:
+    """A vehicle's way, and the lines at which it waits."""
+
+    way: Way
+    path: Path
+    lights: tuple[LightAhead, ...]
+    give_way: tuple[LightAhead, ...]
+
+
 def place_followers(
-    graph: LaneGraph, way: Way, line: Path, count: int, rng: np.random.Generator
+    lane_map: LaneMap, way: Way, line: Path, count: int, rng: np.random.Generator
 ) -> list[Follower]:
-    """Return up to ``count`` vehicles on the lanes of ``graph``, as many as find room.
+    """Return up to ``count`` vehicles on the lanes near a route, as many as find room.
 
     Args:
-        graph: Lanes near the route.
+        lane_map: Map around the route.
         way: The ego's way.
         line: Its line.
         count: Wanted vehicles.
         rng: Where and how fast they start.
     """
+    graph = LaneGraph(lane_map.lanes)
+
+    def drawn(of_way: Way, path: Path) -> _Drawn:
+        lights = lights_on(path, lane_map.signals)
+        return _Drawn(of_way, path, lights, lights_on(path, lane_map.give_way))
+
     followers: list[Follower] = []
-    taken: list[tuple[Way, Any, F64]] = [(way, _shape(line), line.xyz[0, :2])]
+    taken = [drawn(way, line)]
     for _ in range(TRIES * count):
         if len(followers) == count:
             break
         spot = graph.drawn_spot(rng)
-        speed_mps = float(rng.uniform(*SPEED_MPS))
+        wanted_mps = float(rng.uniform(*SPEED_MPS))
         start = Way((spot.lane_id,), spot.at_m, graph.length_m[spot.lane_id] - spot.at_m)
-        own = graph.carried_on(start, WAY_M)
-        if own.beyond_m < SHORTEST_WAY_M:
+        own_way = graph.carried_on(start, WAY_M)
+        if own_way.beyond_m < SHORTEST_WAY_M:
             continue
-        path = graph.line(own)
-        shape, place = _shape(path), path.xyz[0, :2]
-        if any(
-            np.hypot(*(place - there)) < ROOM_M or _meet(own, shape, other, drawn)
-            for other, drawn, there in taken
-        ):
+        own = drawn(own_way, graph.line(own_way))
+        if any(_too_close(own, other) or not _is_ruled(own, other) for other in taken):
             continue
-        taken.append((own, shape, place))
-        sharpest = max(float(np.abs(path.curvature).max()), 1e-6)
-        speed_mps = min(speed_mps, float(np.sqrt(BEND_MPS2 / sharpest)))
-        params = {"desired_speed_mps": speed_mps}
+        taken.append(own)
+        posted_mps = max(float(graph.limits_mps(own_way, own.path).min()), SLOWEST_MPS)
+        wanted_mps = min(wanted_mps, posted_mps)
+        params = {"desired_speed_mps": wanted_mps, "lateral_accel_mps2": BEND_MPS2}
+        begin_mps = float(allowed_speeds(own.path, wanted_mps, BEND_MPS2)[0])
         name = f"car-{len(followers)}"
-        followers.append(Follower(name, "car", path, 0.0, speed_mps, SIZES["car"], params))
+        followers.append(Follower(name, "car", own.path, 0.0, begin_mps, SIZES["car"], params))
     return followers
 
 
-def _shape(path: Path) -> Any:
-    return shapely.linestrings(path.xyz[::8, :2])
+def _too_close(one: _Drawn, other: _Drawn) -> bool:
+    return float(np.hypot(*(one.path.xyz[0] - other.path.xyz[0])[:2])) < ROOM_M
 
 
-def _meet(one: Way, one_shape: Any, other: Way, other_shape: Any) -> bool:
-    """Return whether two ways cross or join; from one lane on, they follow each other."""
-    if one.lane_ids[0] in other.lane_ids or other.lane_ids[0] in one.lane_ids:
+def _is_ruled(one: _Drawn, other: _Drawn) -> bool:
+    """Return whether it is clear who goes first where two ways cross or join; from one lane on,
+    they follow each other. Nobody drives against another one on one lane.
+    """
+    tree = scipy.spatial.KDTree(other.path.xyz[::EVERY, :2])
+    apart_m, row = tree.query(one.path.xyz[::EVERY, :2])
+    close = np.flatnonzero(apart_m < CLOSE_M)
+    if not len(close):
+        return True
+    turned_rad = one.path.yaw[::EVERY][close] - other.path.yaw[::EVERY][row[close]]
+    if np.cos(turned_rad).min() < HEAD_ON:
         return False
-    return bool(shapely.dwithin(one_shape, other_shape, CLOSE_M))
+    if one.way.lane_ids[0] in other.way.lane_ids or other.way.lane_ids[0] in one.way.lane_ids:
+        return True
+    meets = [
+        (one, one.path.s[EVERY * close[0]]),
+        (other, other.path.s[EVERY * row[close].min()]),
+    ]
+    gives = [_before(drawn.give_way, s_m) is not None for drawn, s_m in meets]
+    lights = [_before(drawn.lights, s_m) for drawn, s_m in meets]
+    first, second = lights
+    if first is not None and second is not None:
+        return not _both_open(first, second)
+    return sum(gives) == 1 and first is None and second is None
+
+
+def _before(lines: tuple[LightAhead, ...], s_m: float) -> LightAhead | None:
+    """Return the last line before a place."""
+    found = [line for line in lines if 0.0 <= s_m - line.s_m <= RULED_M]
+    return found[-1] if found else None
+
+
+def _both_open(one: LightAhead, other: LightAhead) -> bool:
+    """Return whether two lights are not red at one time."""
+    cycle_us = sum(lasts_us for _, lasts_us in one.signal.phases)
+    return any(
+        "red" not in (one.signal.colour_at(t_us), other.signal.colour_at(t_us))
+        for t_us in range(0, cycle_us, 500_000)
+    )

@@ -45,7 +45,7 @@ from scenarios.opendrive_road import (
     reference_line,
     road_points,
 )
-from scenarios.opendrive_signals import roadside, traffic_lights
+from scenarios.opendrive_signals import give_way_lines, roadside, traffic_lights
 from scenarios.recorded import SourceFiles
 from scenarios.street_map import StreetMap
 
@@ -335,6 +335,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         lanes,
         roadside(odr, lanes, T_local_map),
         heads,
+        give_way_lines(odr, lanes, T_local_map),
         {name: road.length_m for name, road in roads.items()},
         spots,
         origin,
@@ -415,6 +416,7 @@ def _section(
                 left_paint=paints[0],
                 right_paint=paints[1],
                 is_intersection=road.junction != "-1",
+                speed_limit_mps=road.limit_mps(section.s_m),
             )
         )
     return out

@@ -21,7 +21,7 @@ from numpy.polynomial import Polynomial
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points
-from alpasim_plugin.core.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
+from alpasim_plugin.core.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64
 
@@ -34,6 +34,7 @@ KNOWN = {"header", "road", "junction", "controller", "junctionGroup", "station",
 JUNCTIONS = ("default", "direct", "")
 STOP_LINE, CROSSWALK = "294", "1000003"  # catalogue numbers of marks on the road
 CROSSWALK_M = 4.0
+UNITS_MPS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 JOIN_M = 0.01  # records of a reference line that lie farther apart do not join
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
@@ -230,6 +231,11 @@ class Road:
     predecessor: RoadLink | None
     signals: tuple[RoadSignal, ...] = ()
     crosswalks: tuple[F64, ...] = ()  # rings (N, 2) of s and t
+    limits: tuple[tuple[float, float | None], ...] = ()  # from a place on: speed limit in m/s
+
+    def limit_mps(self, s_m: float) -> float | None:
+        """Return the speed limit at a place."""
+        return next((mps for start_m, mps in self.limits[::-1] if start_m <= s_m), None)
 
 
 @dataclass(frozen=True)
@@ -360,6 +366,7 @@ def _road(
     starts = [_number(one, "s", 0.0) for one in sections]
     if starts and not (starts[0] >= 0 and starts[-1] <= road_m):
         raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
+    types = sorted(element.findall("type"), key=lambda one: _number(one, "s", 0.0))
     records = [_geometry(one, where, road_m) for one in element.findall("planView/geometry")]
     return Road(
         str(element.get("id")),
@@ -378,7 +385,17 @@ def _road(
         _link(element, "predecessor"),
         tuple(signals),
         tuple(rings),
+        tuple((_number(one, "s", 0.0), _limit_mps(one.find("speed"))) for one in types),
     )
+
+
+def _limit_mps(speed: Element | None) -> float | None:
+    text = "" if speed is None else speed.get("max", "")
+    if speed is None or text in ("", "no limit", "undefined"):
+        return None
+    value = float(text) * UNITS_MPS[speed.get("unit", "m/s")]
+    LIMIT_MPS.check(value, "speed", "max")
+    return value
 
 
 def _geometry(record: Element, where: str, road_m: float) -> Geometry:

@@ -28,6 +28,7 @@ from scenarios.opendrive_road import (
 from scenarios.street_map import Head
 
 PEDESTRIAN_LIGHT = "1000002"
+GIVE_WAY = ("205", "206")  # give way; stop
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
 LOWEST_HEAD_M = 3.0  # of the middle of the lamps above the road, where the map has them lower
 PLATE_M = 0.1  # what is lower than this is painted on the road
@@ -82,6 +83,17 @@ def traffic_lights(
             loose += [] if found else [one.signal_id]
     notes = [f"{len(loose)} traffic lights hold back no lane: {', '.join(loose)}"] if loose else []
     return tuple(heads), tuple(notes)
+
+
+def give_way_lines(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> tuple[Signal, ...]:
+    """Return the lines of signs to give way, of traffic before a junction."""
+    return tuple(
+        head.signal
+        for road in _roads(odr, lanes)
+        for one in road.signals
+        if one.kind in GIVE_WAY
+        for head in _heads(road, one, odr.controllers, lanes, T_local_map)
+    )
 
 
 def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:

@@ -235,6 +235,7 @@ class MapSpec(Part):
         Discriminator(lambda given: "(drawn)" if isinstance(given, str) else "(named)"),
     ] = field("Where to drive; random: drawn by the scene seed.", "random")
     vehicles: int = number(0, 100, "Vehicles near the route, which react (IDM).", 6)
+    pedestrians: int = number(0, 100, "Pedestrians on crosswalks of the route.", 2)
 
     @model_validator(mode="after")
     def _one(self) -> MapSpec:

@@ -39,6 +39,7 @@ class StreetMap:
         lanes: Linked lanes.
         beside: Without lanes: crosswalks, stop lines, signs and posts.
         heads: Traffic lights.
+        give_way: Lines at which one lets others pass.
         roads: Name of a road to its length in metres.
         spots: Places on lanes at a number of metres along a road.
         origin: What was subtracted from the file's coordinates.
@@ -48,6 +49,7 @@ class StreetMap:
     lanes: Mapping[str, Lane]
     beside: LaneMap
     heads: tuple[Head, ...]
+    give_way: tuple[Signal, ...]
     roads: Mapping[str, float]
     spots: Callable[[str, float], list[Spot]]
     origin: tuple[float, float, float]

@@ -120,6 +120,7 @@ class LaneMap:
     signals: tuple[Signal, ...] | None = (
         None  # traffic lights with their states; None: not known, also where there is none
     )
+    give_way: tuple[Signal, ...] = ()  # lines without phases, at which one lets others pass
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from alpasim_plugin.core.types import (
     HeightField,
     LaneMap,
     Scenario,
-    Signal,
     Vehicle,
 )
 from alpasim_plugin.world.ground import ground_pose
@@ -29,6 +28,8 @@ from alpasim_plugin.world.idm import (
     Bodies,
     IdmParams,
     Leader,
+    at_place,
+    bend_speeds,
     bodies_from,
     concatenate,
     find_leaders,
@@ -38,7 +39,7 @@ from alpasim_plugin.world.idm import (
 )
 from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep, thinned
 from alpasim_plugin.world.route import LaneIndex
-from alpasim_plugin.world.signals import lights_on, red_gap_m
+from alpasim_plugin.world.signals import LightAhead, give_way_gap_m, lights_on, red_gap_m
 from alpasim_plugin.world.walkers import Walker
 
 MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
@@ -76,8 +77,7 @@ class Actors:
         self.vehicle, self.closed_us = vehicle, closed_us
         reactive = [actor for actor in actors if actor.behaviour.kind in DRIVING]
         index = LaneIndex(lane_map) if lane_map is not None and reactive else None
-        signals = lane_map.signals if lane_map is not None else None
-        self.drivers = [_Driver(actor, index, ground, signals) for actor in reactive]
+        self.drivers = [_Driver(actor, index, ground, lane_map) for actor in reactive]
         for number, driver in enumerate(d for d in self.drivers if d.path is not None):
             driver.line = number
         paths = [driver.path for driver in self.drivers if driver.path is not None]
@@ -169,8 +169,9 @@ class Actors:
                 np.array([driver.horizon_m(motion) for driver, motion in driving]),
                 np.arange(len(others.xy), len(everybody.xy)),
             )
-            for (driver, motion), leader in zip(driving, leaders, strict=True):
-                accel_mps2 = driver.accel_mps2(motion, leader, everybody, to_us)
+            own = len(others.xy)
+            for row, ((driver, motion), leader) in enumerate(zip(driving, leaders, strict=True)):
+                accel_mps2 = driver.accel_mps2(motion, leader, everybody, own + row, to_us)
                 driver.move(motion, accel_mps2, dt_s)
 
 
@@ -274,13 +275,19 @@ class _Driver:
         actor: Actor,
         index: LaneIndex | None,
         ground: HeightField | None,
-        signals: Sequence[Signal] | None,
+        lane_map: LaneMap | None,
     ) -> None:
         self.actor, self.ground = actor, ground
         self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
         self.params = IdmParams(**({} if self.act else actor.behaviour.params))
         self.path = _driving_line(actor, index)
-        self.lights = () if self.path is None else lights_on(self.path, signals)
+        self.lights: tuple[LightAhead, ...] = ()
+        self.give_way: tuple[LightAhead, ...] = ()
+        self.wanted_mps: F64 | None = None
+        if self.path is not None and lane_map is not None:
+            self.lights = lights_on(self.path, lane_map.signals)
+            self.give_way = lights_on(self.path, lane_map.give_way)
+            self.wanted_mps = bend_speeds(self.path, self.params)
         self.line = -1
         self.motion: _Motion | None = None
         self.present = True
@@ -306,18 +313,25 @@ class _Driver:
         """
         return 20.0 + 2.0 * wanted_gap_m(motion.speed_mps, motion.speed_mps, self.params)
 
-    def accel_mps2(self, motion: _Motion, leader: Leader, bodies: Bodies, t_us: int) -> float:
-        """Return the acceleration behind a leader and before a red light; of an adversary that by
-        which it acts on the ego, the first of the bodies.
+    def accel_mps2(
+        self, motion: _Motion, leader: Leader, bodies: Bodies, own: int, t_us: int
+    ) -> float:
+        """Return the acceleration behind a leader and before a line to stop at; of an adversary that
+        by which it acts on the ego, the first of the bodies.
         """
-        speed_mps = motion.speed_mps
-        red_m = red_gap_m(self.lights, motion.s_m + self.actor.box.length_m / 2, speed_mps, t_us)
+        assert self.path is not None
+        speed_mps, front_m = motion.speed_mps, motion.s_m + self.actor.box.length_m / 2
         closing_mps = speed_mps - leader.speed_mps
-        behind = idm_acceleration(speed_mps, leader.gap_m, closing_mps, self.params)
+        params = at_place(self.params, self.path, self.wanted_mps, motion.s_m)
+        behind = idm_acceleration(speed_mps, leader.gap_m, closing_mps, params)
         if self.act is not None:
             against = self._against_ego_mps2(motion, bodies, self.act)
             return against if leader.index <= 0 else min(against, behind)
-        return min(behind, idm_acceleration(speed_mps, red_m, speed_mps, self.params))
+        stop_m = min(
+            red_gap_m(self.lights, front_m, speed_mps, t_us),
+            give_way_gap_m(self.give_way, self.path, front_m, bodies, own),
+        )
+        return min(behind, idm_acceleration(speed_mps, stop_m, speed_mps, params))
 
     def _against_ego_mps2(self, motion: _Motion, bodies: Bodies, act: Mapping[str, float]) -> float:
         """Return the acceleration of an adversary: up to the place where it acts it tries to be

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, Box
-from alpasim_plugin.world.path import Lines
+from alpasim_plugin.world.path import Lines, Path
+
+COMFORT_BRAKE_MPS2 = 1.5  # before bends
+CREEP_MPS = 2.0  # even around a corner of the line
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class IdmParams:
     accel_mps2: float = 1.5
     brake_mps2: float = 2.0  # comfortable
     hard_brake_mps2: float = 7.0  # what the vehicle can do; the model's own demand is cut off here
+    lateral_accel_mps2: float = math.inf  # in bends, before which the driver slows down
 
 
 def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:
@@ -67,6 +71,34 @@ def moved_on(s_m: float, speed_mps: float, accel_mps2: float, dt_s: float) -> tu
     """
     a = max(accel_mps2, -speed_mps / dt_s)
     return s_m + (speed_mps * dt_s + 0.5 * a * dt_s * dt_s), max(0.0, speed_mps + a * dt_s)
+
+
+def allowed_speeds(path: Path, most_mps: float | F64, lateral_accel_mps2: float) -> F64:
+    """Return the speed ``(N,)`` that bends and limits allow along a path, reachable with a
+    comfortable brake from everywhere before them.
+    """
+    k = np.abs(path.curvature)
+    v2 = np.minimum(np.square(most_mps), lateral_accel_mps2 / np.maximum(k, 1e-6))
+    # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
+    rising = v2 + 2 * COMFORT_BRAKE_MPS2 * path.s
+    return np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
+
+
+def bend_speeds(path: Path, p: IdmParams) -> F64 | None:
+    """Return the speeds ``(N,)`` that a driver wants along a path; None for one who ignores
+    bends.
+    """
+    if math.isinf(p.lateral_accel_mps2):
+        return None
+    allowed_mps = allowed_speeds(path, p.desired_speed_mps, p.lateral_accel_mps2)
+    return np.maximum(allowed_mps, CREEP_MPS)
+
+
+def at_place(p: IdmParams, path: Path, wanted_mps: F64 | None, s_m: float) -> IdmParams:
+    """Return the driver with the speed that it wants at a place of its path."""
+    if wanted_mps is None:
+        return p
+    return replace(p, desired_speed_mps=float(np.interp(s_m, path.s, wanted_mps)))
 
 
 @dataclass(frozen=True)

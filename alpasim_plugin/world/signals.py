@@ -1,4 +1,6 @@
-"""Where a line passes traffic lights, and how far a driver may go before one that is red."""
+"""Where a line passes traffic lights and lines to give way at, and how far a driver may go before
+one that is red, or at which others come.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.types import Signal
+from alpasim_plugin.world.idm import Bodies
 from alpasim_plugin.world.path import Path
 
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
+SEEN_M = 30.0  # others are looked for from so far before a line to give way at
+CROSSED_M, CROSSED_S = 20.0, np.arange(0.0, 4.1, 0.5)  # behind the line, and so long ahead
+ASIDE_M = 2.5  # who comes nearer to the own way is let pass
+MOVING_MPS = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,5 +53,38 @@ def red_gap_m(lights: Sequence[LightAhead], front_s_m: float, speed_mps: float, 
         colour = light.signal.colour_at(t_us)
         stoppable = speed_mps**2 <= 2.0 * STOP_BRAKE_MPS2 * gap_m
         if colour in ("red", "red_yellow") or (colour == "yellow" and stoppable):
+            return gap_m
+    return float("inf")
+
+
+def give_way_gap_m(
+    lines: Sequence[LightAhead], path: Path, front_s_m: float, bodies: Bodies, own: int
+) -> float:
+    """Return the distance from the front bumper to the nearest line at which others are to be let
+    pass; infinite without one.
+
+    Others come if, at the speed that they have, they will be on the way behind the line. Who follows
+    on the own way before the line does not count.
+
+    Args:
+        lines: On the path, in its order.
+        path: The driver's way.
+        front_s_m: Arc length of the front bumper.
+        bodies: Everybody.
+        own: The driver's row among them, -1: none.
+    """
+    for line in lines:
+        gap_m = line.s_m - front_s_m
+        if not 0.0 <= gap_m <= SEEN_M:
+            continue
+        crossed, _ = path.at(np.arange(line.s_m + 1.0, line.s_m + CROSSED_M, 1.0))
+        s_m, offset_m = path.project(bodies.xy)
+        counts = (s_m > line.s_m) | (np.abs(offset_m) > ASIDE_M)
+        counts &= np.linalg.norm(bodies.velocity, axis=1) > MOVING_MPS
+        counts &= np.arange(len(bodies.xy)) != own
+        ahead = bodies.velocity[counts, None] * CROSSED_S[:, None]
+        places = bodies.xy[counts, None] + ahead  # (K, T, 2)
+        apart = places[:, :, None] - crossed[:, :2]  # (K, T, N, 2)
+        if (np.hypot(apart[..., 0], apart[..., 1]) < ASIDE_M).any():
             return gap_m
     return float("inf")

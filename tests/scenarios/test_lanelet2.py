@@ -204,3 +204,38 @@ def test_lanelet2_finds_the_same_lanes_links_and_lengths(karlsruhe):
             begin = sense.leftBound[0]
             assert lanes[key].left[0, :2] == pytest.approx([begin.x, begin.y], abs=1e-3)
     assert found == set(lanes)
+
+
+CROSSING = (
+    *STREET[:-4],
+    *(node(key, 1150.0 + x, y) for key, x, y in ((41, -2, -60), (42, -2, 90), (43, 2, -60), (44, 2, 90))),
+    way(441, 41, 42),
+    way(443, 43, 44),
+    way(91, 41, 43),
+    *(node(key, 1150.0 + x, -10.0) for key, x in ((45, -2), (46, 2))),
+    way(92, 45, 46, type="stop_line"),
+    lanelet(1, 212, 112),
+    lanelet(2, 223, 139),
+    lanelet(4, 441, 443, 8),
+)  # fmt: skip
+YIELD = relation(
+    8,
+    [("way", "ref_line", 92), ("relation", "yield", 4), ("relation", "right_of_way", 1)],
+    {"type": "regulatory_element", "subtype": "right_of_way"},
+)
+
+
+@pytest.mark.parametrize("ruled", [True, False])
+def test_vehicles_cross_the_route_where_a_rule_says_who_goes_first(tmp_path, ruled):
+    rule = (
+        YIELD if ruled else YIELD.replace('k="subtype"', 'k="fallback" v="yes"/><tag k="subtype"')
+    )
+    file = written(tmp_path, (*CROSSING, rule))
+    across = set()
+    for seed in range(5):
+        route = ("map.route.from=1:5", "map.route.to=2:140", "map.vehicles=3")
+        made = load_scenario(file, seed, route)
+        assert len(made.lane_map.give_way) == ruled
+        sides = [np.sign(a.track.xyz[[0, -1], 1] - made.ego_log.xyz[0, 1]) for a in made.actors]
+        across |= {seed for begin, end in sides if begin < 0 < end}
+    assert bool(across) == ruled

@@ -254,3 +254,47 @@ def test_a_lane_that_closes_is_not_driven(tmp_path):
     made = road("1", section(0, lane(-1), closing), length=100)
     for seed in range(4):
         assert scenario(tmp_path, (made,), seed=seed).route.lane_ids == ("1.0.-1",)
+
+
+def test_people_cross_where_the_route_passes_and_the_expert_lets_them(tmp_path):
+    outline = "".join(
+        f'<cornerLocal u="{u}" v="{v}"/>' for u, v in ((-2, -4), (2, -4), (2, 4), (-2, 4))
+    )
+    crosswalk = f'<objects><object type="crosswalk" s="50" t="0" hdg="0"><outline>{outline}</outline></object></objects>'
+    first, second = two_roads()
+    parts = (first, second.replace("</road>", f"{crosswalk}</road>"))
+    sides = set()
+    for seed in range(4):
+        made = scenario(tmp_path, parts, *named("1:20", "2:150"), seed=seed)
+        (walker,) = made.actors
+        assert walker.label == "pedestrian"
+        xy = walker.track.xyz[:, :2] + made.world_origin[:2]
+        assert np.abs(xy[:, 0] - 150.0).max() < 1e-6
+        assert np.ptp(xy[:, 1]) == pytest.approx(10.0)
+        sides.add(float(np.sign(xy[0, 1])))
+        front = made.ego_log.xyz[:, 0] + made.world_origin[0] + 1.4 + 4.855 / 2
+        at = made.ego_log.t_us[np.searchsorted(front, 149.5)]
+        y = np.interp(at, walker.track.t_us, xy[:, 1])
+        assert abs(y + 1.75) > 1.2
+    assert len(sides) == 2
+    assert not scenario(tmp_path, parts, *named("1:20", "2:150"), "map.pedestrians=0").actors
+
+
+def test_the_expert_and_vehicles_keep_the_posted_speed(tmp_path):
+    first, second = two_roads()
+    posted = '<type s="0" type="town"><speed max="18" unit="km/h"/></type>'
+    parts = (first, second.replace("<planView>", f"{posted}<planView>"))
+    made = scenario(tmp_path, parts, *named("1:0", "2:200"), "map.vehicles=3", seed=3)
+    assert made.lane_map.lanes["2.0.-1"].speed_limit_mps == pytest.approx(5.0)
+    assert made.lane_map.lanes["1.0.-1"].speed_limit_mps is None
+    for track in (made.ego_log, *(actor.track for actor in made.actors)):
+        x = track.xyz[:, 0] + made.world_origin[0]
+        speed = np.abs(np.diff(x)) / np.diff(track.t_us) * 1e6
+        assert speed[(x[1:] > 105.0) & (x[1:] < 390.0)].max(initial=0.0) < 5.3
+
+
+@pytest.mark.parametrize("limit", ['max="fast"', 'max="-3"', 'max="50" unit="knots"'])
+def test_a_speed_limit_that_is_no_speed_is_refused(tmp_path, limit):
+    text = two_roads()[0].replace("<planView>", f"<type s='0'><speed {limit}/></type><planView>")
+    with pytest.raises(InputError):
+        scenario(tmp_path, (text,))

@@ -12,11 +12,17 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, find_leader, idm_acceleration
+from alpasim_plugin.world.idm import (
+    Bodies,
+    IdmParams,
+    Leader,
+    allowed_speeds,
+    find_leader,
+    idm_acceleration,
+)
 from alpasim_plugin.world.path import Lines, Path
 from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
-from scenarios.expert import speed_limits
 
 STEP_S = 0.1
 LATERAL_MPS2 = 2.0
@@ -60,7 +66,7 @@ class ReferenceLine:
     @staticmethod
     def along(path: Path, fastest_mps: float) -> ReferenceLine:
         """Return the line with its speed limits, at most ``fastest_mps``."""
-        return ReferenceLine(path, speed_limits(path, fastest_mps, LATERAL_MPS2))
+        return ReferenceLine(path, allowed_speeds(path, fastest_mps, LATERAL_MPS2))
 
 
 def acceleration(

@@ -1,0 +1,52 @@
+"""Where a driver has to let others pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.types import Box, Signal
+from alpasim_plugin.world.idm import IdmParams, bend_speeds, bodies_from
+from alpasim_plugin.world.path import polyline_path, smooth_path
+from alpasim_plugin.world.signals import give_way_gap_m, lights_on
+
+NORTH = polyline_path(np.column_stack([np.zeros(101), np.arange(-50.0, 51.0), np.zeros(101)]))
+LINE = Signal(np.array([[-2.0, -6.0, 0.0], [2.0, -6.0, 0.0]]), np.pi / 2, ())
+BOX = Box(4.6, 1.85, 1.5)
+
+
+def gap(x: float, y: float, speed_mps: float, heading: float, own: int = -1, front: float = 30.0):
+    along = np.array([np.cos(heading), np.sin(heading)])
+    bodies = bodies_from(np.array([x, y]), np.array([heading]), [BOX], speed_mps * along)
+    return give_way_gap_m(lights_on(NORTH, [LINE]), NORTH, front, bodies, own)
+
+
+@pytest.mark.parametrize(
+    ("body", "waits"),
+    [
+        ((-30.0, 0.0, 10.0, 0.0), True),  # there within 4 s
+        ((-60.0, 0.0, 10.0, 0.0), False),  # later
+        ((30.0, 0.0, 10.0, 0.0), False),  # has passed
+        ((-30.0, 0.0, 0.0, 0.0), False),  # stands
+        ((0.0, -40.0, 10.0, np.pi / 2), False),  # follows
+        ((0.0, 30.0, 10.0, -np.pi / 2), True),  # comes on the own way
+    ],
+)
+def test_who_comes_across_the_way_behind_the_line_is_let_pass(body, waits):
+    assert gap(*body) == (pytest.approx(14.0) if waits else float("inf"))
+    assert gap(*body, own=0) == float("inf")
+    assert gap(*body, front=45.0) == float("inf")  # is over the line
+    assert gap(*body, front=10.0) == float("inf")  # does not see it yet
+
+
+def test_a_driver_slows_down_before_a_bend_and_creeps_around_a_corner():
+    angle = np.linspace(0.0, np.pi / 2, 20)
+    arc = np.column_stack([60.0 + 12.0 * np.sin(angle), 12.0 - 12.0 * np.cos(angle), 0.0 * angle])
+    line = np.concatenate([np.column_stack([np.arange(0.0, 60.0, 3.0), np.zeros((20, 2))]), arc])
+    path = smooth_path(line)
+    wanted = bend_speeds(path, IdmParams(12.0, lateral_accel_mps2=3.0))
+    assert wanted[0] == pytest.approx(12.0, abs=0.1)
+    assert np.interp(70.0, path.s, wanted) == pytest.approx(6.0, abs=0.3)
+    assert (np.diff(wanted**2) / np.diff(path.s)).min() > -3.1
+    assert bend_speeds(path, IdmParams(12.0)) is None
+    assert bend_speeds(path, IdmParams(12.0, lateral_accel_mps2=1e-3)).min() == 2.0
