@@ -94,10 +94,9 @@ HARD = {
     "name",
     [
         "all",
-        "turning on the spot",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("driving", "turning", "passing car")
+            for name in ("turning on the spot", "driving", "turning", "passing car")
         ),
     ],
 )
