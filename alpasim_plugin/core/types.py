@@ -11,7 +11,7 @@ images are HWC uint8 sRGB.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, Self, TypeVar, cast
 
 import numpy as np
@@ -319,13 +319,12 @@ class RecordedFrame:
 
 def read_only(record: RecordT) -> RecordT:
     """Return a record whose arrays are views that cannot be written, for code that is not ours."""
-    views = {}
-    for one in fields(record):  # type: ignore[arg-type]
-        value = getattr(record, one.name)
-        if isinstance(value, np.ndarray):
-            views[one.name] = value.view()
-            views[one.name].flags.writeable = False
-    return replace(record, **views)  # type: ignore[type-var]
+    views = {name: one.view() for name, one in vars(record).items() if isinstance(one, np.ndarray)}
+    for view in views.values():
+        view.flags.writeable = False
+    copy = object.__new__(type(record))
+    vars(copy).update(vars(record) | views)
+    return copy
 
 
 @dataclass(frozen=True)
