@@ -248,4 +248,6 @@ def describe(manifest: JsonObject, reused: bool) -> str:
 
     events = dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))
     cost = " (reused)" if reused else f", {manifest['wall_s']:.1f} s"
+    if "copied_from" in manifest and not reused:
+        cost = f" (copied from {manifest['copied_from']})"
     return f"{cell}: {', '.join(events) or NO_OUTCOME}{cost}"

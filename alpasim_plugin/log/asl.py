@@ -171,12 +171,20 @@ class AslFile:
             self.abandon()
 
 
-def copy_log(source: Path, target: Path, cameras: Mapping[str, str] = EMPTY) -> None:
-    """Copy a log with other names of cameras.
+def copy_log(
+    source: Path,
+    target: Path,
+    session_uuid: str = "",
+    renderer: str = "",
+    cameras: Mapping[str, str] = EMPTY,
+) -> None:
+    """Copy a log under other names.
 
     Args:
         source: A finished log.
         target: The file to write; its folder exists.
+        session_uuid: The new session id; empty keeps the log's.
+        renderer: The new name of the renderer in the header; empty keeps the log's.
         cameras: Old name -> new name; others keep theirs.
 
     Raises:
@@ -187,7 +195,13 @@ def copy_log(source: Path, target: Path, cameras: Mapping[str, str] = EMPTY) -> 
     with AslFile(target) as out:
         for entry in reader:
             kind = entry.WhichOneof("log_entry")
-            for holder, name in _names(kind, entry if kind is None else getattr(entry, kind)):
+            message = entry if kind is None else getattr(entry, kind)
+            owner = message.session_metadata if kind == "rollout_metadata" else message
+            if session_uuid and "session_uuid" in owner.DESCRIPTOR.fields_by_name:
+                owner.session_uuid = session_uuid
+            if renderer and kind == "rollout_metadata":
+                message.version_ids.sensorsim_version.version_id = renderer
+            for holder, name in _names(kind, message):
                 old = getattr(holder, name)
                 if old in cameras:
                     setattr(holder, name, cameras[old])

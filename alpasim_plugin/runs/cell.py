@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,6 +24,7 @@ from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.log.asl import copy_log
 from alpasim_plugin.log.run_folder.manifests import (
     Action,
     RolloutState,
@@ -29,6 +32,7 @@ from alpasim_plugin.log.run_folder.manifests import (
     write_manifest,
 )
 from alpasim_plugin.log.run_folder.schema import (
+    DEBUG_NAME,
     DERIVED,
     DRIVEN,
     FRAMES_NAME,
@@ -39,7 +43,8 @@ from alpasim_plugin.log.run_folder.schema import (
     VIDEO_NAME,
     WHY_NAME,
 )
-from alpasim_plugin.log.run_folder.writer import write_steps
+from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
+from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.renderers.weather import in_weather
 from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import checked_frames
@@ -142,6 +147,46 @@ def run_cell(
             recorder.save_video()
             if not manifest["has_camera"]:
                 _render_film(cell, options, scenario, folder, threads)
+    return manifest
+
+
+def is_copied(manifest: JsonView) -> bool:
+    """Tell whether the same rollout behind other renderers is a copy of this one, which their
+    images could not have changed.
+    """
+    return manifest["status"] == "ok" and not manifest["has_camera"]
+
+
+def copy_cell(
+    cell: Cell, options: RunOptions, root: Path, threads: int, original: JsonObject
+) -> JsonObject:
+    """Copy the rollout of a policy without a camera into the cell of another renderer and return
+    the manifest. It is neither driven nor scored again; its film is rendered.
+
+    The log names the cell's own renderer and session: it is the log that driving would have made.
+
+    Args:
+        cell: The copy.
+        options: Of the run.
+        root: The run folder.
+        threads: Of the film.
+        original: Manifest of the rollout that was driven; see `is_copied`.
+    """
+    folder, source = root / cell.folder, root / original["path"]
+    with _writing_manifest(cell, options, folder) as manifest:
+        announce(f"copying {cell.scene}")
+        session = session_uuid(cell.seed, cell.rollout_key)
+        name = _service_name(cell.renderer)
+        copy_log(source / LOG_NAME, folder / LOG_NAME, session, name)
+        for file in (FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME):
+            if os.path.exists(source / file):
+                shutil.copyfile(source / file, folder / file)
+        copy_steps(source, folder, cell.renderer.name)
+        manifest |= original | manifest
+        manifest |= {"copied_from": original["path"], "session_uuid": session, "stage_ms": {}}
+        if _wants_film(options.video, manifest):
+            with parts_print_to_stderr(folder / OUTPUT_NAME):
+                _render_film(cell, options, _scenario(cell.ref), folder, threads)
     return manifest
 
 

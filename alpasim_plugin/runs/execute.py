@@ -21,8 +21,10 @@ from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
+    copy_cell,
     failed_manifest,
     find_rollout_state,
+    is_copied,
     rescore_cell,
     run_cell,
 )
@@ -31,6 +33,7 @@ from alpasim_plugin.runs.executors.local import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
 OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
+Job = tuple[Cell, JsonObject | None]  # with the manifest of the rollout that it is a copy of
 Done = Iterator[tuple[Cell, JsonObject]]
 
 
@@ -104,8 +107,9 @@ def execute(
     """Run every unfinished cell and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
-    scored again from their logs; damaged ones are driven again. On SIGINT, SIGTERM or SIGHUP the
-    workers are stopped; finished rollouts stay on disk.
+    scored again from their logs; damaged ones are driven again. A policy without a camera drives
+    behind the first renderer alone, and its other rollouts are copies of that one. On SIGINT,
+    SIGTERM or SIGHUP the workers are stopped; finished rollouts stay on disk.
 
     Args:
         plan: The run.
@@ -116,10 +120,21 @@ def execute(
     """
     manifests: dict[Path, JsonObject] = {}
     todo: list[Cell] = []
+    copies: list[tuple[Cell, Cell]] = []  # with the rollout that each is a copy of
+    originals: dict[tuple[str, str, int], Cell] = {}
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
+        original = cell
+        if cell.policy.is_blind:
+            original = originals.setdefault((cell.policy.name, cell.scene, cell.seed), cell)
         if state.damage:
             notify(f"damaged: {'; '.join(map(str, state.damage))}; it is made again")
+        driven = manifests.get(original.folder)  # None where it is still to be driven
+        if original is not cell and (driven is None or is_copied(driven)):
+            copied_from = state.manifest and state.manifest.get("copied_from")
+            if driven is None or action != "none" or copied_from != driven["path"]:
+                copies.append((cell, original))
+                continue
         if action == "drive" or state.manifest is None:
             todo.append(cell)
             continue
@@ -129,10 +144,16 @@ def execute(
         manifests[cell.folder] = manifest
         on_done(manifest, True)
 
-    try:
-        for cell, manifest in _run(todo, plan, root, how):
+    def take(done: Done) -> None:
+        for cell, manifest in done:
             manifests[cell.folder] = manifest
             on_done(manifest, False)
+
+    try:
+        take(_run(todo, plan, root, how))
+        jobs = [(cell, manifests[original.folder]) for cell, original in copies]
+        take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
+        take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
     finally:
         shutil.rmtree(root / STAGES, ignore_errors=True)
     return [manifests[cell.folder] for cell in plan.cells]
@@ -141,7 +162,7 @@ def execute(
 def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Drive cells where the executor says; with Ray only this process writes the run folder."""
     if how.executor.is_local:
-        yield from _run_local(todo, plan, root, how)
+        yield from _run_local([(cell, None) for cell in todo], plan, root, how)
     elif todo:
         from alpasim_plugin.runs.executors.ray_backend import run_on_ray
 
@@ -150,26 +171,29 @@ def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done
             yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
-def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Drive cells in this process, or in workers that write the run folder themselves."""
+def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
+    """Drive or copy cells in this process, or in workers that write the run folder themselves."""
     workers, threads = how.here.workers, how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
-        todo = sorted(todo, key=lambda cell: cell.renderer.fixer is None)
+        jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
     work = partial(_work, plan.options, root, threads)
 
-    def written(cell: Cell) -> JsonObject | None:
+    def written(job: Job) -> JsonObject | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
-        action, state = find_rollout_state(cell, root, reuse_undigested=True)
+        action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for cell, result in run_jobs(work, todo, workers, threads, how.limit_s, written):
+    for (cell, _), result in run_jobs(work, jobs, workers, threads, how.limit_s, written):
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-def _work(options: RunOptions, root: Path, threads: int, cell: Cell) -> JsonObject:
-    """Drive a cell in a worker of this machine."""
+def _work(options: RunOptions, root: Path, threads: int, job: Job) -> JsonObject:
+    """Drive or copy a cell in a worker of this machine."""
+    cell, original = job
     with shown_in(root / STAGES):
-        return run_cell(cell, options, root, threads)
+        if original is None:
+            return run_cell(cell, options, root, threads)
+        return copy_cell(cell, options, root, threads, original)
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> JsonObject:

@@ -80,6 +80,7 @@ def write_summary(
             "by_class": by_class,
             "cells": cells,
         },
+        "copies": sum("copied_from" in m for m in manifests),
         "fixers": by_policy(_of_policies(done), fixers),
         "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
         **more,

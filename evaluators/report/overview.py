@@ -426,6 +426,12 @@ def _context(run: Run) -> str:
 
 def _cautions(run: Run) -> tuple[str, ...]:
     cautions = fixer_cautions(run.summary)
+    copies = run.summary.get("copies")
+    if copies:
+        cautions.append(
+            f"{copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
+            "a policy without a camera drives once for all renderers."
+        )
     repeat = run.info.get("repeat") or {}
     if repeat.get("repeatable") is False:
         first = repeat.get("first_difference") or {"component": "log", "step": None}

@@ -206,8 +206,10 @@ def rollout_block(run: Run) -> RolloutBlock:
 
 
 def _note(rollout: Rollout) -> str:
-    """Say why a rollout failed."""
-    return "" if rollout.ok else f"{rollout.failure_class or 'unknown cause'}: {rollout.failure}"
+    """Say why a rollout failed, or which one it is a copy of."""
+    if not rollout.ok:
+        return f"{rollout.failure_class or 'unknown cause'}: {rollout.failure}"
+    return f"copied from {rollout.copied_from}" if rollout.copied_from else ""
 
 
 def _short(value: float | None) -> float | None:

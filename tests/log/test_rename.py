@@ -29,18 +29,24 @@ def test_alpasims_own_logs_are_copied_byte_by_byte(logs, tmp_path):
 
 def test_a_renamed_log_differs_in_its_names_alone(logs, tmp_path):
     source, target = logs[0], tmp_path / "copy.asl"
-    camera = "camera_front_wide_120fov"
-    copy_log(source, target, {camera: "other_camera_of_24_bytes"})
+    old, camera = source.parent.name, "camera_front_wide_120fov"
+    new = session_uuid(7, "x")
+    copy_log(source, target, new, cameras={camera: "other_camera_of_24_bytes"})
+    assert old.encode() not in target.read_bytes()
     assert camera.encode() not in target.read_bytes()
-    assert {image.camera for image in read_asl(target).images} == {"other_camera_of_24_bytes"}
-    copy_log(target, tmp_path / "back.asl", {"other_camera_of_24_bytes": camera})
+    log = read_asl(target)
+    assert (log.session_uuid, {image.camera for image in log.images}) == (
+        new,
+        {"other_camera_of_24_bytes"},
+    )
+    copy_log(target, tmp_path / "back.asl", old, cameras={"other_camera_of_24_bytes": camera})
     assert (tmp_path / "back.asl").read_bytes() == source.read_bytes()
 
 
 def test_a_cut_log_is_no_source(logs, tmp_path):
     (tmp_path / "cut.asl").write_bytes(logs[0].read_bytes()[:5000])
     with pytest.raises(InputError, match="last entry cut"):
-        copy_log(tmp_path / "cut.asl", tmp_path / "copy.asl")
+        copy_log(tmp_path / "cut.asl", tmp_path / "copy.asl", "x")
     assert not (tmp_path / "copy.asl").exists()
 
 

@@ -1,25 +1,31 @@
-"""What is not rendered: frames for a policy without a camera, and the past of a fork."""
+"""What is driven and rendered once: rollouts without a camera, and the past of a fork."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from alpasim_plugin.core.interfaces import Renderer, complete
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
+from alpasim_plugin.log.run_folder.check import inspect_run
+from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.cell import make_renderer, run_cell
 from alpasim_plugin.runs.fork import SwitchedRenderer
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.run import execute_run
+from policies.simple import ConstantVelocity
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY, Darker, Grey
 from tests.runs.test_runs import Announced
 
 DARKER = "tests.runs.grey_renderer:Darker"
+SEES = f"{__name__}:SeesAfterAll"
 SMALL = SimpleNamespace(name="front", width=8, height=4)
 SHORT = ("timing.duration_us=1200000", "degradation.kind=none")
 
@@ -32,6 +38,16 @@ class Counts(Grey):
     def render(self, request: RenderRequest) -> Frame:
         self.frames += 1
         return super().render(request)
+
+
+class SeesAfterAll(ConstantVelocity):
+    """Has a camera, which its class does not declare."""
+
+    def reset(self, seed: int, route: object) -> None:
+        self.sensors = (SensorSpec("front"),)
+
+    def __init__(self, scenario: object) -> None:
+        self.sensors = (SensorSpec("front"),)
 
 
 def plan_of(
@@ -47,10 +63,48 @@ def drive(plan: RunPlan, root: Path, workers: int = 1) -> tuple[dict, Announced]
     return run.summary, announced
 
 
-def test_without_a_camera_the_renderer_changes_nothing(tmp_path: Path) -> None:
+def origins(root: Path) -> dict[str, str | None]:
+    """Return the renderer and scene of each rollout with the rollout that it was copied from."""
+    manifests = [read_manifest(path.parent) for path in sorted(root.rglob("manifest.json"))]
+    return {f"{m['renderer'][-6:]} {m['scene']}": m.get("copied_from") for m in manifests}
+
+
+def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path: Path) -> None:
     plan = plan_of()
-    summary, _ = drive(plan, tmp_path, workers=2)
-    assert {one["diff"] for one in summary["paired"][DARKER].values()} <= {0.0, None}
+    summary, _ = drive(plan, tmp_path / "run", workers=2)
+    assert summary["copies"] == 2
+    paired = summary["paired"][DARKER]
+    assert {one["diff"] for one in paired.values()} <= {0.0, None}
+    for cell in plan.cells[1::2]:
+        copied = read_manifest(tmp_path / "run" / cell.folder)
+        driven = run_cell(cell, plan.options, tmp_path / "alone", 1)
+        original = next(
+            one for one in plan.cells if (one.scene, one.seed) == (cell.scene, cell.seed)
+        )
+        assert copied["copied_from"] == original.folder.as_posix()
+        differing = {key for key in driven if copied.get(key) != driven[key]}
+        assert differing <= {"wall_s", "stage_ms", "files", "sha256"}
+        for name in ("rollout.asl", "frames.jsonl", "steps.parquet"):
+            one, other = (tmp_path / where / cell.folder / name for where in ("run", "alone"))
+            assert one.read_bytes() == other.read_bytes()
+    rows = pq.read_table(tmp_path / "run" / "rollouts.parquet").to_pylist()
+    assert [row["copied_from"] is not None for row in rows] == [False, True] * 2
+
+
+def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path: Path) -> None:
+    plan = plan_of()
+    drive(plan, tmp_path)
+    made = origins(tmp_path)
+    assert {reused for _, reused in drive(plan, tmp_path)[1].results} == {True}
+    shutil.rmtree(tmp_path / plan.cells[1].folder)
+    assert sorted(reused for _, reused in drive(plan, tmp_path)[1].results) == [False, *[True] * 3]
+    with (tmp_path / plan.cells[0].folder / "rollout.asl").open("ab") as log:
+        log.write(b"damage")
+    assert (
+        sorted(reused for _, reused in drive(plan, tmp_path)[1].results) == [False] * 2 + [True] * 2
+    )
+    assert origins(tmp_path) == made
+    assert inspect_run(tmp_path, full=True).damage == ()
 
 
 def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: Path) -> None:
@@ -63,6 +117,24 @@ def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: 
         np.testing.assert_allclose(film.frames, level, atol=2)
     drive(plan_of(), tmp_path / "failures")
     assert not list((tmp_path / "failures").rglob("front.mp4"))
+
+
+def test_a_policy_that_has_a_camera_after_all_drives_behind_each_renderer(tmp_path: Path) -> None:
+    plan = plan_of(SEES)
+    drive(plan, tmp_path)
+    assert set(origins(tmp_path).values()) == {None}
+    assert {reused for _, reused in drive(plan, tmp_path)[1].results} == {True}
+
+
+def test_a_rollout_that_failed_is_not_copied(tmp_path: Path) -> None:
+    plan = plan_of("tests.runs.broken_policies:Raises")
+    summary, _ = drive(plan, tmp_path)
+    assert (summary["copies"], summary["failures"]["n_failed"]) == (0, 4)
+
+
+def test_the_first_renderer_drives_and_another_one_alone_drives_itself(tmp_path: Path) -> None:
+    drive(plan_of(renderers=(DARKER,)), tmp_path)
+    assert set(origins(tmp_path).values()) == {None}
 
 
 def test_a_fork_shows_the_past_only_to_a_renderer_with_a_history() -> None:

@@ -400,6 +400,7 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
         files={str(paths[key]): sha for key, sha in shas.items()},
         metrics=dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
         controller=str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
+        is_blind=spec.kind == "policy" and not getattr(factory, "sensors", True),
         missing=declared.missing,
     )
 

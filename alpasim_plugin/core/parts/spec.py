@@ -88,6 +88,7 @@ class PartSpec:
         files: SHA-256 of every file that it declares, by path.
         metrics: An evaluator's own metrics.
         controller: A policy's controller.
+        is_blind: A policy whose class declares that it has no camera (``sensors = ()``).
         address: What follows ``scheme://`` in the name of a remote part.
         missing: What must be given before it can be built; empty where nothing is missing.
     """
@@ -102,6 +103,7 @@ class PartSpec:
     files: Mapping[str, str] = field(default_factory=dict)
     metrics: Mapping[str, MetricInfo] = field(default_factory=dict)
     controller: str = ""
+    is_blind: bool = False
     address: str | None = None
     missing: str = ""
 

@@ -23,6 +23,7 @@ class Rollout:
     Attributes:
         metrics: Rollout values; None where the metric is invalid or was not computed.
         path: Folder of the rollout relative to the run folder, POSIX separators.
+        copied_from: That of the rollout that it is a copy of; empty for a rollout that was driven.
     """
 
     renderer: str
@@ -33,6 +34,7 @@ class Rollout:
     failure_class: str = ""
     failure: str = ""
     path: str = ""
+    copied_from: str = ""
     wall_s: float | None = None
     frames: int | None = None
     steps: int | None = None
@@ -92,7 +94,7 @@ def rollouts_of_table(table: pa.Table) -> tuple[Rollout, ...]:
     for row in table.to_pylist():
         facts = {key: row[key] for key in (*KEYS, "status")}
         facts |= {key: row.get(key) for key in ("frames", "steps")}
-        facts |= {key: row.get(key) or "" for key in ("failure_class", "failure")}
+        facts |= {key: row.get(key) or "" for key in ("failure_class", "failure", "copied_from")}
         metrics = {name: _number(row[name]) if row[name + VALID] else None for name in names}
         path = (row.get("path") or "").strip("/")
         rows.append(Rollout(**facts, path=path, wall_s=_number(row.get("wall_s")), metrics=metrics))

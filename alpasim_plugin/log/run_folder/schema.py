@@ -156,6 +156,7 @@ ROLLOUTS_TABLE = TableSchema(
         Column("failure_class", "text"),
         Column("failure", "text"),
         Column("path", "text"),
+        Column("copied_from", "text"),
         Column("wall_s", "number"),
         Column("frames", "integer"),
         Column("steps", "integer"),

@@ -118,7 +118,7 @@ def rollout_rows(manifests: Sequence[JsonObject]) -> list[JsonObject]:
         error = manifest.get("error") or {}
         row: JsonObject = {
             **{key: manifest[key] for key in (*KEYS, "status", "path", "wall_s")},
-            **{key: manifest.get(key) for key in ("rollout", "frames", "steps")},
+            **{key: manifest.get(key) for key in ("rollout", "copied_from", "frames", "steps")},
             "failure_class": error.get("failure_class"),
             "failure": error.get("message"),
         }
@@ -167,6 +167,16 @@ def write_tables(
 def write_steps(folder: Path, rows: Sequence[JsonView], of_logs: bool = False) -> None:
     """Write ``steps.parquet`` of a rollout's folder; ``of_logs`` as for `TableSchema.arrow`."""
     write_table(folder / STEPS_NAME, rows, STEPS_TABLE.arrow(of_logs=of_logs))
+
+
+def copy_steps(source: Path, folder: Path, renderer: str) -> None:
+    """Write ``steps.parquet`` of a rollout's folder ``source`` for the same rollout behind another
+    renderer.
+    """
+    table = read_parquet(source / STEPS_NAME, {})
+    index = table.schema.get_field_index("renderer")
+    names = pa.repeat(renderer, len(table))
+    write_parquet(folder / STEPS_NAME, table.set_column(index, "renderer", names))
 
 
 def write_table(path: Path, rows: Sequence[JsonView], schema: pa.Schema) -> None:
