@@ -71,6 +71,7 @@ PRINTERS = {
     "alpasim_plugin.cli.output": "tables of rich, through `Escaped`",
     "alpasim_plugin.cli.docs": "pages of ours",
     "alpasim_plugin.alpasim.client.supervisor": "a program of the standard library alone",
+    "alpasim_plugin.alpasim.bridge.client": "a wheel of its own",
     "alpasim_plugin.alpasim.bridge.build": "a program that builds that wheel",
 }
 PRINTING = {

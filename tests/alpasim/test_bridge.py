@@ -4,28 +4,43 @@ packages with AlpaSim's pins, and used.
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 
+import grpc
 import pytest
 import yaml
 
 from alpasim_plugin.alpasim.bridge import build as building
+from alpasim_plugin.alpasim.bridge.client import RendererClient
+from alpasim_plugin.log.wire import sensorsim_pb2
+from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
 from tests.alpasim.test_wire_generated import environment
 
-PINS = ("protobuf>=4.25,<5", "grpcio==1.62.3", "hydra-core")  # as AlpaSim's own (main, 3032e0c)
+# AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio
+# 1.62.3.
+PINS = ("protobuf>=4.25,<5", "grpcio==1.62.3", "numpy>=2,<2.3", "hydra-core")
 USING = """
 import sys
 from importlib import metadata
+from google.protobuf import descriptor_pb2, descriptor_pool
+foreign = descriptor_pb2.FileDescriptorProto(name="alpasim_grpc/v0/common.proto", package="common")
+foreign.message_type.add(name="Vec3")
+descriptor_pool.Default().AddSerializedFile(foreign.SerializeToString())
+from alpasim_onefixer_bridge.client import main
 (entry,) = metadata.entry_points(group="alpasim.configs")
 assert entry.name == "onefixer" and entry.load().__name__ == entry.value
 from hydra import compose, initialize_config_module
 with initialize_config_module(version_base=None, config_module=entry.value):
     assert compose("renderer/onefixer").runtime.renderer.kind == "sensorsim"
+code = main([sys.argv[1]])
 assert not {"torch", "numba", "av", "alpasim_plugin"} & set(sys.modules), sys.modules.keys()
+sys.exit(code)
 """
 
 REPO = Path(__file__).resolve().parents[2]
@@ -41,6 +56,19 @@ def staged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bridge")
     building.stage(folder)
     return folder
+
+
+def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged):
+    allowed = {"grpc", "google", "__future__", *sys.stdlib_module_names}
+    modules = [path for path in staged.rglob("*.py") if not path.name.endswith("_pb2.py")]
+    assert len(modules) >= 5
+    for path in modules:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            )
+            assert {name.split(".")[0] for name in names} <= allowed, path
 
 
 def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged):
@@ -99,10 +127,61 @@ def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
         assert all(one["address"].startswith("localhost:") for one in service["endpoints"])
 
 
+def test_the_client_asks_again_only_after_what_may_pass(upstream, renderer, monkeypatch):
+    monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
+    frame, seen = drive(1)[0], []
+
+    def fault(code, text, times):
+        def answer(asked, context, data):
+            seen.append(code)
+            return data if len(seen) > times else context.abort(code, text)
+
+        seen.clear()
+        return answer
+
+    with RendererClient(upstream.address) as client:
+        renderer.fault = fault(grpc.StatusCode.UNAVAILABLE, "away", 2)
+        assert list(client.render([frame])) == [CAMERA]
+        renderer.fault = fault(grpc.StatusCode.DEADLINE_EXCEEDED, "Stopped waiting for backend", 2)
+        assert list(client.render([frame])) == [CAMERA]
+        for code, text, times, calls in (
+            (grpc.StatusCode.UNAVAILABLE, "away", 9, 3),
+            (grpc.StatusCode.UNKNOWN, "broken", 9, 1),
+        ):
+            renderer.fault = fault(code, text, times)
+            with pytest.raises(grpc.RpcError, match=text):
+                client.render([frame])
+            assert len(seen) == calls
+
+
+@pytest.mark.parametrize("items", [0, 1])
+def test_the_client_refuses_what_the_runtime_refuses(items):
+    """No item for a camera, or one without success."""
+
+    class Refused(StandInRenderer):
+        def batch_render_rgb(self, asked, context):
+            item = sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=CAMERA)
+            return sensorsim_pb2.BatchRGBRenderReturn(items=[item][:items])
+
+    with hosted({"SensorsimService": Refused()}) as host, RendererClient(host.address) as client:
+        frames = drive(1)
+        with pytest.raises(ValueError, match="answered"):
+            client.render(frames)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_wheel_installs_beside_alpasims_pins_and_gives_the_presets(tmp_path):
+def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream, tmp_path):
     wheel = building.build(tmp_path / "dist")
     python = environment(tmp_path / "venv", *PINS)
     subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True)
-    subprocess.run([python, "-c", USING], check=True, cwd=tmp_path)
+    versions = subprocess.run(
+        [python, "-m", "pip", "list", "--format=freeze"], check=True, capture_output=True, text=True
+    ).stdout
+    assert "protobuf==4.25" in versions
+    assert "grpcio==1.62.3" in versions
+    done = subprocess.run(
+        [python, "-c", USING, upstream.address], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "version stand-in" in done.stdout

@@ -27,7 +27,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2
+from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import (
     START_US,
@@ -124,8 +124,33 @@ def say_nothing(service, method):
     )
 
 
+def reflect(channel, silence):
+    def questions():
+        yield reflection_pb2.ServerReflectionRequest(list_services="*")
+        yield from silence
+
+    call = Stub(channel, "ServerReflection").ServerReflectionInfo(questions())
+    next(call)
+    return call
+
+
 @pytest.mark.parametrize("name", SERVICES)
-@pytest.mark.parametrize("of", [("Health", "Check"), None], ids=lambda of: of and of[1])
+def test_streams_that_stay_open_hold_nobody_up(name):
+    silence = Silence()
+    with served(name) as host, channel_to(host) as channel:
+        calls = [reflect(channel, silence) for _ in range(40)]
+        assert is_served(host, name)
+        for call in calls:
+            call.cancel()
+        silence.over.set()
+
+
+@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize(
+    "of",
+    [("Health", "Check"), ("ServerReflection", "ServerReflectionInfo"), None],
+    ids=lambda of: of and of[1],
+)
 def test_calls_whose_message_never_comes_hold_nobody_up(name, of):
     silence, open_call = Silence(), say_nothing(*(of or (name, "get_version")))
     with served(name) as host, channel_to(host) as channel:

@@ -188,7 +188,7 @@ def test_questions_about_scenes_are_answered(served):
                 sensorsim_pb2.LidarRenderRequest(lidar_config={"lidar_type": 7})
             ),
             "UNIMPLEMENTED",
-            "cameras alone",
+            "type 7 needs an --upstream",
         ),
     ],
 )

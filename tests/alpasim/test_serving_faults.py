@@ -21,7 +21,7 @@ from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.wire import common_pb2, health_pb2
+from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import (
     answers,
@@ -203,13 +203,31 @@ def test_malformed_messages_change_nothing(upstream, overrides, count):
         assert answers(stub, frames) == before
 
 
-def test_health_answers_under_public_names(upstream):
+def test_health_and_reflection_answer_under_public_names(upstream):
     service = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address))).service
     with hosted({"SensorsimService": service}) as host, channel_to(host) as to:
         health, name = Stub(to, "Health"), "nre.grpc.protos.sensorsim.SensorsimService"
         ask = health_pb2.HealthCheckRequest
         assert [health.Check(ask(service=s)).status for s in ("", name)] == [1, 1]
         assert failure(lambda: health.Check(ask(service="other")))[0] == Code.NOT_FOUND
+        reflect, question = Stub(to, "ServerReflection"), reflection_pb2.ServerReflectionRequest
+        listed, file, missing = reflect.ServerReflectionInfo(
+            iter(
+                [
+                    question(list_services="*"),
+                    question(file_containing_symbol=name),
+                    question(file_containing_symbol="nobody.Service"),
+                ]
+            )
+        )
+        assert name in [s.name for s in listed.list_services_response.service]
+        assert (
+            b"nre.grpc.protos.sensorsim" in file.file_descriptor_response.file_descriptor_proto[0]
+        )
+        assert (
+            b"simrun.wire.sensorsim" not in file.file_descriptor_response.file_descriptor_proto[0]
+        )
+        assert missing.error_response.error_code == 5
 
 
 def test_running_calls_finish_while_the_server_stops(upstream, renderer, overrides):

@@ -16,13 +16,15 @@ from tests.alpasim import compile_protos as compiling
 PROTOS = compiling.PROTOS
 WIRE = PROTOS.parent
 
-# Loads the package from a copy outside the project under another name, then a foreign file that defines `common.Vec3` into the default pool, and sends a message
+# Loads the package from a copy outside the project under another name, as the bridge distribution
+# has it, then a foreign file that defines `common.Vec3` into the default pool, and sends a message
 # there and back.
 LOADING = """
 import sys, google.protobuf
 sys.path.insert(0, sys.argv[1])
 from google.protobuf import descriptor_pb2, descriptor_pool
 from bridge import wire
+from bridge.wire.services import public_pool
 from bridge.wire.services import methods
 assert "alpasim_plugin" not in sys.modules
 foreign = descriptor_pb2.FileDescriptorProto(name="alpasim_grpc/v0/common.proto", package="common")
@@ -31,7 +33,8 @@ descriptor_pool.Default().AddSerializedFile(foreign.SerializeToString())
 entry = wire.logging_pb2.LogEntry()
 entry.actor_poses.timestamp_us = 1689697803493732
 assert wire.logging_pb2.LogEntry.FromString(entry.SerializeToString()) == entry
-assert sum(len(methods(name)) for name in wire.SERVICE_PATHS) == 41
+assert public_pool().FindMessageTypeByName("common.Vec3").fields_by_name["x"].number == 1
+assert sum(len(methods(name)) for name in wire.SERVICE_PATHS) == 42
 print(google.protobuf.__version__)
 """
 

@@ -7,7 +7,7 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 from alpasim_plugin.log import wire
 from alpasim_plugin.log.asl import AslReader
 
-GRPC = ("health_pb2",)  # gRPC's own service
+GRPC = ("health_pb2", "reflection_pb2")  # gRPC's own services
 MODULES = [
     getattr(wire, name) for name in wire.__all__ if name.endswith("_pb2") and name not in GRPC
 ]
@@ -45,7 +45,7 @@ def test_packages_are_private():
 
 def test_every_service_has_the_path_that_is_dialled():
     services = {name for module in MODULES for name in module.DESCRIPTOR.services_by_name}
-    assert services | {"Health"} == set(wire.SERVICE_PATHS)
+    assert services | {"Health", "ServerReflection"} == set(wire.SERVICE_PATHS)
 
 
 def test_time_stamps_are_eight_fixed_bytes():

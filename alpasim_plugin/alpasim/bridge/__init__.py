@@ -1,4 +1,7 @@
-"""Sources of ``alpasim-onefixer-bridge``: Hydra presets for AlpaSim's own environment.
+"""Sources of ``alpasim-onefixer-bridge``: what AlpaSim's own environment needs of this project,
+without torch, numba or PyAV.
 
-The distribution is put together by `build.py`. Nothing here imports the rest of the project.
+The distribution is put together by `build.py`, under the name ``alpasim_onefixer_bridge``: the wire
+messages, Hydra presets, a client, and ``onefixer-bridge``, which asks a renderer service what it
+is. Nothing here imports the rest of the project.
 """

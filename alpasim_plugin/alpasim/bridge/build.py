@@ -1,8 +1,8 @@
 """Build the wheel of ``alpasim-onefixer-bridge`` from this checkout: ``python -m
 alpasim_plugin.alpasim.bridge.build DIST``.
 
-The presets are copied under the distribution's own package name, so that it can be installed where
-this project is not, beside AlpaSim's packages.
+The wire messages, the client and the presets are copied under the distribution's own package name,
+so that it can be installed where this project is not, beside AlpaSim's packages.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from pathlib import Path
 from alpasim_plugin import __version__
 
 HERE = Path(__file__).resolve().parent
+WIRE = HERE.parents[1] / "log" / "wire"
 PACKAGE = "alpasim_onefixer_bridge"
-INIT = '"""Presets of OneFixer for AlpaSim."""\n'
+SUFFIXES = (".py", ".pyi", ".proto", ".yaml", ".json")
+INIT = '"""What AlpaSim needs of OneFixer in its own environment: wire messages, presets, a client."""\n'
 PROJECT = f"""[build-system]
 requires = ["setuptools>=77"]
 build-backend = "setuptools.build_meta"
@@ -24,9 +26,13 @@ build-backend = "setuptools.build_meta"
 [project]
 name = "alpasim-onefixer-bridge"
 version = "{__version__}"
-description = "Hydra presets of OneFixer's renderer service, for AlpaSim's environment"
+description = "Wire messages, Hydra presets and a client of OneFixer's renderer service, for AlpaSim's environment"
 requires-python = ">=3.11"
 license = "Apache-2.0"
+dependencies = ["grpcio>=1.62", "protobuf>=4.25,<7"]
+
+[project.scripts]
+onefixer-bridge = "{PACKAGE}.client:main"
 
 [project.entry-points."alpasim.configs"]
 onefixer = "{PACKAGE}.configs"
@@ -35,16 +41,21 @@ onefixer = "{PACKAGE}.configs"
 include = ["{PACKAGE}*"]
 
 [tool.setuptools.package-data]
-"*" = ["*.yaml"]
+"*" = ["*.yaml", "*.json", "*.proto", "*.pyi"]
 """
 
 
 def stage(target: Path) -> None:
     """Write the distribution's source tree into a folder."""
     package = target / PACKAGE
-    for path in sorted((HERE / "configs").rglob("*")):
-        if path.suffix in (".py", ".yaml"):
-            copy(path, package / path.relative_to(HERE))
+    for source, name in ((WIRE, "wire"), (HERE / "configs", "configs")):
+        for path in sorted(source.rglob("*")):
+            if path.suffix in SUFFIXES and path.name != "compile.py":
+                copy(path, package / name / path.relative_to(source))
+    client = (
+        (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")
+    )  # there the messages lie two folders nearer
+    (package / "client.py").write_text(client)
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)
 

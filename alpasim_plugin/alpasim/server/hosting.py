@@ -27,9 +27,10 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.reading import read_bytes, read_text
 from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.log.wire.services import MESSAGE_BYTES, handlers
+from alpasim_plugin.log.wire.services import MESSAGE_BYTES, V1ALPHA, Reflection, handlers
 
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
+LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 RECEIVING = 128  # calls whose message is in memory and that are not worked on yet
 RECEIVED_BYTES = 16 << 20  # of one message: an image as JPEG or PNG, or a request to render
@@ -289,7 +290,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     Args:
         token: None: no token is asked for.
-        workers: Calls that are worked on; health does not count.
+        workers: Calls that are worked on; health and reflection do not count.
     """
 
     def __init__(self, token: str | None, workers: int) -> None:
@@ -307,7 +308,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         ):
             return self._refusal
         handler = continuation(details)
-        if handler is None or details.method.startswith(OPEN_CALLS):
+        if handler is None or details.method.startswith(LIGHT_CALLS):
             return handler
         return grpc.stream_unary_rpc_method_handler(
             partial(self._answer, handler.unary_unary),
@@ -400,7 +401,9 @@ class Host:
             interceptors=(gate,),
         )
         made = [handlers(name, service) for name, service in services.items()]
-        self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health)))
+        self._server.add_generic_rpc_handlers(
+            (*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers())
+        )
         host, _, port = listen.rpartition(":")
         is_socket = listen.startswith("unix:")
         credentials = policy.credentials()

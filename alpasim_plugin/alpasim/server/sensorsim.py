@@ -4,18 +4,31 @@ upstream's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import wraps
 from typing import Any
 
 import grpc
+import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import KEPT_SCENES, SceneCache, advertised
 from alpasim_plugin.alpasim.server.frames import FrameServer
+from alpasim_plugin.alpasim.server.sources import LocalSource
 from alpasim_plugin.alpasim.server.status import CallTime, Failures, Unimplemented, answering
+from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
+
+SCAN_PX = 900, 604  # of an image of a quarter of the horizon: 0.13 degrees a pixel in its middle
+SCAN_MOST_M = 200.0
+ONE_SURFACE = 0.05  # neighbouring depths that differ by a smaller share are of one surface,
+# as are those whose step is at most so many times the smaller one beside it: a plane far away has
+# even steps
+EVEN_STEP = 1.5
+
 
 Call = Callable[[Any, Any, Any], Any]
 
@@ -107,12 +120,15 @@ class Sensorsim(Failures):
     def render_aggregated(
         self, request: sensorsim_pb2.AggregatedRenderRequest, context: Any
     ) -> sensorsim_pb2.AggregatedRenderReturn:
-        """Render frames together; an upstream's lidar and its data for the driver are handed on."""
+        """Render frames and lidar spins together; over an upstream lidar and its data for the
+        driver are handed on.
+        """
         left = CallTime(context)
         if self.upstream is None:
-            for lidar in request.lidar_requests:
-                self.render_lidar(lidar, context)
-            return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=self._returns(request, left))
+            scans = [self._scan(one, left) for one in request.lidar_requests]
+            return sensorsim_pb2.AggregatedRenderReturn(
+                rgb_returns=self._returns(request, left), lidar_returns=scans
+            )
         reply: sensorsim_pb2.AggregatedRenderReturn
         reply = self.forward("render_aggregated", request, context)
         if request.rgb_requests:
@@ -133,13 +149,43 @@ class Sensorsim(Failures):
     def render_lidar(
         self, request: sensorsim_pb2.LidarRenderRequest, context: Any
     ) -> sensorsim_pb2.LidarRenderReturn:
-        """Return a lidar's points as the upstream answers; our own renderer has no lidar.
+        """Return a lidar's points: from the depth of our renderer, or as the upstream answers."""
+        return self._scan(request, CallTime(context))
 
-        Raises:
-            Unimplemented: There is no upstream.
-        """
-        raise Unimplemented(
-            "a lidar: our renderer draws cameras alone", "use --upstream with a server that has it"
+    def _scan(
+        self, request: sensorsim_pb2.LidarRenderRequest, left: CallTime
+    ) -> sensorsim_pb2.LidarRenderReturn:
+        if request.lidar_config.lidar_type not in LIDARS or not isinstance(
+            self.frames.source, LocalSource
+        ):
+            raise Unimplemented(
+                f"a lidar of type {request.lidar_config.lidar_type}",
+                "use --upstream with a server that has it",
+            )
+        lidar = LIDARS[request.lidar_config.lidar_type]
+        cameras = lidar.cameras()
+        view = read_view(
+            sensorsim_pb2.RGBRenderRequest(
+                scene_id=request.scene_id,
+                resolution_w=SCAN_PX[0],
+                resolution_h=SCAN_PX[1],
+                frame_start_us=request.frame_start_us,
+                frame_end_us=request.frame_end_us,
+                sensor_pose=request.sensor_pose,
+                dynamic_objects=request.dynamic_objects,
+            )
+        )
+        frames = self.frames.source.scan(view, cameras, left)
+        depths = [frame.depth for frame in frames if frame.depth is not None]
+        if len(depths) < len(frames):
+            raise Unimplemented(
+                "a lidar of a renderer without depth", "use --upstream with a server that has it"
+            )
+        xyz, brightness = points_of(lidar.rays(), cameras, depths, [frame.rgb for frame in frames])
+        return sensorsim_pb2.LidarRenderReturn(
+            num_points=len(xyz),
+            point_xyzs_buffer=xyz.astype("<f4").tobytes(),
+            point_intensities_buffer=brightness.astype("<f4").tobytes(),
         )
 
     @answering
@@ -231,3 +277,108 @@ class Sensorsim(Failures):
     def _own_scenes(self) -> SceneCache:
         assert self._scenes is not None, "a server without an upstream has scenes"
         return self._scenes
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """Where a lidar looks: every row at every azimuth. Rows are those of the data sheet as far as
+    it is even, not a device's calibration.
+
+    Attributes:
+        rows_deg: Elevations.
+        azimuths_deg: From the left of straight ahead.
+        looks_deg: Azimuths of the images that cover them.
+    """
+
+    rows_deg: F64
+    azimuths_deg: F64
+    looks_deg: tuple[float, ...]
+
+    def rays(self) -> F64:
+        """Return directions ``(N, 3)``: x forwards, y left, z up."""
+        up, left = (
+            np.deg2rad(one).ravel()
+            for one in np.meshgrid(self.rows_deg, self.azimuths_deg, indexing="ij")
+        )
+        return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
+
+    def cameras(self) -> list[CameraSpec]:
+        """Return the cameras of the images, 90 degrees wide, placed on the sensor."""
+        width, height = SCAN_PX
+        K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+        out: list[CameraSpec] = []
+        for look in np.deg2rad(self.looks_deg):
+            T = np.eye(4)
+            c = np.cos(look)
+            s = np.sin(look)
+            T[:3, :3] = np.array([[s, 0, c], [-c, 0, s], [0, -1, 0]])
+            out.append(CameraSpec(f"scan{len(out)}", width, height, K, T))
+        return out
+
+
+LIDARS = {
+    sensorsim_pb2.PANDAR128: Lidar(
+        np.r_[np.linspace(-25, -6.5, 36), np.linspace(-6, 2, 65), np.linspace(2.5, 15, 27)],
+        np.arange(-180, 180, 0.2),
+        (0.0, 90.0, 180.0, 270.0),
+    ),
+    sensorsim_pb2.AT128: Lidar(
+        np.linspace(-12.5, 12.9, 128), np.arange(-60, 60, 0.1), (-30.0, 30.0)
+    ),
+}
+
+
+def points_of(
+    rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], images: Sequence[U8]
+) -> tuple[F64, F64]:
+    """Return where rays meet the surfaces of depth images, ``(P, 3)`` metres in the sensor's
+    frame, and how bright it is there ``(P,)``.
+
+    Inverse depth is linear in an image of a plane, so it is interpolated between the four pixels
+    around a ray where they are of one surface; elsewhere the nearest pixel counts. Rays without a
+    surface, or beyond `SCAN_MOST_M`, give no point.
+
+    Args:
+        rays: ``(N, 3)`` of length 1.
+        cameras: Placed on the sensor.
+        depths: ``(H, W)`` of each, metres along the axis; 0 without a surface.
+        images: ``(H, W, 3)`` of each.
+    """
+    axes = np.array([camera.T_rig_camera[:3, 2] for camera in cameras])
+    nearest = np.argmax(rays @ axes.T, axis=1)
+    points, bright = [], []
+    for index, (camera, depth, image) in enumerate(zip(cameras, depths, images, strict=True)):
+        mine = rays[nearest == index]
+        p = mine @ camera.T_rig_camera[:3, :3]
+        u, v = (
+            camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1)
+        )  # pixel centres lie at halves
+        column, row = (
+            np.clip(np.floor(x).astype(np.int64), 0, n - 2)
+            for x, n in ((u, camera.width), (v, camera.height))
+        )
+        a, b = np.clip(u - column, 0, 1), np.clip(v - row, 0, 1)
+        inverse = np.divide(1.0, depth, out=np.full(depth.shape, np.nan), where=depth > 0)
+        down, right = _is_one_surface(inverse), _is_one_surface(inverse.T).T
+        smooth = (
+            down[row, column] & down[row, column + 1] & right[row, column] & right[row + 1, column]
+        )
+        around = np.stack([inverse[row + i, column + j] for i in (0, 1) for j in (0, 1)])
+        weights = np.stack([(1 - b) * (1 - a), (1 - b) * a, b * (1 - a), b * a])
+        single = np.take_along_axis(around, weights.argmax(axis=0)[None], axis=0)[0]
+        z = 1.0 / np.where(smooth, (weights * around).sum(axis=0), single)
+        length = z / p[:, 2]
+        hit = length <= SCAN_MOST_M  # not where it is NaN, without a surface
+        points.append(mine[hit] * length[hit, None])
+        bright.append(image[row + (b > 0.5), column + (a > 0.5)][hit].mean(axis=1) / 255.0)
+    return np.concatenate(points), np.concatenate(bright)
+
+
+def _is_one_surface(inverse: F64) -> Bool:
+    """Tell ``(H - 1, W)`` which neighbours down an image of inverse depth are of one surface:
+    alike, or in even steps.
+    """
+    step = np.abs(np.diff(inverse, axis=0))
+    beside = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)
+    alike = step <= ONE_SURFACE * np.fmax(inverse[1:], inverse[:-1])
+    return alike | (step <= EVEN_STEP * np.fmin(beside[:-2], beside[2:]))

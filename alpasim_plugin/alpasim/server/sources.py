@@ -243,6 +243,32 @@ class LocalSource:
         rendered = Rendered(lens.frame(frame), sdmap)
         return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view)
 
+    def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
+        """Return frames with depth of several cameras at the view's place, at its shutter end.
+
+        Args:
+            view: Whose camera is a sensor, x forwards, y left, z up; its size does not count.
+            cameras: Placed on the sensor.
+            left: Of the caller.
+
+        Raises:
+            InputError: A track that the scene does not have; an unknown scene.
+            RendererError: The renderer broke its contract.
+        """
+        entry = self._scenes.get(view.scene_id, left)
+        boxes, out = boxes_at(entry, view), []
+        for camera in cameras:
+            with left.holding(self._busy):
+                out.append(
+                    entry.render(
+                        RenderRequest(
+                            view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes
+                        )
+                    )
+                )
+            left.left_s()
+        return out
+
 
 class UpstreamSource:
     """Ask another server of the renderer service, and estimate how far its frames can be trusted.

@@ -16,6 +16,7 @@ from .protos import (
     health_pb2,
     logging_pb2,
     physics_pb2,
+    reflection_pb2,
     runtime_pb2,
     sensorsim_pb2,
     traffic_pb2,
@@ -30,6 +31,7 @@ MODULES = (
     health_pb2,
     logging_pb2,
     physics_pb2,
+    reflection_pb2,
     runtime_pb2,
     sensorsim_pb2,
     traffic_pb2,
@@ -47,6 +49,7 @@ SERVICE_PATHS = {
     "RuntimeService": "/RuntimeService/",
     "WorldModelService": "/omnidreams.video_model.WorldModelService/",
     "Health": "/grpc.health.v1.Health/",
+    "ServerReflection": "/grpc.reflection.v1.ServerReflection/",
 }
 
 #: Version of AlpaSim's wire interface that these messages speak: what `common.VersionId` reports.
@@ -74,6 +77,7 @@ __all__ = [
     "health_pb2",
     "logging_pb2",
     "physics_pb2",
+    "reflection_pb2",
     "runtime_pb2",
     "sensorsim_pb2",
     "traffic_pb2",

@@ -1,22 +1,33 @@
-"""Call and serve the services generically.
+"""Call and serve the services generically, and let them be asked what they are.
 
 The methods are read off the compiled descriptors, the path from `SERVICE_PATHS`. No generated
 ``_pb2_grpc`` modules are needed: a path, a serialiser and a parser are all that gRPC wants.
+
+``grpcurl`` and the like ask a server for its services and messages (reflection). They must see the
+names that are dialled (``nre.grpc.protos.sensorsim.SensorsimService``), not our private packages.
+So every file is copied with its package renamed into a separate pool; protobuf's default pool never
+holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import grpc
-from google.protobuf.descriptor_pb2 import ServiceDescriptorProto
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FileDescriptorProto,
+    ServiceDescriptorProto,
+)
+from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from . import MODULES, SERVICE_PATHS
+from . import MODULES, SERVICE_PATHS, reflection_pb2
 
 MESSAGE_BYTES = 64 << 20  # AlpaSim opens its renderer channels with this limit, both ways
 OPTIONS: tuple[tuple[str, int], ...] = (
@@ -27,6 +38,24 @@ OPTIONS: tuple[tuple[str, int], ...] = (
 
 #: What gRPC says, as UNKNOWN or INTERNAL, where a connection broke in the middle of a call.
 BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
+#: Packages as AlpaSim names them, by the last part of ours; "" is no package.
+PACKAGES = {
+    "common": "common",
+    "controller": "controller",
+    "egodriver": "egodriver",
+    "health": "grpc.health.v1",
+    "logging": "logging",
+    "physics": "physics",
+    "reflection": "grpc.reflection.v1",
+    "runtime": "",
+    "sensorsim": "nre.grpc.protos.sensorsim",
+    "traffic": "traffic",
+    "video_model": "omnidreams.video_model",
+}
+OURS = ".simrun.wire."
+V1ALPHA = "/grpc.reflection.v1alpha.ServerReflection/"
+NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
+UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
 
 
 def is_lost_connection(error: Any) -> bool:
@@ -125,13 +154,16 @@ class Stub:
         raise AttributeError(f"the service has no call {name!r}")
 
 
-def handlers(service: str, implementation: object) -> grpc.GenericRpcHandler:
+def handlers(
+    service: str, implementation: object, prefix: str | None = None
+) -> grpc.GenericRpcHandler:
     """Return the handler of a service for `grpc.Server.add_generic_rpc_handlers`.
 
     Args:
         service: Name of the service, as in `SERVICE_PATHS`.
         implementation: Has a method ``name(request, context)`` for each call that it serves; the
             others answer UNIMPLEMENTED.
+        prefix: Path to serve under instead of the service's own.
     """
     made = {}
     for method in methods(service).values():
@@ -143,4 +175,129 @@ def handlers(service: str, implementation: object) -> grpc.GenericRpcHandler:
                 request_deserializer=method.request.FromString,
                 response_serializer=method.response.SerializeToString,
             )
-    return grpc.method_handlers_generic_handler(SERVICE_PATHS[service].strip("/"), made)
+    return grpc.method_handlers_generic_handler((prefix or SERVICE_PATHS[service]).strip("/"), made)
+
+
+@lru_cache(maxsize=1)
+def public_pool() -> DescriptorPool:
+    """Return a pool with every message and service under the names that AlpaSim uses."""
+    pool = DescriptorPool()
+    files = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in MODULES}
+    done: set[str] = set()
+
+    def add(file: FileDescriptor) -> None:
+        if file.name in done:
+            return
+        done.add(file.name)
+        for needed in file.dependencies:
+            add(needed)
+        pool.AddSerializedFile(renamed(file).SerializeToString())
+
+    for file in files.values():
+        add(file)
+    return pool
+
+
+def renamed(file: FileDescriptor) -> FileDescriptorProto:
+    """Return a file with AlpaSim's package in place of ours, in its own name and in every
+    reference.
+    """
+    proto = FileDescriptorProto()
+    file.CopyToProto(proto)
+    proto.package = PACKAGES[proto.package.rsplit(".", 1)[1]]
+    for message in proto.message_type:
+        _rename_fields(message)
+    for service in proto.service:
+        for method in service.method:
+            method.input_type, method.output_type = (
+                public_name(method.input_type),
+                public_name(method.output_type),
+            )
+    return proto
+
+
+def public_name(name: str) -> str:
+    """Return AlpaSim's name of one of our messages, both with a leading dot.
+
+    Example:
+        >>> public_name(".simrun.wire.sensorsim.CameraSpec"), public_name(".simrun.wire.runtime.RolloutSpec")
+        ('.nre.grpc.protos.sensorsim.CameraSpec', '.RolloutSpec')
+    """
+    package, _, rest = name.removeprefix(OURS).partition(".")
+    public = PACKAGES[package]
+    return f".{public}.{rest}" if public else f".{rest}"
+
+
+def _rename_fields(message: DescriptorProto) -> None:
+    for field in message.field:
+        if field.type_name:
+            field.type_name = public_name(field.type_name)
+    for nested in message.nested_type:
+        _rename_fields(nested)
+
+
+class Reflection:
+    """The reflection service for some services.
+
+    Args:
+        services: Names as in `SERVICE_PATHS`; reflection itself is added.
+    """
+
+    def __init__(self, services: Iterable[str]) -> None:
+        self.names = sorted(
+            SERVICE_PATHS[name].strip("/") for name in {*services, "ServerReflection"}
+        )
+
+    def handlers(self) -> tuple[grpc.GenericRpcHandler, ...]:
+        """Return the handlers of both versions of the protocol, which are equal on the wire."""
+        return handlers("ServerReflection", self), handlers("ServerReflection", self, V1ALPHA)
+
+    def ServerReflectionInfo(
+        self, requests: Iterator[reflection_pb2.ServerReflectionRequest], context: Any
+    ) -> Iterator[reflection_pb2.ServerReflectionResponse]:
+        """Answer each question of a stream in turn."""
+        for request in requests:
+            yield self.answer(request)
+
+    def answer(
+        self, request: reflection_pb2.ServerReflectionRequest
+    ) -> reflection_pb2.ServerReflectionResponse:
+        """Answer one question."""
+        response = reflection_pb2.ServerReflectionResponse(
+            valid_host=request.host, original_request=request
+        )
+        kind, pool = request.WhichOneof("message_request"), public_pool()
+        if kind == "list_services":
+            response.list_services_response.service.extend(
+                reflection_pb2.ServiceResponse(name=name) for name in self.names
+            )
+            return response
+        if kind not in ("file_by_filename", "file_containing_symbol"):
+            response.error_response.error_code = UNIMPLEMENTED
+            response.error_response.error_message = "there are no extensions here"
+            return response
+        find = pool.FindFileByName if kind == "file_by_filename" else pool.FindFileContainingSymbol
+        try:
+            file = find(getattr(request, kind))
+        except KeyError:
+            response.error_response.error_code = NOT_FOUND
+            response.error_response.error_message = (
+                f"{kind}: {getattr(request, kind)!r} is not served here"
+            )
+            return response
+        response.file_descriptor_response.file_descriptor_proto.extend(_with_needed(file))
+        return response
+
+
+def _with_needed(file: FileDescriptor) -> list[bytes]:
+    """Return a file and all that it imports, serialised; what is imported comes later, as clients
+    expect.
+    """
+    found: dict[str, bytes] = {}
+    todo = [file]
+    while todo:
+        one = todo.pop(0)
+        if one.name not in found:
+            found[one.name] = one.serialized_pb
+            todo.extend(one.dependencies)
+    return list(found.values())
