@@ -71,7 +71,7 @@ def cached(
         warn(f"{what} ...")
         announce(what)
         began = time.perf_counter()
-        with atomic_folder(folder, DO_THIS) as partial:
+        with atomic_folder(folder) as partial:
             make(partial)
         warn(f"{what}: {time.perf_counter() - began:.1f} s")
         return read(folder)
