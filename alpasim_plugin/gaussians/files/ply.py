@@ -285,7 +285,6 @@ def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating
 
 
 _MAX_HEADER_BYTES = 1 << 20
-MAX_PROPERTIES = 512  # the highest degree of colour takes 62
 _KINDS = {
     "i1": ("char", "int8"),
     "u1": ("uchar", "uint8"),
@@ -297,7 +296,7 @@ _KINDS = {
     "f8": ("double", "float64"),
 }
 _SCALAR_CODES = {word: kind for kind, words in _KINDS.items() for word in words}
-_ENDIAN = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _EXPORT_AGAIN = "export the file again as a binary PLY, or copy it again if the transfer broke off"
 
 
@@ -363,29 +362,47 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     """
     path = Path(path)
     lines, body_offset = _header_lines(path)
-    byte_order, text = "", False
-    comments = []
-    pending: list[tuple[str, int, list[tuple[str, str]] | None]] = []
+    form = ""
+    comments: list[str] = []
+    found: list[tuple[str, int, list[tuple[str, str] | None]]] = []
     for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if not words or words[0] in ("ply", "end_header"):
-            continue
-        if words[0] in ("comment", "obj_info"):
-            comments.append(" ".join(words[1:]))
-        elif words[0] == "format" and len(words) == 3:
-            text = words[1] == "ascii"
-            byte_order = "<" if text else _byte_order(path, words[1])
-        elif words[0] == "element" and len(words) == 3:
-            pending.append((words[1], _count(path, number, words[2]), []))
-        elif words[0] == "property" and pending and len(words) >= 3:
-            pending[-1] = _with_property(path, number, pending[-1], words, byte_order)
-        else:
-            raise _bad_line(path, number, line)
-    if not byte_order:
+        match line.split():
+            case [] | ["ply" | "end_header", *_]:
+                pass
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
+            case ["format", word, _] if word in _BYTE_ORDERS:
+                form = word
+            case ["element", name, count] if count.isascii() and count.isdigit():
+                rows = int(count[:20])
+                GAUSSIANS.check(rows, f"{path}, line {number}", "element count")
+                found.append((name, rows, []))
+            case ["property", "list", *_] if found:
+                found[-1][2].append(None)
+            case ["property", word, name, *_] if found and form and word in _SCALAR_CODES:
+                # CloudCompare puts scalar_ before every name.
+                code = _BYTE_ORDERS[form] + _SCALAR_CODES[word]
+                found[-1][2].append((name.removeprefix("scalar_"), code))
+            case _:
+                raise InputError(
+                    f"{path}, line {number}: a line that means nothing here: {line[:80]!r}",
+                    _EXPORT_AGAIN,
+                )
+    if not form:
         raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
-    if text:
-        return PlyHeader(path, _place(pending, 0, text), tuple(comments), body_offset)
-    return PlyHeader(path, _place(pending, body_offset), tuple(comments))
+    text = form == "ascii"
+    elements: list[PlyElement] = []
+    offset: int | None = 0 if text else body_offset
+    for name, rows, fields in found:
+        scalars = [field for field in fields if field is not None]
+        with parsing(path, _EXPORT_AGAIN, f"element {name!r}"):
+            dtype = np.dtype(scalars) if len(scalars) == len(fields) else None
+        elements.append(PlyElement(name, rows, dtype, offset))
+        if offset is not None and (text or dtype is not None):
+            offset += rows if dtype is None or text else rows * dtype.itemsize
+        else:
+            offset = None
+    return PlyHeader(path, tuple(elements), tuple(comments), body_offset if text else None)
 
 
 def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
@@ -449,68 +466,3 @@ def _header_lines(path: Path) -> tuple[list[str], int]:
             _EXPORT_AGAIN,
         )
     return head[:end].decode("ascii", errors="replace").splitlines(), end + 1
-
-
-def _byte_order(path: Path, word: str) -> str:
-    if word in _ENDIAN:
-        return _ENDIAN[word]
-    raise InputError(
-        f"{path}: format {word!r}; only {', '.join(_ENDIAN)} can hold Gaussians without loss",
-        "export the file again as a binary PLY",
-    )
-
-
-def _count(path: Path, number: int, word: str) -> int:
-    if not (word.isascii() and word.isdigit()):
-        raise InputError(
-            f"{path}, line {number}: element count {word!r}, not a whole number",
-            _EXPORT_AGAIN,
-        )
-    count = int(word) if len(word) <= 20 else 10**20
-    GAUSSIANS.check(count, f"{path}, line {number}", "element count")
-    return count
-
-
-def _with_property(
-    path: Path,
-    number: int,
-    element: tuple[str, int, list[tuple[str, str]] | None],
-    words: list[str],
-    byte_order: str,
-) -> tuple[str, int, list[tuple[str, str]] | None]:
-    """Return the element with one more property; a list property turns the layout into None."""
-    name, count, fields = element
-    if words[1] == "list" or fields is None:
-        return name, count, None
-    known_as = words[2].removeprefix("scalar_")  # which CloudCompare puts before every name
-    if (
-        len(fields) >= MAX_PROPERTIES
-        or words[1] not in _SCALAR_CODES
-        or not byte_order
-        or any(known_as == known for known, _ in fields)
-    ):
-        raise _bad_line(path, number, " ".join(words))
-    return name, count, [*fields, (known_as, byte_order + _SCALAR_CODES[words[1]])]
-
-
-def _place(
-    pending: list[tuple[str, int, list[tuple[str, str]] | None]],
-    body_offset: int,
-    text: bool = False,
-) -> tuple[PlyElement, ...]:
-    """Give each element its row layout and the position of its rows."""
-    offset: int | None = body_offset
-    elements = []
-    for name, count, fields in pending:
-        dtype = None if fields is None else np.dtype(fields)
-        elements.append(PlyElement(name, count, dtype, offset))
-        size = 1 if text else None if dtype is None else dtype.itemsize
-        offset = None if size is None or offset is None else offset + count * size
-    return tuple(elements)
-
-
-def _bad_line(path: Path, number: int, line: str) -> InputError:
-    return InputError(
-        f"{path}, line {number}: a line that means nothing here: {line[:80]!r}",
-        _EXPORT_AGAIN,
-    )
