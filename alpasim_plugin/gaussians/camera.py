@@ -88,7 +88,6 @@ class PinholeCamera:
         cls, width: int, height: int, K: npt.ArrayLike, T_world_camera: F64
     ) -> PinholeCamera:
         """Build a camera from its pose, the transform that maps camera points to the world."""
-        require_rigid(T_world_camera)
         return cls(
             width,
             height,

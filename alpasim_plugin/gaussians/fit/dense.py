@@ -41,22 +41,9 @@ FEWEST_POINTS = 12  # that tracks must place in a view
 AGREE = 0.06  # share by which the depths of two views may differ
 
 
-@dataclass(frozen=True, eq=False)
-class DepthMap:
-    """What one photograph's pixels are known of; pixels between those that are measured are 0 as
-    unknown ones are.
-
-    Attributes:
-        depth: ``(H, W)`` metres along the optical axis; 0 where unknown.
-        spread: ``(H, W)`` its standard deviation as a share of it; 0 where unknown.
-    """
-
-    depth: F32
-    spread: F32
-
-
-def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> list[DepthMap]:
-    """Return the depth of every view; nothing is known of a view in which tracks place too few
+def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> list[F32]:
+    """Return the depth ``(H, W)`` of every view, metres along the optical axis, 0 where unknown and
+    between the pixels that are measured; nothing is known of a view in which tracks place too few
     points.
 
     Args:
@@ -76,7 +63,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
             if 0 <= i + gap < len(views) and views[i + gap].camera.width == view.camera.width
         ]
         if guess is None or len(near) < 2:
-            out.append(DepthMap(*(np.zeros(view.rgb.shape[:2], np.float32) for _ in range(2))))
+            out.append(np.zeros(view.rgb.shape[:2], np.float32))
             continue
         seen = [
             _Seen.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
@@ -172,7 +159,7 @@ class _Seen:
         )
 
 
-def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
+def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
     """Find each measured pixel's inverse depth from where the neighbours see it, and judge it."""
     q = guess[::STRIDE, ::STRIDE].copy()
     for _ in range(ROUNDS):
@@ -198,13 +185,9 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
     known &= _textured(view)[::STRIDE, ::STRIDE]
     if view.mask is not None:
         known &= view.mask[::STRIDE, ::STRIDE]
-    depth, spread = (
-        np.zeros(view.rgb.shape[:2], np.float32),
-        np.zeros(view.rgb.shape[:2], np.float32),
-    )
+    depth = np.zeros(view.rgb.shape[:2], np.float32)
     depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
-    spread[::STRIDE, ::STRIDE] = np.where(known, sigma / np.maximum(q, 1e-6), 0)
-    return DepthMap(depth, spread)
+    return depth
 
 
 def _textured(view: PosedView) -> Bool:
@@ -216,11 +199,9 @@ def _textured(view: PosedView) -> Bool:
     return np.asarray(cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)
 
 
-def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> DepthMap:
-    """Keep what the depth map of a neighbour confirms, within `AGREE` and both spreads, or none can
-    look at.
-    """
-    depth, spread = maps[i].depth, maps[i].spread
+def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
+    """Keep what the depth map of a neighbour confirms, within `AGREE`, or none can look at."""
+    depth = maps[i]
     rows, columns = np.nonzero(depth)
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
@@ -228,12 +209,12 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> Dep
     confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
-            ok, looked = _confirms(views[i + gap].camera, maps[i + gap].depth, local, camera)
+            ok, looked = _confirms(views[i + gap].camera, maps[i + gap], local, camera)
             confirmed |= ok
             asked |= looked
     keep = np.zeros(depth.shape, bool)
     keep[rows, columns] = confirmed | ~asked
-    return DepthMap(np.where(keep, depth, 0), np.where(keep, spread, 0))
+    return np.where(keep, depth, 0)
 
 
 def _confirms(

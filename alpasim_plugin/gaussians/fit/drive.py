@@ -144,8 +144,8 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
     placed = place(tracks, [view.camera for view in views])
     maps = depth_maps(views, tracks, placed)
     measured = [
-        view if view.depth is not None else replace(view, depth=one.depth)
-        for view, one in zip(views, maps, strict=True)
+        view if view.depth is not None else replace(view, depth=depth)
+        for view, depth in zip(views, maps, strict=True)
     ]
     way = (
         np.linalg.norm(np.diff([view.camera.centre_world for view in views], axis=0), axis=1).sum()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.atomic import write_safetensors
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
@@ -75,19 +75,11 @@ def fit(
         Background, actors, the sky that the views saw, and their exposures.
 
     Raises:
-        InputError: No view, nothing to start from, or a folder begun with other views or another
-            recipe.
+        InputError: A folder begun with other views or another recipe.
         InfrastructureError: The loss or a gradient is not finite; the folder keeps the state before
             it.
     """
-    if not views:
-        raise InputError("no view: nothing to learn from", "give at least one posed view")
     begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
-    if len(begin.background) == 0:
-        raise InputError(
-            "a start cloud: no Gaussian in the background",
-            "start from points that the views see",
-        )
     run = SplatFit(views, begin, recipe, scene_id, threads, folder)
     while run.step < recipe.steps:
         numbers = run.update()
@@ -165,7 +157,7 @@ class SplatFit:
         out = rasterize_gradient(
             splats, target.camera, background=target.behind, threads=self.threads
         )
-        lit = out.rgb if self.exposure.plain else out.rgb * self.exposure.gain(target.index)
+        lit = out.rgb * self.exposure.gain(target.index)
         rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
         loss = _loss(rgb, out, target, recipe)
         if recipe.needle_weight > 0:

@@ -257,13 +257,11 @@ class Exposure:
     Attributes:
         log_gain: ``(V, 3)``.
         adam: Its optimiser.
-        plain: All gains are 1 and stay so.
     """
 
     def __init__(self, begin: F64) -> None:
         self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32)
         self.log_gain = self.begin.clone().requires_grad_()
-        self.plain = bool((self.begin == 0).all())
         self.adam = RowAdam({"log_gain": self.log_gain})
 
     def gain(self, view: int) -> Tensor:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from alpasim_plugin.core.errors import InputError
-
 
 @dataclass(frozen=True)
 class SplatRecipe:
@@ -56,9 +54,6 @@ class SplatRecipe:
         prune_share: Gaussians larger than this share of the extent are removed as well.
         save_every: Steps between checkpoints.
         seed: Of the start, the order of views and the splits.
-
-    Raises:
-        InputError: A number outside its range.
     """
 
     steps: int = 500
@@ -92,26 +87,6 @@ class SplatRecipe:
     prune_share: float = 0.1
     save_every: int = 250
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        checks = {
-            "steps": self.steps >= 1,
-            "views": self.views >= 1,
-            "width": self.width >= 16,
-            "points": self.points >= 1,
-            "cap": self.cap >= 1,
-            "sh_degree": 0 <= self.sh_degree <= 3,
-            "ssim_weight": 0 <= self.ssim_weight <= 1,
-            "save_every": self.save_every >= 1,
-            "densify_every": self.densify_every >= 0,
-            "sh_share": self.sh_share >= 0,
-        }
-        for name, good in checks.items():
-            if not good:
-                raise InputError(
-                    f"{name}={getattr(self, name)}: outside its range",
-                    "see SplatRecipe for what it means",
-                )
 
     @classmethod
     def street(cls) -> SplatRecipe:

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -33,9 +32,6 @@ class PosedView:
         gain: Of red, green and blue over the model's colours: the photograph's exposure and white
             balance.
         t_us: When it was taken, where that is known.
-
-    Raises:
-        InputError: An array does not have the camera's size.
     """
 
     camera: PinholeCamera
@@ -47,17 +43,6 @@ class PosedView:
     actors: Mapping[str, F64] = field(default_factory=dict)
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     t_us: int = 0
-
-    def __post_init__(self) -> None:
-        size = (self.camera.height, self.camera.width)
-        wanted = {"rgb": (*size, 3), "sky": size, "mask": size, "depth": size}
-        for name, shape in wanted.items():
-            value = getattr(self, name)
-            if value is not None and value.shape != shape:
-                raise InputError(
-                    f"{self.name!r}, {name}: shape {value.shape}, the camera has {shape}",
-                    "give images of the camera's size",
-                )
 
     @property
     def camera_name(self) -> str:

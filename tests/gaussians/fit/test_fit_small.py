@@ -11,11 +11,9 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.image_metrics import psnr_db
-from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import loop
 from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.start import Start
 from tests.gaussians.fit.conftest import BOX, actor_pose, at, camera_at
 
 QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
@@ -149,11 +147,3 @@ def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
     fit(posed.views, posed.start, QUICK, folder=tmp_path, report=lambda step, _: steps.append(step))
     assert (tmp_path / STATE_FILE).exists()
     assert steps[0] == 4
-
-
-@pytest.mark.parametrize("missing", ["views", "start"])
-def test_nothing_to_learn_from_is_one_clear_error(posed, missing):
-    with pytest.raises(InputError):
-        fit([], posed.start, QUICK) if missing == "views" else fit(
-            posed.views, Start(GaussianCloud.empty(), {}), QUICK
-        )
