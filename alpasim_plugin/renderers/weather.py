@@ -133,9 +133,10 @@ class WeatherRenderer(Renderer):
         rgb, depth = frame.read()
         environment = self.scenario.environment
         view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground)
-        cameras = {one.name: one for one in self.scenario.cameras}
-        camera = cameras.get(frame.camera, self.scenario.cameras[0])
-        T_world_rig = frame.T_world_camera @ inverse(camera.T_rig_camera)
+        T_world_rig = interpolate(self.scenario.ego_log, frame.t_us)
+        for camera in self.scenario.cameras:
+            if camera.name == frame.camera:
+                T_world_rig = frame.T_world_camera @ inverse(camera.T_rig_camera)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
         if environment.rain:
