@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
@@ -80,9 +80,6 @@ def serve(
     render_width: Annotated[
         int | None, Flag("Render wider images at this width, pixels, and enlarge them.", min=16)
     ] = None,
-    shutter: Annotated[
-        Literal["asked", "rolling", "global"], Flag("Which shutters roll: as asked, all, or none.")
-    ] = "asked",
     host_policy: HostPolicy = HostPolicy(),
     as_json: Annotated[
         bool,
@@ -118,7 +115,6 @@ def serve(
         history_bytes=history_mb * MIB,
         expiry_s=host_policy.expiry_s,
         masks={camera: Path(file) for camera, file in masks.items()},
-        shutter=shutter,
         render_width=render_width,
     )
     made = assemble(settings)

@@ -73,13 +73,12 @@ def ask(
     return asked
 
 
-def exposure(asked, shutter="asked"):
+def exposure(asked):
     view = read_view(asked)
     return exposure_of(
         asked.camera_intrinsics,
         view,
         {name: pair[1] for name, pair in view.objects.items()},
-        shutter,
     )
 
 
@@ -103,19 +102,17 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec,
 
 
 @pytest.mark.parametrize(
-    ("asked", "shutter", "rolls"),
+    ("asked", "rolls"),
     [
-        (ask(DOWN), "asked", True),
-        (ask(sensorsim_pb2.GLOBAL), "asked", False),
-        (ask(sensorsim_pb2.UNKNOWN), "asked", False),
-        (ask(sensorsim_pb2.GLOBAL), "rolling", True),
-        (ask(UP), "rolling", True),
-        (ask(DOWN), "global", False),
-        (ask(DOWN, ms=0), "asked", False),
+        (ask(DOWN), True),
+        (ask(UP), True),
+        (ask(sensorsim_pb2.GLOBAL), False),
+        (ask(sensorsim_pb2.UNKNOWN), False),
+        (ask(DOWN, ms=0), False),
     ],
 )
-def test_what_rolls(asked, shutter, rolls):
-    found = exposure(asked, shutter)
+def test_what_rolls(asked, rolls):
+    found = exposure(asked)
     assert (found is not None) == rolls
     if found is not None:
         assert (found.share[0, 0] < found.share[-1, 0]) == (
@@ -124,17 +121,13 @@ def test_what_rolls(asked, shutter, rolls):
         assert set(found.actors_start) == {o.track_id for o in asked.dynamic_objects}
 
 
-def served(shutter, asked):
-    made = assemble(Settings(renderer="clean", scenes=[SCENE], shutter=shutter))
+def served(asked):
+    made = assemble(Settings(renderer="clean", scenes=[SCENE]))
     return decode_image(made.service.frames.answers([asked], CallTime())[0])
 
 
 def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row():
-    asked = ask()
-    rolled = served("asked", asked)
-    still = served("global", asked)
-    forced = served("rolling", ask(sensorsim_pb2.GLOBAL))
-    np.testing.assert_array_equal(rolled, forced)
+    rolled, still = served(ask()), served(ask(sensorsim_pb2.GLOBAL))
     assert (
         np.abs(rolled[: H // 2].astype(int) - still[: H // 2]).mean()
         > 3 * np.abs(rolled[-2:].astype(int) - still[-2:]).mean()

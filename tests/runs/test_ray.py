@@ -68,13 +68,9 @@ def test_a_node_that_differs_drives_nothing(tmp_path):
     scenario = plan.scenarios[cell.scene]
     expected = ray_backend.identity_of(plan.parts)
     wrong = {**expected, "numpy": "0.0.1"}
-    refused = ray_backend.drive_on_node(
-        cell, plan.options, 1, scenario, plan.parts, wrong, None, tmp_path
-    )
+    refused = ray_backend.drive_on_node(cell, plan.options, 1, scenario, plan.parts, wrong, None)
     assert isinstance(refused, InfrastructureError)
-    driven = ray_backend.drive_on_node(
-        cell, plan.options, 1, scenario, plan.parts, expected, None, tmp_path
-    )
+    driven = ray_backend.drive_on_node(cell, plan.options, 1, scenario, plan.parts, expected, None)
     assert isinstance(driven, ray_backend.DrivenRollout)
     assert ray_backend.write_rollout(driven, tmp_path)["status"] == "ok"
     assert (tmp_path / cell.folder / "rollout.asl").is_file()

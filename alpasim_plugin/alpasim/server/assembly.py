@@ -17,7 +17,6 @@ from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
-from alpasim_plugin.alpasim.server.shutters import Shutter
 from alpasim_plugin.alpasim.server.sources import (
     FrameSource,
     LocalSource,
@@ -137,7 +136,6 @@ class Settings:
         device: For renderer and fixer.
         history_bytes, expiry_s: Bounds of the histories.
         masks: Grey masks by camera.
-        shutter: Which shutters roll; see `shutters.exposure_of`.
         render_width: Pixels; wider images are made at this width and enlarged. None: all are made
             as asked.
     """
@@ -150,7 +148,6 @@ class Settings:
     history_bytes: int = 2 << 30
     expiry_s: float = 900.0
     masks: Mapping[str, Path] = field(default_factory=dict)
-    shutter: Shutter = "asked"
     render_width: int | None = None
 
 
@@ -222,7 +219,7 @@ def assemble(settings: Settings) -> Assembled:
     source: FrameSource
     if settings.upstream is None:
         assert scenes is not None
-        source = LocalSource(scenes, busy, settings.shutter)
+        source = LocalSource(scenes, busy)
     else:
         channel = settings.upstream.channel()
         stub = Stub(channel, "SensorsimService")
@@ -232,7 +229,6 @@ def assemble(settings: Settings) -> Assembled:
             scenes,
             masks,
             settings.upstream.as_png,
-            settings.shutter,
         )
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
     frames = FrameServer(source, fixers, tree, busy, settings.render_width)
@@ -241,7 +237,6 @@ def assemble(settings: Settings) -> Assembled:
         "masks": {camera: file_sha256(path) for camera, path in settings.masks.items()},
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,
-        "shutter": settings.shutter,
         "render_width": settings.render_width,
     }
     service = Sensorsim(

@@ -10,7 +10,6 @@ that covers the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 from alpasim_plugin.alpasim.server.lens_cache import lenses
 from alpasim_plugin.alpasim.server.views import View, camera_of, read_lens
@@ -19,7 +18,6 @@ from alpasim_plugin.core.shutter import Along, rolling
 from alpasim_plugin.core.types import F32, F64, Exposure
 from alpasim_plugin.log.wire import sensorsim_pb2
 
-Shutter = Literal["asked", "rolling", "global"]
 ROLLS: Mapping[int, tuple[Along, bool]] = {
     sensorsim_pb2.ROLLING_TOP_TO_BOTTOM: ("rows", False),
     sensorsim_pb2.ROLLING_BOTTOM_TO_TOP: ("rows", True),
@@ -29,22 +27,17 @@ ROLLS: Mapping[int, tuple[Along, bool]] = {
 
 
 def exposure_of(
-    spec: sensorsim_pb2.CameraSpec, view: View, actors: Mapping[str, F64], shutter: Shutter
+    spec: sensorsim_pb2.CameraSpec, view: View, actors: Mapping[str, F64]
 ) -> Exposure | None:
     """Return when the pixels of the covering pinhole are exposed; None: all at the shutter's end.
 
     Args:
-        spec: The request's intrinsics.
+        spec: The request's intrinsics; a shutter of which they say nothing does not roll.
         view: The request.
         actors: Every road user's box pose at shutter end.
-        shutter: ``asked``: as the intrinsics say, and what says nothing does not roll; ``rolling``:
-            whatever does not roll does so from top to bottom; ``global``: nothing rolls.
     """
-    rolls = ROLLS.get(
-        spec.shutter_type,
-        ROLLS[sensorsim_pb2.ROLLING_TOP_TO_BOTTOM] if shutter == "rolling" else None,
-    )
-    if shutter == "global" or rolls is None or view.start_us == view.t_us:
+    rolls = ROLLS.get(spec.shutter_type)
+    if rolls is None or view.start_us == view.t_us:
         return None
     what = ("shares", view.width, view.height, *rolls)
     share = lenses.get(spec, what, lambda: _shares(spec, view.width, view.height, *rolls))

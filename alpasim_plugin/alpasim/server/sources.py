@@ -25,7 +25,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
 from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
-from alpasim_plugin.alpasim.server.shutters import Shutter, exposure_of
+from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, read_lens, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
@@ -135,16 +135,14 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     return poses | {track: pair[1] for track, pair in view.objects.items()}
 
 
-def asked_of(
-    entry: SceneEntry, request: Request, view: View, camera: CameraSpec, shutter: Shutter
-) -> RenderRequest:
+def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec) -> RenderRequest:
     """Return what is to be drawn by the pinhole that covers the request's lens.
 
     Raises:
         InputError: A track that the scene does not have.
     """
     actors = boxes_at(entry, view)
-    exposure = exposure_of(request.camera_intrinsics, view, actors, shutter)
+    exposure = exposure_of(request.camera_intrinsics, view, actors)
     return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
 
 
@@ -207,16 +205,14 @@ class LocalSource:
     Args:
         scenes: Scenes with their renderers.
         busy: Held while something is computed: renderers are no more than one at a time.
-        shutter: Which shutters roll; see `shutters.exposure_of`.
     """
 
     def __init__(
         self,
         scenes: SceneCache,
         busy: threading.Lock,
-        shutter: Shutter = "asked",
     ) -> None:
-        self._scenes, self._busy, self._shutter = scenes, busy, shutter
+        self._scenes, self._busy = scenes, busy
 
     def render(
         self, requests: Sequence[Request], views: Sequence[View], left: CallTime
@@ -235,7 +231,7 @@ class LocalSource:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
-        asked = asked_of(entry, request, view, camera, self._shutter)
+        asked = asked_of(entry, request, view, camera)
         with left.holding(self._busy):
             frame = entry.render(asked)
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
@@ -280,7 +276,6 @@ class UpstreamSource:
         masks: Grey masks by camera.
         as_png: Ask for PNG whatever the caller asked for, so that the image is not compressed
             twice.
-        shutter: Which shutters roll, for the map; see `shutters.exposure_of`.
     """
 
     def __init__(
@@ -289,9 +284,7 @@ class UpstreamSource:
         scenes: SceneCache | None,
         masks: Mapping[str, U8] | None = None,
         as_png: bool = True,
-        shutter: Shutter = "asked",
     ) -> None:
-        self._shutter: Shutter = shutter
         self._stub, self._scenes, self._masks = stub, scenes, masks or {}
         self._as_png, self._has_batch = as_png, True
         self._paths: dict[str, F64] = {}
@@ -360,7 +353,7 @@ class UpstreamSource:
                 read_lens(seen.camera_intrinsics, width, height),
                 replace(view, width=width, height=height),
             )
-            asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)), self._shutter)
+            asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)))
             sdmap = drawn_map(entry, asked, lens)
             if sdmap is not None:
                 straight = straight_of(seen.camera_intrinsics, width, height)

@@ -15,7 +15,7 @@ import socket
 import tempfile
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,11 +29,10 @@ from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
 from alpasim_plugin.core.reading import file_sha256, read_bytes
-from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.core.subprocesses import own_path_only
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
-from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME, RUN_INFO, STAGES
+from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.cell import run_cell
 from alpasim_plugin.runs.executors.choice import Executor
 from alpasim_plugin.runs.executors.local import Lost, limited
@@ -149,7 +148,6 @@ def run_on_ray(
                         plan.parts,
                         expected,
                         limit_s,
-                        root.absolute(),
                     )
                     running[task] = cell
                 for task in ray.wait(list(running), num_returns=1)[0]:
@@ -187,12 +185,8 @@ def drive_on_node(
     parts: Sequence[PartSpec],
     expected: Mapping[str, str],
     limit_s: float | None,
-    run: Path,
 ) -> DrivenRollout | SimrunError:
-    """Drive a rollout on this node; an error of the node is returned, since Ray would wrap it.
-
-    What it does is shown where the node sees the run folder.
-    """
+    """Drive a rollout on this node; an error of the node is returned, since Ray would wrap it."""
     own_path_only()  # Ray adds the driver's working directory
     name = socket.gethostname()
     differences = differences_of(expected, identity_of(tuple(parts)))
@@ -206,9 +200,7 @@ def drive_on_node(
             root = Path(scratch)
 
             def drive(cell: Cell) -> DrivenRollout:
-                is_seen = os.path.isfile(run / RUN_INFO)
-                with shown_in(run / STAGES) if is_seen else nullcontext():
-                    run_cell(cell, options, root, threads, load=lambda ref: scenario)
+                run_cell(cell, options, root, threads, load=lambda ref: scenario)
                 return read_rollout(root / cell.folder, name)
 
             return limited(drive, cell, limit_s)
