@@ -62,17 +62,6 @@ class PictureFolderReader:
             width, height, None, PERIOD, len(self.names), Fraction(1), unstated
         )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        return None
-
     def __iter__(self) -> Iterator[TimedFrame]:
         for index, name in enumerate(self.names):
             image = self._read(name)
@@ -247,8 +236,10 @@ def refine_video(
     with ExitStack() as stack:
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
-            readers[role] = PictureFolderReader(path) if os.path.isdir(path) else VideoReader(path)
-            stack.enter_context(readers[role])
+            if os.path.isdir(path):
+                readers[role] = PictureFolderReader(path)
+            else:
+                readers[role] = stack.enter_context(VideoReader(path))
         check_formats(readers)
         source = readers["input"].format
         fixer = make_fixer()

@@ -72,11 +72,10 @@ def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
 
 def test_a_server_gets_its_bounds_and_whom_it_trusts(called, tmp_path):
     (tmp_path / "token").write_text(" secret \n")
-    bounds = ("--history-mb", "16", "--shutter", "rolling")
+    bounds = ("--history-mb", "16")
     upstream = ("--upstream", f"host:1?ca=ca.pem&token_file={tmp_path / 'token'}&image=as-asked")
     settings = called(serve, "assemble", "serve", *bounds, *upstream)["settings"]
     assert (settings.history_bytes, settings.upstream.as_png) == (16 << 20, False)
-    assert settings.shutter == "rolling"
     assert (settings.upstream.token, settings.upstream.ca) == ("secret", Path("ca.pem"))
 
 

@@ -102,20 +102,6 @@ def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends():
     assert project(line, np.array([13.0, 4.0])) == (10.0, 5.0)
 
 
-def test_one_quaternion_is_that_of_many_to_the_last_bit():
-    random = np.random.default_rng(0)
-    turned = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()  # 180 degrees about each axis
-    noisy = Rotation.random(200, random_state=1).as_matrix() * (
-        1 + 1e-9 * random.normal(size=(200, 3, 3))
-    )
-    planar = Rotation.from_rotvec(random.uniform(-4, 4, (50, 1)) * [0.0, 0.0, 1.0]).as_matrix()
-    matrices = np.concatenate([turned, np.eye(3)[None], noisy, planar, -turned])
-    many = quat_from_matrix(matrices)
-    np.testing.assert_array_equal(np.stack([quat_from_matrix(one) for one in matrices]), many)
-    assert not np.signbit(quat_from_matrix(np.eye(3))).any()
-    assert np.isnan(quat_from_matrix(np.full((3, 3), np.nan))).all()
-
-
 def test_resampling_skips_repeated_points():
     line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
     np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])

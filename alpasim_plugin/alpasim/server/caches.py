@@ -83,27 +83,26 @@ class FixerCache:
     def __init__(self, spec: RendererSpec, device: str = "cpu") -> None:
         assert spec.fixer is not None, "a renderer without a fixer has nothing to fix"
         self._spec, self._session = spec.fixer, {"device": device, "threads": None}
-        self._made: dict[tuple[str, int], CausalFixer] = {}
+        self._made: dict[str, CausalFixer] = {}
 
     @property
     def needs_map(self) -> bool:
         """Whether the fixer takes semantic maps."""
         return bool(getattr(self._spec.settings, "uses_map", False))
 
-    def of(self, scene_id: str, seed: int = 0) -> CausalFixer:
-        """Return the fixer of a scene; a seed is another stream of noise."""
-        key = scene_id, seed
-        if key not in self._made:
+    def of(self, scene_id: str) -> CausalFixer:
+        """Return the fixer of a scene."""
+        if scene_id not in self._made:
             if len(self._made) >= 256:  # ids come from requests
                 self._made.clear()
-            fixer = build(self._spec, scene_id=scene_id, seed=seed, **self._session)
+            fixer = build(self._spec, scene_id=scene_id, seed=0, **self._session)
             if fixer.blocks != BlockRule(1, 1) or not hasattr(fixer, "advance"):
                 raise InputError(
                     f"fixer {self._spec.name!r}: {type(fixer).__name__} has no advance(frame, map, past)",
                     "serve a fixer of single frames, such as onefixer",
                 )
-            self._made[key] = fixer
-        return self._made[key]
+            self._made[scene_id] = fixer
+        return self._made[scene_id]
 
 
 @dataclass(frozen=True)
