@@ -79,6 +79,11 @@ class CanMap(_Part):
     steer: Received
     accel: Received
 
+    @property
+    def parts(self) -> tuple[Sent | Received, ...]:
+        """Give all messages of the map."""
+        return (*self.send, self.steer, self.accel)
+
 
 def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     """Read a map and return it with the path of its database.
@@ -132,8 +137,7 @@ class Codec:
     @property
     def uses_fd(self) -> bool:
         """Return whether any message of the map needs a CAN FD frame."""
-        parts = (*self.map.send, self.map.steer, self.map.accel)
-        return any(is_fd(self.message(part.message)) for part in parts)
+        return any(is_fd(self.message(part.message)) for part in self.map.parts)
 
     def address(self, name: str) -> FrameId:
         """Return what identifies the frames of a message."""
@@ -216,7 +220,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             "repair the database, or remove the message that it names",
         ) from error
     codec = Codec(can_map, loaded)
-    for part in (*can_map.send, can_map.steer, can_map.accel):
+    for part in can_map.parts:
         _check(codec, database, part)
     return codec
 
