@@ -65,6 +65,8 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
     if not isinstance(frame, Frame):
         return f"render returned {type(frame).__name__}, not a Frame"
     wanted = (request.camera.height, request.camera.width, 3)
+    shape: Any
+    dtype: Any
     if frame.pending:
         shape, dtype = (*frame.size, 3), np.dtype(np.uint8)
     else:

@@ -150,7 +150,7 @@ class SceneCache:
         device: str = "cpu",
     ) -> None:
         self._spec, self._needs_map = spec, needs_map
-        self._session = {"seed": 0, "device": device, "threads": None}
+        self._session: dict[str, Any] = {"seed": 0, "device": device, "threads": None}
         self._sources: dict[str, str | Path] = {}
         self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
         self._lock, self._loading = threading.Lock(), threading.Lock()
