@@ -21,7 +21,7 @@ STEP, AHEAD = (
     0.3,
     25.0,
 )  # of the path's samples; how far the strip goes on before and beyond the path, straight on
-# Points beside the path by less than they lie below it are on what was driven over, for the most
+# Points with a lateral offset less than they lie below it are on what was driven over, for the most
 # part; the wider cone is for few points.
 CONES = (1.0, 1.6)
 STRIP = 1.6  # half the width of the strip that is fitted
@@ -56,7 +56,7 @@ CELL_M, BESIDE_M, TILTED_M = (
     1.0,
     60.0,
     6.0,
-)  # of the height field; beyond TILTED_M beside the path it goes on level
+)  # of the height field; beyond a lateral offset of TILTED_M it goes on level
 
 
 class PathFrame:

@@ -252,7 +252,7 @@ def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
 
 def _piece_ahead(strip: GroundStrip, centre: F64, aside: float) -> F64:
     """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``aside``
-    camera heights beside the path.
+    camera heights of lateral offset.
     """
     here = strip.frame.place(centre[None])[0][0]
     out = []

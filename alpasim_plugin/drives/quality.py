@@ -41,7 +41,7 @@ def measure(
     tell: Report,
 ) -> tuple[dict[str, list[Comparison]], dict[float, float]]:
     """Render the model where photographs were taken that it did not see, in the exposure of those
-    near by, and beside the path.
+    near by, and at a lateral offset.
 
     Returns:
         Use of the photographs to their comparisons; and metres to the left of the path to the share
