@@ -7,7 +7,7 @@ point far better than a match of two, and its reprojection errors say how far th
 trusted.
 
 Poses of a drive come from satellite positioning and inertial sensors. They are good to centimetres
-and tenths of a degree, which is more than a pixel: a reconstruction fitted to them blurs. `adjust`
+and tenths of a degree, which is more than a pixel: a reconstruction fitted to them blurs. `corrected`
 corrects them by bundle adjustment (Triggs et al. 2000). The correction is small, so the given poses
 stay as a prior: they fix place, direction and scale of the whole, and a photograph without tracks
 keeps its pose.
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -233,51 +234,31 @@ def _angles(xyz: F64, tracks: Tracks, centre: F64) -> F64:
     return np.asarray(np.arctan2(cross, np.einsum("ij,ij->i", a, b)))
 
 
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """Photographs' cameras and the points that they show.
-
-    Attributes:
-        cameras: In the order given.
-        tracks: What was used.
-        placed: Its points.
-        before_px, after_px: Median reprojection error with the given and with the corrected poses.
+class Adjusted(NamedTuple):
+    """Photographs' cameras, and the median reprojection error with the given and with these poses,
+    pixels; NaN where there are too few tracks to say.
     """
 
-    cameras: tuple[PinholeCamera, ...]
-    tracks: Tracks
-    placed: Placed
+    cameras: Sequence[PinholeCamera]
     before_px: float
     after_px: float
 
 
 def corrected(views: Sequence[PosedView]) -> Adjusted:
     """Return cameras of views, in the order of the way and of one size, whose poses agree with what
-    the views show.
+    the views show; the same cameras where there are too few tracks to say.
     """
-    return adjust([view.camera for view in views], follow(views))
-
-
-def adjust(cameras: Sequence[PinholeCamera], tracks: Tracks) -> Adjusted:
-    """Return cameras whose poses agree with the tracks; the same cameras where there are too few
-    tracks to say.
-
-    Args:
-        cameras: As given.
-        tracks: Over the same photographs.
-    """
-    placed = place(tracks, cameras)
-    kept = tracks.only(_good(tracks, placed, 3 * LARGEST_ERROR_PX))
+    cameras = [view.camera for view in views]
+    tracks = follow(views)
+    kept = tracks.only(_good(tracks, place(tracks, cameras), 3 * LARGEST_ERROR_PX))
     if kept.count < 10:
-        return Adjusted(tuple(cameras), kept, place(kept, cameras), float("nan"), float("nan"))
+        return Adjusted(cameras, float("nan"), float("nan"))
     start = place(kept, cameras)
     before = float(np.median(start.error_px[np.isfinite(start.error_px)]))
-    moved = _solve(cameras, kept, start.xyz)
-    placed = place(tracks, moved)
-    kept = tracks.only(_good(tracks, placed, LARGEST_ERROR_PX))
+    moved = _solve(cameras, kept, start.xyz, cameras)
+    kept = tracks.only(_good(tracks, place(tracks, moved), LARGEST_ERROR_PX))
     moved = _solve(cameras, kept, place(kept, moved).xyz, moved)
-    placed = place(kept, moved)
-    return Adjusted(tuple(moved), kept, placed, before, float(np.median(placed.error_px)))
+    return Adjusted(moved, before, float(np.median(place(kept, moved).error_px)))
 
 
 def _good(tracks: Tracks, placed: Placed, error_px: float) -> Bool:
@@ -290,13 +271,13 @@ def _solve(
     given: Sequence[PinholeCamera],
     tracks: Tracks,
     xyz: F64,
-    begin: Sequence[PinholeCamera] | None = None,
+    begin: Sequence[PinholeCamera],
 ) -> list[PinholeCamera]:
     """Minimise robust reprojection error and distance from the given poses by Gauss-Newton; points
     are eliminated (Schur complement).
     """
     R0, t0, K = pose_arrays(given)
-    R, t = (a.copy() for a in pose_arrays(begin or given)[:2])
+    R, t = (a.copy() for a in pose_arrays(begin)[:2])
     for _ in range(ADJUSTING_ROUNDS):
         step, points = _step(R, t, K, R0, t0, tracks, xyz)
         for i in range(len(R)):
