@@ -37,9 +37,10 @@ def cells(folder: Path) -> dict[tuple[str, str], str]:
         for renderer in RENDERERS:
             mine = [one for one in rollouts if (one.policy, one.renderer) == (policy, renderer)]
             clear = [one for one in mine if not any(one.metrics.get(name) for name in OUTCOMES)]
-            metres = [one.metrics["lateral_distance_m"] or 0.0 for one in mine]
-            mean_m = sum(metres) / len(metres)
-            found[policy, renderer] = f"{len(clear)} of {len(mine)}, {mean_m:.2f} m"
+            metres = [one.metrics["lateral_distance_m"] for one in mine]
+            known = [value for value in metres if value is not None]
+            mean_m = f"{sum(known) / len(known):.2f} m" if known else "no distance"
+            found[policy, renderer] = f"{len(clear)} of {len(mine)}, {mean_m}"
     return found
 
 
