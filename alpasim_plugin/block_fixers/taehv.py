@@ -37,7 +37,7 @@ from alpasim_plugin.block_fixers.streaming import (
     run_layers,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import StateDict, load_checked, unwrap
+from alpasim_plugin.fixers.network.checkpoints import StateDict, clean, load_checked, unwrap
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3
@@ -144,7 +144,7 @@ class TinyDecoder(StreamingDecoder):
         """
         tensors = {
             key: value
-            for key, value in unwrap(sd, source).items()
+            for key, value in clean(unwrap(sd, source)).items()
             if not key.startswith("encoder.")
         }
         latent, widths = _read_widths(tensors, source)

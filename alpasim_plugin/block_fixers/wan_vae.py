@@ -39,7 +39,7 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     Upsample,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
+from alpasim_plugin.fixers.network.checkpoints import clean, load_checked, unwrap
 
 COLOURS, LATENT = 3, 16
 STEM = "encoder.conv1.bias"
@@ -141,7 +141,7 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
-        tensors = unwrap(sd, source)
+        tensors = clean(unwrap(sd, source))
         if STEM not in tensors:
             raise InputError(f"{source} ({len(tensors)} tensors): missing: {STEM}", DO)
         with torch.device("meta"):

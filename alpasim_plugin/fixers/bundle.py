@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration, Fixer
-from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.core.reading.arrays import read_metadata, refuse_shards
 from alpasim_plugin.core.reading.files import parse_json
 from alpasim_plugin.fixers.settings import WeightedSettings
 
@@ -72,6 +72,7 @@ class FixerFactory(Generic[S]):
             if path is not None:
                 files[f"weights.{part}"] = path
         for key, path in files.items():
+            refuse_shards(path)
             if not os.path.isfile(path):
                 raise InputError(
                     f"{settings.name}: {key} = {path}: no such file",

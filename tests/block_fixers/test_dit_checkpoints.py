@@ -5,17 +5,24 @@ nothing but tensors is unpickled.
 from __future__ import annotations
 
 import io
+import json
 import pickle
+import shlex
+import subprocess
+import sys
 
 import pytest
 import torch
+import torch.distributed.checkpoint as distributed
 from safetensors.torch import save_file
 
 from alpasim_plugin.block_fixers.dit import FLOAT32_KEYS, CosmosCausalDiT
+from alpasim_plugin.block_fixers.factory import blocks
 from alpasim_plugin.block_fixers.networks import at_precision
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.dit_cases import SMALL, clip, furthest
 from tests.block_fixers.dit_reference import random_weights, velocity
@@ -78,6 +85,62 @@ def test_everything_a_training_run_stores_besides_is_tolerated(wrap):
     sd, c = random_weights(SMALL), clip(3)
     with torch.no_grad():
         assert torch.equal(load(wrap(dressed(sd)))(*c), load(sd)(*c))
+
+
+@pytest.mark.parametrize("prefix", ["module.", "net_ema.", "module.net_ema.", "_orig_mod."])
+def test_prefixes_of_wrappers_and_averages_are_stripped(prefix):
+    sd = random_weights(SMALL)
+    back = load({prefix + key: value for key, value in sd.items()}).state_dict()
+    assert all(torch.equal(back[key], sd[key]) for key in sd)
+
+
+def test_a_network_without_a_map_is_refused():
+    sd = changed("additional_patch_embedding.proj.1.weight", None)
+    with pytest.raises(InputError) as caught:
+        load(sd)
+    assert "additional_patch_embedding" in caught.value.message
+
+
+# --- shards, which the commands of docs/fixers.md join
+
+
+def of_the_page(repo, word, folder):
+    """Return a command of the page that holds a word, for a folder."""
+    lines = (repo / "docs" / "fixers.md").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("python -") and word in line)
+    return [sys.executable, *shlex.split(line.replace("FOLDER", str(folder)), comments=True)[1:]]
+
+
+def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
+    sd, folder = random_weights(SMALL), tmp_path / "shards"
+    folder.mkdir()
+    halves = sorted(sd)[::2], sorted(sd)[1::2]
+    for number, keys in enumerate(halves):
+        write_safetensors(folder / f"net-{number}.safetensors", {key: sd[key] for key in keys})
+    index = folder / "net.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {key: "net-0.safetensors" for key in halves[0]}}))
+    for path in (folder, index):
+        with pytest.raises(InputError):
+            load_weights(path)
+        with pytest.raises(InputError):
+            describe("onefixer-2b", f"weights.dit={path}")
+    subprocess.run(of_the_page(repo, "glob", folder), cwd=tmp_path, check=True)
+    back = load(load_weights(tmp_path / "net.safetensors")).state_dict()
+    assert all(torch.equal(back[key], sd[key]) for key in sd)
+
+
+def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
+    sd, folder = random_weights(SMALL), tmp_path / "shards"
+    distributed.save({f"net.{key}": value for key, value in sd.items()}, checkpoint_id=folder)
+    with pytest.raises(InputError):
+        load_weights(folder)
+    subprocess.run(of_the_page(repo, "dcp_to_torch", folder), cwd=tmp_path, check=True)
+    back = load(load_weights(tmp_path / "net.pt")).state_dict()
+    assert all(torch.equal(back[key], sd[key]) for key in sd)
+
+
+def describe(name, *overrides):
+    return blocks.describe(fixer_settings(name, list(overrides)))
 
 
 def test_network_owns_a_copy_of_its_weights():

@@ -19,6 +19,7 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     causal_conv,
 )
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.codec_cases import (
     SMALL,
     clip,
@@ -187,6 +188,14 @@ def test_sizes_are_read_off_the_tensors():
     made = WanVAE.random(12)
     video = clip(5, 16, 16)
     assert torch.equal(WanVAE.from_state_dict(made.state_dict()).encode(video), made.encode(video))
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_a_torch_file_of_tensors_loads(vae, tmp_path, prefix):
+    path = tmp_path / "Wan2.1_VAE.pth"
+    torch.save({prefix + key: value for key, value in vae.state_dict().items()}, path)
+    back = WanVAE.from_state_dict(load_weights(path)).state_dict()
+    assert all(torch.equal(back[key], value) for key, value in vae.state_dict().items())
 
 
 @pytest.mark.parametrize(("base", "millions"), [(96, 126.9), (24, 8.04)])

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 NO_ARRAY = "no readable NumPy array"
 NO_CHECKPOINT = "not a whole checkpoint"
+ONE_FILE = "Make one file of tensors of it: docs/fixers.md, Published weights"
 START_ANEW = "remove the folder and start again, or put a whole copy of the file there"
 
 Array = np.ndarray[Any, Any]
@@ -68,6 +69,16 @@ def read_checkpoint(path: Path, facts: str) -> tuple[dict[str, str], dict[str, T
         )
     with parsing(path, START_ANEW, NO_CHECKPOINT):
         return metadata, load_file(str(path))
+
+
+def refuse_shards(path: Path) -> None:
+    """Refuse weights that are a folder of shards, or the index of one.
+
+    Raises:
+        InputError: They are.
+    """
+    if path.is_dir() or path.name.endswith(".index.json"):
+        raise InputError(f"{path}: a checkpoint in shards, not one file", ONE_FILE)
 
 
 def read_metadata(

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import WEIGHT_BYTES
 from alpasim_plugin.core.reading import check_regular, file_sha256, parsing
+from alpasim_plugin.core.reading.arrays import ONE_FILE, refuse_shards
 from alpasim_plugin.core.reading.files import open_regular
 
 StateDict = dict[str, Tensor]
@@ -23,7 +24,9 @@ RECOMPUTED = (
     "pos_embedder.dim_spatial_range",
     "pos_embedder.dim_temporal_range",
 )
-CHECKPOINT_INFIX = "_checkpoint_wrapped_module."
+INFIXES = ("_checkpoint_wrapped_module.", "_orig_mod.")  # of wrappers around layers
+WRAPPER = "module."  # of data-parallel training, before all keys
+OWN, AVERAGED = "net.", "net_ema."  # where a training checkpoint holds both, the first is read
 LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
 
@@ -44,6 +47,7 @@ def load_weights(path: str | Path, sha256: str | None = None) -> StateDict:
             than tensors.
     """
     path = Path(path)
+    refuse_shards(path)
     check_regular(path, WEIGHT_BYTES)
     if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
         raise InputError(
@@ -88,17 +92,20 @@ def unwrap(content: object, source: str) -> StateDict:
 def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     """Return the network's own tensors under their plain keys.
 
-    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights,
-    optimiser) is dropped. Also dropped: rotary buffers (recomputed), training counters,
-    transformer-engine states, the infix of activation checkpointing.
+    A prefix ``module.`` is stripped, then ``net.``, or else ``net_ema.``; where one is used,
+    everything without it (other weights, optimiser) is dropped. Also dropped: rotary buffers
+    (recomputed), training counters, transformer-engine states, the infixes of wrappers.
     """
-    prefixed = any(key.startswith("net.") for key in tensors)
+    keys = {key.removeprefix(WRAPPER): value for key, value in tensors.items()}
+    used = [prefix for prefix in (OWN, AVERAGED) if any(key.startswith(prefix) for key in keys)]
+    prefix = used[0] if used else ""
     out: StateDict = {}
-    for key, value in tensors.items():
-        if prefixed and not key.startswith("net."):
-            continue
-        plain = key.removeprefix("net.").replace(CHECKPOINT_INFIX, "")
-        if plain not in RECOMPUTED and not _is_bookkeeping(plain):
+    for key, value in keys.items():
+        plain = key.removeprefix(prefix)
+        for infix in INFIXES:
+            plain = plain.replace(infix, "")
+        is_own = key.startswith(prefix) and plain not in RECOMPUTED
+        if is_own and not _is_bookkeeping(plain):
             out[plain] = value
     return out
 
@@ -192,7 +199,7 @@ def _load_pickle(path: Path) -> object:
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path}: a pickle that holds more than tensors; loading it could run code",
-            "save the tensors alone, best as safetensors",
+            ONE_FILE,
         ) from error
     except Exception as error:  # whatever the unpickler raises on damaged bytes
         raise InputError(
