@@ -223,6 +223,7 @@ def pretended_device(patch: Any) -> Iterator[Traffic]:
 
     patch.setattr(torch.cuda, "is_available", lambda: True)
     patch.setattr(torch.cuda, "device_count", lambda: 1)
+    patch.setattr(torch.cuda, "get_device_name", lambda: "pretended")
     patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
     # Subclasses of tensors do not work in inference mode; gradients are off in either.
     plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]

@@ -120,6 +120,7 @@ def per_frame(
     precision: Annotated[
         Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")
     ] = "fp32",
+    device: options.Device = "cpu",
     threads: options.Threads = None,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
@@ -167,7 +168,9 @@ def per_frame(
         perceptual, temporal, flow, grid, horizon=frames
     )
     needs_distance = any(stage.perceptual for stage in chosen_variant.stages)
-    distance = progress.perceptual_term(metric_weights) if needs_distance else None
+    distance = progress.perceptual_term(metric_weights, device) if needs_distance else None
     dtype = torch.bfloat16 if precision == "bf16" else None
-    run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
+    run = PixelRun(
+        settings, source, chosen_variant, schedule, init, seed, dtype, keep_every, device
+    )
     progress.wrote(train_per_frame(run, out, distance, stop_at, progress.update), as_json)

@@ -12,6 +12,7 @@ import torch
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
@@ -60,6 +61,9 @@ Channels = Annotated[
 Precision = Annotated[
     Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")
 ]
+Device = Annotated[
+    str, typer.Option("--device", help="cpu, cuda or cuda:N; a run may go on on another.")
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, sampling and noise.")]
 MetricWeights = Annotated[
     Path | None,
@@ -99,13 +103,18 @@ class Progress:
         self.console, self.steps, self.began = Console(stderr=True), steps, time.time()
         self.every = every or max(steps // 100, 1)
 
-    def perceptual_term(self, metric_weights: Path | None) -> tuple[str, Distance]:
+    def perceptual_term(
+        self, metric_weights: Path | None, device: str = "cpu"
+    ) -> tuple[str, Distance]:
         """Select the perceptual distance of the loss, and print its name.
 
         Raises:
             InputError: The named folder has no LPIPS weights.
+            InfrastructureError: There is no such device.
         """
         name, measure = distance_for_training(metric_weights)
+        if isinstance(measure, torch.nn.Module):
+            measure.to(require_device(device))
         self.console.print(f"perceptual term: {name}")
         return name, measure.distance
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
@@ -48,6 +49,7 @@ class PixelRun:
         precision: Of the forward passes: None is float32.
         keep_every: Updates between bundles that are kept for a learning curve; 0 keeps the last
             alone.
+        device: Where to train; a run may go on on another.
     """
 
     settings: PixelFixerSettings
@@ -58,6 +60,7 @@ class PixelRun:
     seed: int = 0
     precision: torch.dtype | None = None
     keep_every: int = 0
+    device: str = "cpu"
 
 
 def train_per_frame(
@@ -79,9 +82,9 @@ def train_per_frame(
 
     Raises:
         InputError: Weights of other sizes, or a folder of another run.
-        InfrastructureError: The loss is not finite.
+        InfrastructureError: The loss is not finite, or there is no such device.
     """
-    net = initial_generator(run)
+    net = initial_generator(run).to(require_device(run.device))
     task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed)
     facts = {
         **task.facts,

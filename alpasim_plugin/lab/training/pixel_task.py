@@ -172,7 +172,7 @@ class PixelTask:
         )
         return NoisyBatch(sample, got.fresh)
 
-    def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of an update and what is logged; the state goes on to the next."""
         sample = batch.sample
         start = self.net.start(sample.render[:, 0])
@@ -186,15 +186,15 @@ class PixelTask:
             _psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render)
         )
         degraded = given < 40  # renders that are the truth, or nearly, say nothing about repair
-        gain = float((made - given)[degraded].mean()) if bool(degraded.any()) else 0.0
+        gain = ((made - given) * degraded).sum() / degraded.sum().clamp(min=1)
         return found.total, {
-            "picture": float(found.picture.detach()),
-            "perceptual": float(found.perceptual.detach()),
-            "temporal": float(found.temporal.detach()),
-            "flow": float(found.flow.detach()),
-            "grid": float(found.grid.detach()),
-            "choice": float(found.choice.detach()),
-            "psnr_db": float(made.mean()),
+            "picture": found.picture.detach(),
+            "perceptual": found.perceptual.detach(),
+            "temporal": found.temporal.detach(),
+            "flow": found.flow.detach(),
+            "grid": found.grid.detach(),
+            "choice": found.choice.detach(),
+            "psnr_db": made.mean(),
             "gain_db": gain,
         }
 

@@ -11,7 +11,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, Literal, Protocol, TypeVar
@@ -26,7 +26,7 @@ from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.fixers.network.checkpoints import listed, load_weights
 
 Batch = TypeVar("Batch")
-Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
+Loss = tuple[Tensor, Mapping[str, Tensor | float]]  # loss, and values for the log
 
 STATE_FILE = "state.safetensors"
 LOG_FILE = "log.jsonl"
@@ -168,6 +168,7 @@ class Trainer(Generic[Batch]):
         self.module, self.folder, self.schedule = module, folder, schedule
         self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
+        self.device = next(iter(self.parameters.values())).device
         self._parts = [
             (name, part, _parameters_of(name, self.parameters)) for name, part in parts.items()
         ]
@@ -271,24 +272,24 @@ class Trainer(Generic[Batch]):
     def _update(self) -> dict[str, float]:
         began, core_began = time.perf_counter(), time.process_time()
         self.optimiser.zero_grad(set_to_none=True)
-        sums: dict[str, float] = {}
+        sums: dict[str, Tensor | float] = {}
         n = self.schedule.accumulate
         for part in range(n):
             index = self.step * n + part
             batch = self._batch(index)
-            device = next(iter(self.parameters.values())).device.type
             with torch.autocast(
-                device, self._autocast or torch.bfloat16, enabled=self._autocast is not None
+                self.device.type,
+                self._autocast or torch.bfloat16,
+                enabled=self._autocast is not None,
             ):
-                loss, numbers = self._loss(batch, index)
-            if not torch.isfinite(loss):
-                self._stop(batch, f"loss {loss.item()} in batch {index}")
+                loss, numbers = self._loss(moved(batch, self.device), index)
             (loss / n).backward()  # type: ignore[no-untyped-call]
-            for name, value in {"loss": float(loss.detach()), **numbers}.items():
+            for name, value in {"loss": loss.detach(), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
         norms = self._clip()
-        if not all(map(math.isfinite, norms.values())):
-            self._stop(batch, f"gradient norm {norms} at update {self.step}")
+        found = floats({**sums, **norms})
+        if not all(map(math.isfinite, found.values())):
+            self._stop(batch, f"update {self.step}: {found}")
         lr = self.schedule.lr(self.step)
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group["rate"]
@@ -299,21 +300,20 @@ class Trainer(Generic[Batch]):
         )  # only now: a failed update leaves the last one's
         self._update_average()
         return {
-            **sums,
-            **norms,
+            **found,
             "lr": lr,
             "s": time.perf_counter() - began,
             CORE_S: time.process_time() - core_began,
         }
 
-    def _clip(self) -> dict[str, float]:
+    def _clip(self) -> dict[str, Tensor]:
         """Clip the gradients of every part that has any, and return their norms."""
         norms = {}
         for name, part, own in self._parts:
             if any(p.grad is not None for p in own.values()):
                 clip = self.schedule.clip if part.clip is None else part.clip
                 key = f"grad_norm.{name}" if len(self._parts) > 1 else "grad_norm"
-                norms[key] = float(nn.utils.clip_grad_norm_(list(own.values()), clip))
+                norms[key] = nn.utils.clip_grad_norm_(list(own.values()), clip)
         return norms
 
     def _update_average(self) -> None:
@@ -367,7 +367,7 @@ class Trainer(Generic[Batch]):
                 if key.startswith(CARRIED)
             }
             if self._carried is not None:
-                self._carried.carry(self._kept)
+                self._carried.carry(moved(self._kept, self.device))
             self._take(tensors)
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:
@@ -403,6 +403,33 @@ class Trainer(Generic[Batch]):
             with parsing(path, f"remove {path}; only the curves are lost", "not a training log"):
                 kept = [line for line in lines if parse_json(line, path)["step"] <= self.step]
             write_text(path, "".join(line + "\n" for line in kept))
+
+
+def moved(value: Any, device: torch.device) -> Any:
+    """Return a batch with its tensors on a device: a tensor, or dataclasses, mappings and tuples
+    of them; anything else as it is.
+    """
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {field.name: getattr(value, field.name) for field in fields(value)}
+        return replace(value, **moved(parts, device))
+    if isinstance(value, Mapping):
+        return {key: moved(part, device) for key, part in value.items()}
+    if isinstance(value, tuple):
+        parts_moved = [moved(part, device) for part in value]
+        return type(value)(*parts_moved) if hasattr(value, "_fields") else tuple(parts_moved)
+    return value
+
+
+def floats(numbers: Mapping[str, Tensor | float]) -> dict[str, float]:
+    """Return numbers of a device as floats; all are waited for at once."""
+    tensors = [value.float() for value in numbers.values() if isinstance(value, Tensor)]
+    downloaded = iter(torch.stack(tensors).cpu().tolist() if tensors else ())
+    return {
+        name: next(downloaded) if isinstance(value, Tensor) else value
+        for name, value in numbers.items()
+    }
 
 
 def _parameters_of(part: str, parameters: Mapping[str, nn.Parameter]) -> dict[str, nn.Parameter]:

@@ -27,6 +27,7 @@ from alpasim_plugin.lab.training.pixel_rollout import (
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
+from tests.pretended_device import pretended_device
 
 SMALL = (
     "generator.widths=[8,8,8]",
@@ -292,3 +293,26 @@ def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_wh
     assert float(choice_term(nowhere, truth).detach()) < 0.1, (
         "a reference that holds nowhere is not to be chosen"
     )
+
+
+def pixel_run(**options):
+    settings = fixer_settings("onefixer", list(SMALL))
+    variant = pixel_variant("V9").weighted(0.0, 0.25, 0.25, 0.01, horizon=2)
+    return PixelRun(settings, Streams(), variant, Schedule(4, warmup=0, save_every=4), **options)
+
+
+def test_a_run_on_a_device_equals_the_processors_and_goes_on_there(tmp_path, monkeypatch):
+    pytest.importorskip("triton", reason="Triton is not installed")
+    wanted = load_weights(train_per_frame(pixel_run(), tmp_path / "host", None))
+    waits = []
+    with pretended_device(monkeypatch) as traffic:
+        run = pixel_run(device="cuda")
+
+        def report(step, numbers):
+            waits.append(sum(traffic.waits.values()))
+            traffic.reset()
+
+        train_per_frame(run, tmp_path / "device", None, 2, report)
+    found = load_weights(train_per_frame(pixel_run(), tmp_path / "device", None))
+    assert all(torch.equal(found[key], value) for key, value in wanted.items())
+    assert waits[-1] <= 2
