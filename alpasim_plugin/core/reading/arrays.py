@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,7 +78,7 @@ def refuse_shards(path: Path) -> None:
     Raises:
         InputError: They are.
     """
-    if path.is_dir() or path.name.endswith(".index.json"):
+    if os.path.isdir(path) or path.name.endswith(".index.json"):
         raise InputError(f"{path}: a checkpoint in shards, not one file", ONE_FILE)
 
 
