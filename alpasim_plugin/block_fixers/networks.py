@@ -35,7 +35,6 @@ from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.pixel_network import DTYPES
-from alpasim_plugin.fixers.settings import FixerSettings
 
 Precision = Literal["fp32", "bf16"]
 Net = TypeVar("Net", bound=nn.Module)
@@ -79,10 +78,7 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
         InputError: Weights that are missing or do not fit.
         InfrastructureError: The device is not here.
     """
-    device = require_device(device)
-    loop = FixerSettings(name="")  # settings of the loop do not change the networks
-    usual = {key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}
-    return _load(settings.model_copy(update=usual), device)
+    return _load(settings, require_device(device))
 
 
 def streaming_dit(

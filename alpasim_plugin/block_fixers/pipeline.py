@@ -37,12 +37,8 @@ def condition_of(
         z_map, z_render: ``(B, 16, T, h, w)``.
         opacity: From `opacity_input`.
     """
-    parts = [z_map]
-    if settings.render_input:
-        parts.append(z_render)
-    if opacity is not None:
-        parts.append(opacity)
-    return torch.cat(parts, dim=1)
+    render = z_render if settings.render_input else None
+    return torch.cat([part for part in (z_map, render, opacity) if part is not None], dim=1)
 
 
 def opacity_input(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -103,18 +103,12 @@ def in_passes(
     return (torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]), state
 
 
-@runtime_checkable
-class Causal(Protocol):
-    """A layer that sees past frames."""
-
-    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
-        """Map the next frames; past frames are read from ``streaming`` and updated there."""
-
-
 def run_layers(layers: Iterable[nn.Module], x: Tensor, streaming: StreamingState) -> Tensor:
-    """Apply layers in sequence; causal layers use the streaming state."""
+    """Apply layers in sequence. A layer that sees past frames has ``next(x, streaming)``, which
+    reads them from the streaming state and leaves its own there.
+    """
     for layer in layers:
-        x = layer.next(x, streaming) if isinstance(layer, Causal) else layer(x)
+        x = layer.next(x, streaming) if hasattr(layer, "next") else layer(x)
     return x
 
 
@@ -140,6 +134,13 @@ def channels_to_frames(x: Tensor, parts: int) -> Tensor:
     return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
 
 
+def spread(x: Tensor) -> Tensor:
+    """Rearrange the channels of ``(B, T, H, W, 4 * C)`` as 2x2 pixels: ``(B, T, 2H, 2W, C)``."""
+    b, t, rows, columns, _ = x.shape
+    squares = x.view(b, t, rows, columns, 2, 2, -1).permute(0, 1, 2, 4, 3, 5, 6)
+    return squares.reshape(b, t, 2 * rows, 2 * columns, -1)
+
+
 def conv_frames(
     x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1, padding: int = 0
 ) -> Tensor:
@@ -157,25 +158,33 @@ def conv_frames(
 
 
 class FrameConv(nn.Conv2d):
-    """3x3 convolution of every frame, zero padding."""
+    """Convolution of every frame, by default 3x3 with zeros around it."""
 
-    def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
-        super().__init__(inputs, outputs, 3, bias=bias)
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        bias: bool = True,
+        side: int = 3,
+        stride: int = 1,
+        around: int = 1,
+    ) -> None:
+        super().__init__(inputs, outputs, side, stride, around, bias=bias)
 
     def forward(self, input: Tensor) -> Tensor:
-        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
-        return conv_frames(input, self.weight, self.bias, padding=1)
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H / stride, W / stride, outputs)``."""
+        return conv_frames(input, self.weight, self.bias, self.stride[0], int(self.padding[0]))
 
 
-class DownsampleConv(nn.Conv2d):
+class DownsampleConv(FrameConv):
     """3x3 convolution with stride 2; zero padding at the bottom and right only."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(inputs, outputs, 3, stride=2)
+        super().__init__(inputs, outputs, stride=2, around=0)
 
     def forward(self, input: Tensor) -> Tensor:
         """Map ``(B, T, H, W, inputs)`` to ``(B, T, H/2, W/2, outputs)``."""
-        return conv_frames(F.pad(input, (0, 0, 0, 1, 0, 1)), self.weight, self.bias, stride=2)
+        return super().forward(F.pad(input, (0, 0, 0, 1, 0, 1)))
 
 
 class UpsampleConv(FrameConv):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -33,6 +33,7 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_to_frames,
     conv_frames,
     run_layers,
+    spread,
 )
 from alpasim_plugin.core.errors import InputError
 
@@ -127,11 +128,7 @@ class CosineTransform(nn.Module):
         return conv_frames(grid, self.kernel, None, stride=SIDE // QUARTER)
 
     def _sum(self, coefficients: Tensor) -> Tensor:
-        b, t, rows, columns, _ = coefficients.shape
-        squares = F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)).view(
-            b, t, rows, columns, 2, 2, -1
-        )
-        return squares.permute(0, 1, 2, 4, 3, 5, 6).reshape(b, t, 2 * rows, 2 * columns, -1)
+        return spread(F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)))
 
 
 def _kernel() -> Tensor:
@@ -188,19 +185,20 @@ class TinySizes:
         Raises:
             InputError: One of the biases is missing.
         """
-        keys = {
-            "encoder_quarter": "encoder.stem.bias",
-            "encoder_eighth": "encoder.fold.bias",
-            "decoder_eighth": "decoder.stem.bias",
-            "decoder_quarter": "decoder.quarter.bias",
-            "decoder_frame": "decoder.mix.last.bias",
-        }
-        missing = [key for key in keys.values() if key not in tensors]
+        layers = (
+            "encoder.stem",
+            "encoder.fold",
+            "decoder.stem",
+            "decoder.quarter",
+            "decoder.mix.last",
+        )
+        keys = [f"{layer}.bias" for layer in layers]
+        missing = [key for key in keys if key not in tensors]
         if missing:
             raise InputError(
                 f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", do
             )
-        return cls(**{field.name: tensors[keys[field.name]].numel() for field in fields(cls)})
+        return cls(*(tensors[key].numel() for key in keys))
 
 
 def activation() -> nn.LeakyReLU:
@@ -226,17 +224,6 @@ class TemporalResidualBlock(nn.Module):
         return F.leaky_relu_(out.add_(x), SLOPE)
 
 
-class Downsample(nn.Conv2d):
-    """2x2 convolution with stride 2."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(inputs, outputs, 2, stride=2)
-
-    def forward(self, input: Tensor) -> Tensor:
-        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H/2, W/2, outputs)``."""
-        return conv_frames(input, self.weight, self.bias, stride=2)
-
-
 class Upsample(PointwiseConv):
     """Linear map of one cell to 2x2 cells (pixel shuffle) with one shared bias."""
 
@@ -246,10 +233,8 @@ class Upsample(PointwiseConv):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, T, H, W, inputs)`` to ``(B, T, 2H, 2W, outputs)``."""
-        b, t, rows, columns, _ = x.shape
         assert self.bias is not None
-        four = F.linear(x, self.weight, self.bias.repeat(4)).view(b, t, rows, columns, 2, 2, -1)
-        return four.permute(0, 1, 2, 4, 3, 5, 6).reshape(b, t, 2 * rows, 2 * columns, -1)
+        return spread(F.linear(x, self.weight, self.bias.repeat(4)))
 
 
 class TinyVAEEncoder(nn.Module):
@@ -260,7 +245,7 @@ class TinyVAEEncoder(nn.Module):
         quarter, eighth = sizes.encoder_quarter, sizes.encoder_eighth
         self.stem = FrameConv(GROUP * PIXELS, quarter)
         self.near = TemporalResidualBlock(quarter)
-        self.fold = Downsample(quarter, eighth)
+        self.fold = FrameConv(quarter, eighth, side=2, stride=2, around=0)
         self.far = nn.ModuleList([TemporalResidualBlock(eighth), TemporalResidualBlock(eighth)])
         self.head = FrameConv(eighth, LATENT)
 

@@ -27,11 +27,12 @@ def doctor(
     gpu: Annotated[
         bool, Flag("Compare the first CUDA device with the CPU, then time it.", "--gpu")
     ] = False,
+    budget_s: Annotated[float, Flag("Seconds that --gpu may take.", "--budget", min=1.0)] = 400.0,
     as_json: Json = False,
 ) -> None:
     """Test each part on a small case and report what fails."""
     if gpu:
-        _check_gpu(as_json)
+        _check_gpu(budget_s, as_json)
     rows = []
     for name, check in CHECKS.items():
         row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}
@@ -51,13 +52,13 @@ def doctor(
     raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
 
 
-def _check_gpu(as_json: bool) -> None:
+def _check_gpu(budget_s: float, as_json: bool) -> None:
     """Print one line a section as it ends, then exit: 0 if the card agrees with the CPU."""
     from alpasim_plugin.runs.gpu_check import check_gpu
 
     device = require_device("cuda")
     sections = {}
-    for name, facts in check_gpu(device):
+    for name, facts in check_gpu(device, budget_s):
         sections[name] = facts
         if not as_json:
             show(False, facts, f"{name:>12}  {json.dumps(facts)}")

@@ -23,7 +23,7 @@ Examples:
 
 - `simrun list runs`: every run folder below runs/, the newest first
 
-- `simrun list runs nightly --renderer onefixer --since 7d --metric offroad`
+- `simrun list runs nightly --renderer onefixer --metric offroad`
 """
 
 Kind = Literal["renderers", "fixers", "policies", "scenarios", "metrics", "presets", "runs"]
@@ -41,9 +41,6 @@ def list_names(
     policy: Annotated[
         tuple[str, ...], Flag("Runs with this policy; * and ? match. Repeatable.")
     ] = (),
-    since: Annotated[
-        str | None, Flag("Runs begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")
-    ] = None,
     metric: Annotated[tuple[str, ...], Flag("Show this metric of each run. Repeatable.")] = (),
     as_json: Json = False,
 ) -> None:
@@ -51,9 +48,9 @@ def list_names(
     if kind == "runs":
         from alpasim_plugin.cli.list_runs import list_runs
 
-        list_runs(roots or (Path("runs"),), renderer, policy, since, metric, as_json)
+        list_runs(roots or (Path("runs"),), renderer, policy, metric, as_json)
         return
-    if roots or renderer or policy or since or metric:
+    if roots or renderer or policy or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
     if kind is None:
         known = {name: f"simrun list {name}" for name in get_args(Kind)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
 from evaluators.numbers import plural
-from evaluators.report.runs import RunEntry, as_day, find_runs, runs_table
+from evaluators.report.runs import RunEntry, find_runs, runs_table
 
 VALUES = ("mean", "ci95_clustered", "n_rollouts")
 
@@ -21,7 +20,6 @@ def list_runs(
     roots: Sequence[Path],
     renderers: tuple[str, ...],
     policies: tuple[str, ...],
-    since: str | None,
     metrics: Sequence[str],
     as_json: bool,
 ) -> None:
@@ -30,23 +28,18 @@ def list_runs(
     Args:
         roots: Folders that are searched.
         renderers, policies: Patterns that a run must match.
-        since: Earliest start, as a date or an age (``7d``).
         metrics: Metrics of ``summary.json`` to print beside each run.
         as_json: Print one JSON document.
 
     Raises:
         InputError: A root is no folder, or no run has the metric.
     """
-    started = datetime.min.replace(tzinfo=UTC)
-    if since is not None:
-        started = as_day(since, "--since", datetime.now(UTC))
     entries = find_runs(roots)
     chosen = [
         entry
         for entry in entries
         if _each_is_named(renderers, entry.info.get("renderers") or ())
         and _each_is_named(policies, entry.info.get("policies") or ())
-        and entry.started_at >= started
     ]
     stored = {
         name

@@ -1,6 +1,6 @@
 """Check a card against the CPU: agreement first, then rates.
 
-Each section is a process of its own, so that a CUDA error costs one section.
+Each section is a process of its own: after an error of CUDA nothing more runs in its process.
 ``python -m alpasim_plugin.runs.gpu_check SECTION DEVICE`` runs one and prints one line of JSON.
 """
 
@@ -31,7 +31,6 @@ from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario
 
-BUDGET_S = 400.0  # for all sections
 SCENE = "smoke/curve"
 SIZES = ((256, 144), (960, 544), (1920, 1088))
 REPEATS = 5
@@ -41,12 +40,12 @@ ODD_SHARE = 1e-3  # of the pixels may differ by more: splats of nearly equal dep
 Facts = dict[str, Any]
 
 
-def check_gpu(device: str = "cuda:0", budget_s: float = BUDGET_S) -> Iterator[tuple[str, Facts]]:
+def check_gpu(device: str, budget_s: float) -> Iterator[tuple[str, Facts]]:
     """Run every section and yield its name and facts; ``ok`` is false where it failed.
 
     Args:
         device: The card, or ``cpu`` to try the check itself.
-        budget_s: Seconds after which sections that are left are not begun.
+        budget_s: Seconds after which the section in progress is ended, and no other begun.
     """
     end = time.monotonic() + budget_s
     for name in SECTIONS:

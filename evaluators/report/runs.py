@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -173,31 +173,6 @@ def find_runs(roots: Sequence[Path]) -> list[RunEntry]:
             names[:] = [name for name in names if name[0] != "." and name not in SKIPPED]
     entries.sort(key=lambda entry: str(entry.folder))
     return sorted(entries, key=lambda entry: entry.started_at, reverse=True)
-
-
-def as_day(text: str, option: str, now: datetime) -> datetime:
-    """Read a date, a time, or an age such as ``7d`` or ``12h``; without a zone it is UTC, as in
-    ``run.json``.
-
-    Example:
-        >>> as_day("2d", "--since", datetime(2026, 3, 10, 12, tzinfo=UTC)).isoformat()
-        '2026-03-08T12:00:00+00:00'
-        >>> as_day("2026-03-01", "--since", datetime(2026, 3, 10, tzinfo=UTC)).isoformat()
-        '2026-03-01T00:00:00+00:00'
-
-    Raises:
-        InputError: None of these.
-    """
-    hours = {"h": 1, "d": 24, "w": 168}.get(text[-1:])
-    try:
-        if hours is not None:
-            return now - timedelta(hours=hours * float(text[:-1]))
-        return as_utc(text)
-    except (ValueError, OverflowError):
-        raise InputError(
-            f"{option} {text}: neither a date nor an age",
-            "write 2026-03-01, 2026-03-01T18:00, 7d or 12h",
-        ) from None
 
 
 def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) -> Table:

@@ -28,6 +28,6 @@ def test_a_folder_of_another_time_is_whole_and_read(tmp_path, usual_run, time_s)
     for words in (
         ["check", "run", str(run)],
         ["compare", str(run)],
-        ["list", "runs", str(tmp_path), "--since", "1d"],
+        ["list", "runs", str(tmp_path)],
     ):
         assert run_command(words) == 0

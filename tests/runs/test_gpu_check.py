@@ -10,19 +10,19 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.runs import gpu_check
 
 
-def test_a_section_runs_in_a_process_of_its_own(monkeypatch):
-    monkeypatch.setattr(gpu_check, "SECTIONS", {"card": gpu_check.card})
-    assert dict(gpu_check.check_gpu("cpu")) == {"card": {"ok": True, "torch": torch.__version__}}
-
-
 def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch):
     monkeypatch.setattr(gpu_check, "SECTIONS", {"unknown": gpu_check.card, "card": gpu_check.card})
-    facts = dict(gpu_check.check_gpu("cpu"))
+    facts = dict(gpu_check.check_gpu("cpu", 100.0))
     assert not facts["unknown"]["ok"]
     assert "unknown" in facts["unknown"]["why"]
-    assert facts["card"]["ok"]
-    late = dict(gpu_check.check_gpu("cpu", budget_s=0.0))
-    assert not any(section["ok"] for section in late.values())
+    assert facts["card"] == {"ok": True, "torch": torch.__version__}
+
+
+def test_a_section_that_the_budget_does_not_reach_is_not_begun(monkeypatch):
+    monkeypatch.setattr(gpu_check, "_child", lambda *args: pytest.fail("a section has begun"))
+    facts = dict(gpu_check.check_gpu("cpu", 0.0))
+    assert facts.keys() == gpu_check.SECTIONS.keys()
+    assert not any(section["ok"] for section in facts.values())
 
 
 def test_images_that_differ_fail_the_section():

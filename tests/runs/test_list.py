@@ -78,7 +78,6 @@ def test_runs_are_found_at_any_depth_and_the_newest_comes_first(root, capsys):
         (("--renderer", "3dgs"), ["middle"]),
         (("--renderer", "clean", "--renderer", "one*"), ["new"]),
         (("--policy", "mine:*"), ["middle"]),
-        (("--since", "2026-02-10T08:00:00"), ["new", "middle"]),
     ],
 )
 def test_a_filter_takes(root, capsys, words, names):
