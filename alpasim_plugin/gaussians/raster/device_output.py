@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from alpasim_plugin.core.devices import download
-from alpasim_plugin.core.types import F32, Bool, Frame
+from alpasim_plugin.core.types import F32, Bool, DevicePlanes, Frame
 from alpasim_plugin.gaussians.raster.output import OPAQUE, RasterOutput
 
 PLANES = ("rgb", "alpha", "depth")
@@ -85,9 +85,9 @@ class DeviceOutput(RasterOutput):
     def frame(self, t_us: int, camera: str) -> Frame:
         """Return the view as a camera's frame, whose planes stay on the device."""
         shown = self.changed(lambda out: {"rgb": (out.rgb * 255 + 0.5).to(torch.uint8)})
-        return Frame(t_us, camera, on_device=shown)
+        return Frame(t_us, camera, on_device=cast(DevicePlanes, shown))
 
-    def changed(self, change: Callable[[DeviceOutput], Mapping[str, Tensor]]) -> DeviceOutput:
+    def changed(self, change: Callable[[DeviceOutput], Mapping[str, Any]]) -> DeviceOutput:
         """Return the view with other planes, which it also has when it is drawn again."""
         return replace(self, **change(self), again=lambda: self.again().changed(change))
 
