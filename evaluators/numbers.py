@@ -30,14 +30,12 @@ class Cell:
         detail: Second, smaller line: the interval, for rates behind the count, "7/300 (1.0 to 5.0
             %)"; may be empty.
         sort: Key for sorting; None sorts last.
-        tone: "worse", "better" or "" (nothing to say).
     """
 
     text: str
     note: str = ""
     detail: str = ""
     sort: float | None = None
-    tone: str = ""
 
     @property
     def missing(self) -> bool:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -258,38 +257,31 @@ def combined_run_uuid(rollouts: Sequence[ScoredRollout]) -> str:
     return hashlib.sha256("\x1f".join(ids).encode()).hexdigest()
 
 
+STEPS = pa.schema(
+    [
+        ("name", pa.string()),
+        ("timestamps_us", pa.int64()),
+        ("values", pa.float64()),
+        ("valid", pa.bool_()),
+        ("time_aggregation", pa.string()),
+        *((name, pa.string()) for name in ("clipgt_id", "rollout_id", "run_uuid", "run_name")),
+    ]
+)
+
+
 def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
     """Return every step of every metric, long; a metric without values has one row without a
     time.
     """
-    columns: dict[str, list[Any]] = {
-        name: [] for name in ("name", "timestamps_us", "values", "valid", "time_aggregation")
-    }
-    ids: dict[str, list[Any]] = {
-        name: [] for name in ("clipgt_id", "rollout_id", "run_uuid", "run_name")
-    }
+    rows = []
     for rollout in rollouts:
-        for metric_series in rollout.series:
-            n = max(len(metric_series.t_us), 1)
-            columns["name"] += [metric_series.name] * n
-            columns["timestamps_us"] += metric_series.t_us.tolist() or [None]
-            columns["values"] += metric_series.value.tolist() or [None]
-            columns["valid"] += metric_series.valid.tolist() or [None]
-            columns["time_aggregation"] += [metric_series.metric.aggregation] * n
-            for name, value in zip(
-                ids,
-                (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name),
-                strict=True,
-            ):
-                ids[name] += [value] * n
-    types = [pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.string(), *[pa.string()] * 4]
-    data = {**columns, **ids}
-    return pa.table(
-        {
-            name: pa.array(values, type=kind)
-            for (name, values), kind in zip(data.items(), types, strict=True)
-        }
-    )
+        ids = (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name)
+        for one in rollout.series:
+            steps = zip(one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True)
+            for step in list(steps) or [(None, None, None)]:
+                row = (one.name, *step, one.metric.aggregation, *ids)
+                rows.append(dict(zip(STEPS.names, row, strict=True)))
+    return pa.Table.from_pylist(rows, STEPS)
 
 
 def metrics_results_table(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NotRequired
 
@@ -13,14 +13,14 @@ from typing_extensions import TypedDict
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import inside, read_bytes, read_json_as
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import AGAIN
+from alpasim_plugin.log.run_folder.schema import AGAIN, VIDEO_NAME
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
-from evaluators.numbers import Cell, fixed, missing, short
 from evaluators.opening import Run
 from evaluators.statistics.variants import Base, Variant, axis_bases
 
 FLIPS_NAME = "flips.json"
 MAX_FLIP_ROWS = 400
+TOO_MANY = "left out to keep this file small; they are in flips/"
 # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
 FlipKey = tuple[str, str, str, int, str]
 
@@ -130,19 +130,17 @@ class FlipRow:
     """One flip as the report shows it.
 
     Attributes:
-        time: When the plans diverged, since the first frame.
-        gap: How far apart they were then.
-        pictures: (side, colour, data address) at that time.
+        entry: What ``flips.json`` says of it.
+        pictures: (side, colour, data address) when the plans diverged.
         why_not: Why there are no images.
         links: (side, colour, clip, folder).
     """
 
     flip: Flip
-    time: Cell
-    gap: Cell
-    pictures: tuple[tuple[str, int, str], ...]
+    entry: Mapping[str, Any]
+    pictures: Sequence[tuple[str, int, str]]
     why_not: str
-    links: tuple[tuple[str, int, str | None, str | None], ...]
+    links: Sequence[tuple[str, int, str | None, str | None]]
 
 
 def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
@@ -161,12 +159,22 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     unknown = "the run folder has no logs to look for it in"
     if known:
         unknown = "not looked for: there are too many flips"
+    colours = colours_of(run)
     spent = 0
     rows = []
     for flip in flips[:MAX_FLIP_ROWS]:
-        row = _row(run, flip, known.get(flip.key) or {"reason": unknown}, spent < budget_bytes)
-        spent += sum(len(src) for _, _, src in row.pictures)
-        rows.append(row)
+        entry: Mapping[str, Any] = known.get(flip.key) or {"t_us": None, "reason": unknown}
+        why_not = entry.get("reason") or entry.get("frames_reason") or TOO_MANY
+        pictures, links = [], []
+        for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True):
+            colour, _ = colours[rollout.renderer, rollout.policy]
+            links.append((name, colour, run.href(rollout, VIDEO_NAME), run.href(rollout)))
+            path = inside(run.folder, str((entry.get("frames") or {}).get(name)))
+            if spent < budget_bytes and path is not None and os.path.isfile(path):
+                data = base64.b64encode(read_bytes(path, SOURCE_BYTES)).decode()
+                pictures.append((name, colour, f"data:image/jpeg;base64,{data}"))
+        spent += sum(len(src) for _, _, src in pictures)
+        rows.append(FlipRow(flip, entry, pictures, "" if pictures else why_not, links))
     return rows, len(flips) - len(rows), compared
 
 
@@ -206,35 +214,3 @@ def flip_entries(run: Run) -> list[FlipEntry]:
 def key_of_entry(entry: FlipEntry) -> FlipKey:
     """Return the key of an entry of ``flips.json``."""
     return entry["renderer"], entry["policy"], entry["scene"], entry["seed"], entry["against"]
-
-
-def _row(run: Run, flip: Flip, entry: Mapping[str, Any], has_room: bool) -> FlipRow:
-    colours = colours_of(run)
-    sides = [
-        (name, colours[rollout.renderer, rollout.policy][0], rollout)
-        for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True)
-    ]
-    links = tuple(
-        (name, colour, run.href(rollout, "front.mp4"), run.href(rollout))
-        for name, colour, rollout in sides
-    )
-    if entry.get("t_us") is None:
-        why = str(entry.get("reason") or "the plans never diverge by more than the threshold")
-        return FlipRow(flip, missing(why), missing(why), (), why, links)
-    seconds, gap_m = float(entry["after_us"]) * 1e-6, float(entry["gap_m"])
-    frames = entry.get("frames") or {}
-    pictures = []
-    for name, colour, _ in sides:
-        path = inside(run.folder, str(frames.get(name)))
-        if has_room and path is not None and os.path.isfile(path):
-            data = base64.b64encode(read_bytes(path, SOURCE_BYTES)).decode()
-            pictures.append((name, colour, f"data:image/jpeg;base64,{data}"))
-    why = str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
-    return FlipRow(
-        flip,
-        Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds),
-        Cell(short(gap_m, "m"), sort=gap_m),
-        tuple(pictures),
-        "" if pictures else why,
-        links,
-    )

@@ -20,7 +20,7 @@ from alpasim_plugin.log.run_folder.checksums import (
 )
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import GATE_FILES, ROLLOUTS, WHY_NAME
-from evaluators.numbers import DASH, short
+from evaluators.numbers import short
 from evaluators.opening import Run
 from evaluators.statistics.gate import GateVerdict
 from evaluators.statistics.verdicts import WORDS
@@ -88,10 +88,9 @@ def gate_section(run: Run) -> JsonObject | None:
     worst = []
     for pair in worst_of(stored["checks"]):
         unit = run.table.shown(pair["metric"]).unit
-        was = DASH if pair["was"] is None else short(pair["was"], unit)
         cell = (pair["renderer"], pair["policy"], pair["scene"], pair["seed"])
-        shown = {"was": was, "now": short(pair["now"], unit), "page": pages.get(cell)}
-        worst.append(pair | shown)
+        shown = {name: short(pair[name], unit) for name in ("was", "now")}
+        worst.append(pair | shown | {"page": pages.get(cell)})
     outcome = stored["outcome"]
     return {
         "title": WORDS[outcome["cause"]],
