@@ -57,13 +57,10 @@ def finite(value: Any) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def interval(value: Any, centre: float | None = None) -> tuple[float, float] | None:
-    """Read ``[low, high]``, or a half-width around ``centre``; None where either end is missing."""
-    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
-        low, high = finite(value[0]), finite(value[1])
-        return None if low is None or high is None else (low, high)
-    half = finite(value)
-    return None if half is None or centre is None else (centre - half, centre + half)
+def interval(value: Sequence[float | None] | None) -> tuple[float, float] | None:
+    """Read ``[low, high]``; None where either end is missing."""
+    low, high = (None, None) if value is None else map(finite, value)
+    return None if low is None or high is None else (low, high)
 
 
 def decimals(*values: float | None, digits: int = 3) -> int:

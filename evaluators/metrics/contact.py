@@ -227,9 +227,10 @@ def _onsets(
 
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:
     """Find the first contact of each actor in each interval at whose start it does not touch."""
-    actor, interval = np.nonzero(~touch[:, :-1])
-    pair, t0, t1 = _pieces(actors, actor, t_us[interval], t_us[interval + 1])
-    actor, interval = actor[pair], interval[pair]
+    actor, t0, t1 = _pieces(actors, t_us)
+    interval = np.searchsorted(t_us, t0, side="right") - 1
+    is_open = ~touch[actor, interval]
+    actor, interval, t0, t1 = actor[is_open], interval[is_open], t0[is_open], t1[is_open]
     pairs = _motions(ego, actors, t_us, actor, interval, t0, t1)
     near = np.flatnonzero(pairs.distance_m() <= pairs.radius_m().sum(axis=1) + _SLACK_M)
     tau = first_contact(pairs.take(near))
@@ -242,36 +243,25 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     return _Found(actor[rows][first], interval[rows][first], t_s[first], side[first], xy[first])
 
 
-def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, I64, I64]:
-    """Cut intervals ``(M,)`` at the actor's logged times and to its presence; return (row of the
-    interval, start, end) in order.
+def _pieces(actors: ActorTable, t_us: I64) -> tuple[I64, I64, I64]:
+    """Cut the presence of each actor at the steps and at its own logged times.
+
+    Returns:
+        Actor, start and end ``(M,)`` of each piece, by actor and then by time. An actor that is
+        there at one instant between two steps has a piece without length.
     """
-    pair = []
-    start = []
-    stop = []
-    for a in np.unique(actor):
-        rows = np.flatnonzero(actor == a)
-        logged = actors.times_of(int(a))
-        first, last = np.maximum(begin[rows], logged[0]), np.minimum(end[rows], logged[-1])
-        # An interval that only meets the presence at one of its own ends is decided there, at the
-        # step.
-        inside = (first < last) | ((first == last) & (first > begin[rows]) & (first < end[rows]))
-        rows = rows[inside]
-        first = first[inside]
-        last = last[inside]
-        low, high = (
-            np.searchsorted(logged, first, side="right"),
-            np.searchsorted(logged, last, side="left"),
-        )
-        n = np.maximum(high - low, 0) + 1
-        row = np.repeat(np.arange(len(rows)), n)
-        k = np.arange(len(row)) - np.repeat(np.cumsum(n) - n, n)
-        knot = np.minimum(low[row] + k, len(logged) - 1)
-        pair.append(rows[row])
-        start.append(np.where(k == 0, first[row], logged[knot - 1]))
-        stop.append(np.where(k == n[row] - 1, last[row], logged[knot]))
-    none = [np.zeros(0, dtype=np.int64)]
-    return np.concatenate(pair or none), np.concatenate(start or none), np.concatenate(stop or none)
+    pieces = [np.zeros((3, 0), dtype=np.int64)]
+    for a in range(len(actors)):
+        logged = actors.times_of(a)
+        knots = np.union1d(t_us, logged)
+        first_us, last_us = max(logged[0], t_us[0]), min(logged[-1], t_us[-1])
+        knots = knots[(knots >= first_us) & (knots <= last_us)]
+        starts, ends = knots[:-1], knots[1:]
+        if len(knots) == 1 and knots[0] not in t_us:
+            starts = ends = knots
+        pieces.append(np.stack([np.full(len(starts), a), starts, ends]))
+    actor, start, end = np.concatenate(pieces, axis=1)
+    return actor, start, end
 
 
 def _motions(

@@ -316,7 +316,7 @@ def differences_of(run: Run) -> dict[str, Difference]:
         tone = tone_of(entry)
         if tone in ("worse", "better") and (number, metric_name) not in shown:
             tone = "unclear"
-        bounds = interval(entry.get("ci95"), float(entry["diff"]))
+        bounds = interval(entry.get("ci95"))
         values = [float(entry["diff"]), *(bounds or ())]
         texts = printed(metric, *values, sign=True)
         baseline = variant_name(run, str(entry.get("baseline") or "the baseline"))

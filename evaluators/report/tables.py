@@ -154,7 +154,7 @@ def pair_rows(summary: JsonView, known: MetricTable = METRICS) -> list[PairRow]:
 
 def _pair_row(variant: str, metric: MetricInfo, entry: JsonView) -> PairRow:
     difference, p = finite(entry.get("diff")), finite(entry.get("p_value"))
-    bounds = interval(entry.get("ci95"), difference) or ()
+    bounds = interval(entry.get("ci95")) or ()
     scale, unit = scale_and_unit(metric, str(entry.get("unit", "")))
     reason, note = str(entry.get("reason") or ""), _pair_note(entry)
     diff_cell = missing(reason or "no pair has this metric valid on both sides")

@@ -34,7 +34,7 @@ def difference_text(entry: JsonView, metric: MetricInfo) -> str:
     if difference is None:
         return str(entry.get("reason") or "no difference")
     scale, unit = scale_and_unit(metric, metric.unit)
-    bounds = interval(entry.get("ci95"), difference) or ()
+    bounds = interval(entry.get("ci95")) or ()
     numbers = printed(metric, difference, *bounds, sign=True)
     text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
     n, p = int(entry.get("n_scenes") or 0), finite(entry.get("p_value"))
