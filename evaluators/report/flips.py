@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NotRequired
 
-from typing_extensions import TypedDict
-
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import inside, read_bytes, read_json_as
+from alpasim_plugin.core.reading import inside, parsing, read_bytes
+from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN, VIDEO_NAME
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
@@ -137,7 +136,7 @@ class FlipRow:
     """
 
     flip: Flip
-    entry: Mapping[str, Any]
+    entry: JsonView
     pictures: Sequence[tuple[str, int, str]]
     why_not: str
     links: Sequence[tuple[str, int, str | None, str | None]]
@@ -163,7 +162,7 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     spent = 0
     rows = []
     for flip in flips[:MAX_FLIP_ROWS]:
-        entry: Mapping[str, Any] = known.get(flip.key) or {"t_us": None, "reason": unknown}
+        entry: JsonView = known.get(flip.key) or {"t_us": None, "reason": unknown}
         why_not = entry.get("reason") or entry.get("frames_reason") or TOO_MANY
         pictures, links = [], []
         for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True):
@@ -178,39 +177,19 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     return rows, len(flips) - len(rows), compared
 
 
-class FlipEntry(TypedDict):
-    """An entry of ``flips.json``; the other members are there where plans diverge."""
-
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
-    baseline: str
-    against: str
-    t_us: int | None
-    reason: NotRequired[str]
-    after_us: NotRequired[int]
-    gap_m: NotRequired[float]
-    frames: NotRequired[dict[str, str]]
-    frames_reason: NotRequired[str]
-
-
-class FlipsFile(TypedDict):
-    """``flips.json``."""
-
-    cells: list[FlipEntry]
-
-
-def flip_entries(run: Run) -> list[FlipEntry]:
+def flip_entries(run: Run) -> list[JsonView]:
     """Read the entries of ``flips.json``; none where there is no such file.
 
     Raises:
         InputError: It is damaged.
     """
     path = run.folder / FLIPS_NAME
-    return read_json_as(FlipsFile, path, AGAIN)["cells"] if os.path.lexists(path) else []
+    if not os.path.lexists(path):
+        return []
+    with parsing(path, AGAIN, "not what simrun wrote"):
+        return list(read_json(path)["cells"])
 
 
-def key_of_entry(entry: FlipEntry) -> FlipKey:
+def key_of_entry(entry: JsonView) -> FlipKey:
     """Return the key of an entry of ``flips.json``."""
     return entry["renderer"], entry["policy"], entry["scene"], entry["seed"], entry["against"]

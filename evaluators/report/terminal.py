@@ -32,13 +32,12 @@ LEAST_PLOT = 20  # letters
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 
 
-def render_presets(summaries: Mapping[str, JsonView], known: MetricTable = METRICS) -> Table:
+def render_presets(summaries: Mapping[str, JsonView]) -> Table:
     """Lay out the scores of several presets on the same logs: a benchmark's own scores, of the
     other presets their headline metrics.
 
     Args:
         summaries: Preset -> content of its ``summary.json``.
-        known: What the metrics are.
 
     A score that is not measured in every rollout shows the range of its mean, and what is missing.
     """
@@ -49,12 +48,12 @@ def render_presets(summaries: Mapping[str, JsonView], known: MetricTable = METRI
     for head in ("preset", "score", *columns):
         table.add_column(Text(escape(head)), overflow="fold")
     for preset, summary in summaries.items():
-        for name in [f"{preset}_{score}" for score in SCORES.get(preset, {})] or known.headline:
+        for name in [f"{preset}_{score}" for score in SCORES.get(preset, {})] or METRICS.headline:
             table.add_row(
                 preset,
                 name,
                 *(
-                    _score_cell(summary, variant, name, known.shown(name).in_percent)
+                    _score_cell(summary, variant, name, METRICS.shown(name).in_percent)
                     for variant in columns
                 ),
             )

@@ -84,13 +84,12 @@ def chance_above(values: F64, counts: F64, mean: float) -> float:
     return min(max(0.5 + total / math.pi, 0.0), 1.0)
 
 
-def upper_bound(values: F64, most: float, tail: float = TAIL) -> float:
+def upper_bound(values: F64, most: float) -> float:
     """Return the greatest mean that the values ``(n,)`` do not refute.
 
     Args:
         values: None above ``most``.
         most: The greatest possible value.
-        tail: Chance that the bound is too low.
 
     Example:
         >>> round(upper_bound(np.zeros(10), 1.0), 4)  # Clopper-Pearson of 0 in 10
@@ -104,7 +103,7 @@ def upper_bound(values: F64, most: float, tail: float = TAIL) -> float:
     if low >= distinct[-1]:
         return most
     root = scipy.optimize.brentq(
-        lambda mean: chance_above(distinct, counts, mean) - tail, low, distinct[-1], xtol=TOLERANCE
+        lambda mean: chance_above(distinct, counts, mean) - TAIL, low, distinct[-1], xtol=TOLERANCE
     )
     return min(scale * float(root), most)
 

@@ -75,7 +75,6 @@ def paired(
     rows: Sequence[Row],
     baseline: str,
     listed: int = LISTED,
-    known: MetricTable = METRICS,
 ) -> Table:
     """Compare every renderer with a baseline, cell by cell.
 
@@ -83,7 +82,6 @@ def paired(
         rows: As for `aggregate`.
         baseline: Renderer that the others are compared with.
         listed: How many missing cells to name per metric.
-        known: What the metrics are.
 
     Returns:
         RENDERER -> METRIC -> what `compare` gives.
@@ -99,7 +97,7 @@ def paired(
         )
     return {
         renderer: {
-            name: compare(side, sides[baseline], known.info(name), baseline, listed=listed)
+            name: compare(side, sides[baseline], METRICS.info(name), baseline, listed=listed)
             for name in metric_names(rows)
         }
         for renderer, side in sides.items()

@@ -166,24 +166,20 @@ def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values:
 
 def _notes(
     cells: Sequence[WatchedCell],
-    shown: Sequence[WatchedCell],
+    asked: Sequence[WatchedCell],
     too_many: Sequence[WatchedCell],
     stride: int,
 ) -> list[str]:
     """Say what the page does not hold, one sentence each."""
-    ids = {cell.id for cell in shown}
+    ids = {cell.id for cell in asked}
     left = [cell for cell in cells if cell.id not in ids and cell.watchable]
     failed = [cell for cell in cells if not cell.watchable]
-    notes = []
-    if too_many:
-        notes.append(f"No room for {_named(too_many)}. --scene, --policy and --seed choose.")
-    if left:
-        why = "not chosen"
-        if all(cell.interest == "quiet" for cell in left):
-            why = "in which nothing happened"
-        notes.append(f"Left out {why}: {_named(left)}. --scene, --policy and --seed choose.")
-    if failed:
-        notes.append(f"Every rollout failed, so that nothing is shown: {_named(failed)}.")
+    reasons = {
+        "No room for": (too_many, " --scene, --policy and --seed choose."),
+        "Left out": (left, " --scene, --policy and --seed choose."),
+        "Not shown, as every rollout failed,": (failed, ""),
+    }
+    notes = [f"{why} {_named(some)}.{hint}" for why, (some, hint) in reasons.items() if some]
     if stride > 1:
         notes.append(
             f"Every {ORDINALS[stride]} camera frame is kept. Poses, plans and metrics are whole."
