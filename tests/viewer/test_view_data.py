@@ -252,7 +252,7 @@ def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run, tmp_path
     assert any(re.match(r"Every \w+ camera frame is kept", note) for note in smaller.notes)
     least = write_page(run, tmp_path / "least.html", asked, size // 5)
     assert len(least.shown) == 1
-    assert least.notes[0].startswith("No room for 1\u00a0cell")
+    assert least.notes[0].startswith("No room for 1\u00a0")
     index = documents(least.path.read_text())["index"]
     assert sum(cell["here"] for cell in index["cells"]) == 1
     assert {f"cell-{cell.id}" for cell in least.shown} == set(documents(least.path.read_text())) - {
