@@ -41,7 +41,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.world.ground import from_points
-from scenarios.map_lines import border_lines, lane_edges, merge_areas
+from scenarios.map_lines import border_lines, lane_edges, merge_areas, same_way
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
 # Argoverse 2 mark types -> the markings a scene can show. Mixed lines take their solid half; double
@@ -147,7 +147,14 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             crossings.append(_closed(np.concatenate([one, two[::-1]])))
         surface = merge_areas([shapely.Polygon(area[:, :2]) for area in areas])
     lane_map = LaneMap(
-        {key: _same_way_neighbours(lane, lanes) for key, lane in lanes.items()},
+        {
+            key: replace(
+                lane,
+                left_neighbour=same_way(lane, lanes, lane.left_neighbour),
+                right_neighbour=same_way(lane, lanes, lane.right_neighbour),
+            )
+            for key, lane in lanes.items()
+        },
         road_edges=border_lines(surface, np.concatenate(areas)),
         drivable_areas=areas,
         crosswalks=tuple(crossings),
@@ -225,22 +232,6 @@ def _line(files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64
 
 def _closed(ring: F64) -> F64:
     return ring if np.array_equal(ring[0], ring[-1]) else np.concatenate([ring, ring[:1]])
-
-
-def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
-    """Drop neighbours that are not in the map or run the other way."""
-
-    def keep(other: str | None) -> str | None:
-        if other not in lanes:
-            return None
-        ahead, own = ((one.centre[-1] - one.centre[0])[:2] for one in (lanes[other], lane))
-        return other if ahead @ own > 0 else None
-
-    return replace(
-        lane,
-        left_neighbour=keep(lane.left_neighbour),
-        right_neighbour=keep(lane.right_neighbour),
-    )
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
-from scenarios.map_lines import bordered, corridor, ground_of, is_left_of
+from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, same_way
 from scenarios.osi_messages import UNREAD, ground_truths
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
@@ -216,18 +216,10 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
         out[key] = replace(
             lane,
             successors=tuple(name for name in found if name in lanes),
-            left_neighbour=_beside(lanes, lane, lane.left_neighbour),
-            right_neighbour=_beside(lanes, lane, lane.right_neighbour),
+            left_neighbour=same_way(lane, lanes, lane.left_neighbour),
+            right_neighbour=same_way(lane, lanes, lane.right_neighbour),
         )
     return out
-
-
-def _beside(lanes: Mapping[str, Lane], lane: Lane, name: str | None) -> str | None:
-    """Return a neighbour that is driven the same way."""
-    if name not in lanes:
-        return None
-    first, other = (one.centre[-1, :2] - one.centre[0, :2] for one in (lane, lanes[name]))
-    return name if float(first @ other) > 0 else None
 
 
 def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane | None:

@@ -172,7 +172,7 @@ def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
     """Return dotted keys and plain values of a specification; actors go by their ids."""
     if isinstance(part, Part):
         rules = {"jitter", "variations"} if not loc else set()
-        pairs = [
+        pairs: list[tuple[str | int, Any]] = [
             (name, getattr(part, name)) for name in type(part).model_fields if name not in rules
         ]
     elif isinstance(part, tuple) and part and isinstance(part[0], Part):

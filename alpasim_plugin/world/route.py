@@ -230,8 +230,8 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     points, headings = path[:1], np.array([first_heading_rad])
     if total > 0:
         points = resample(path, at)
-        before = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
-        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - before
+        behind = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
+        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - behind
         headings = np.arctan2(ahead[:, 1], ahead[:, 0])
     inside = index.containing_many(points)
     layers: list[dict[str, tuple[float, str | None]]] = []
