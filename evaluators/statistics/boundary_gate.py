@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.numbers import fixed
 from evaluators.statistics.gate import Check, GateSpec, GateVerdict, failures_of
@@ -60,7 +60,12 @@ def judge_boundaries(
         label = stored_name or short_name(other, variant)
         cause, text, bounds = _checked(record, earlier, variant.name, other.name, spec)
         sentence = f"{variant.name}: {METRIC} against {label}: {text}"
-        entry = {"baseline": label, "margin": spec.boundary_margin, "bounds": bounds, "worst": []}
+        entry: JsonObject = {
+            "baseline": label,
+            "margin": spec.boundary_margin,
+            "bounds": bounds,
+            "worst": [],
+        }
         checks.append(
             Check(variant.renderer, variant.policy, METRIC, "margin", cause, sentence, entry)
         )
