@@ -50,7 +50,9 @@ def chart_of(axes: Axes, title: str, note: str) -> Chart:
 
     text = io.StringIO()
     with rc_context(STYLE):
-        axes.figure.canvas.figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
+        axes.figure.canvas.figure.savefig(
+            text, format="svg", transparent=True, metadata={"Date": None}
+        )
     label = escape(f"{title}. {note}")
     svg = text.getvalue()
     svg = svg[svg.index("<svg ") :].replace(
