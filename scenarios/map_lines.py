@@ -199,12 +199,12 @@ def _beside(centre: F64, left_m: float) -> F64:
     return out
 
 
-def merge_areas(areas: Sequence[Any], seam_m: float = SEAM_M) -> Any:
-    """Return the union of shapely areas with seams up to ``seam_m`` closed and tiny holes filled.
+def merge_areas(areas: Sequence[Any]) -> Any:
+    """Return the union of shapely areas with seams up to `SEAM_M` closed and tiny holes filled.
 
     Closing is a mitred offset outwards and back, which moves no straight border.
     """
-    half = seam_m / 2
+    half = SEAM_M / 2
     merged = shapely.union_all([shapely.make_valid(a) for a in areas])
     closed = shapely.buffer(merged, half, join_style="mitre", mitre_limit=2.0)
     closed = shapely.union_all(
@@ -220,7 +220,7 @@ def merge_areas(areas: Sequence[Any], seam_m: float = SEAM_M) -> Any:
     return shapely.union_all(filled)
 
 
-def border_lines(area: Any, heights: F64, step_m: float = STEP_M) -> tuple[F64, ...]:
+def border_lines(area: Any, heights: F64) -> tuple[F64, ...]:
     """Return the borders of a shapely area as closed polylines ``(N, 3)``, exterior rings first in
     each part.
 
@@ -228,12 +228,11 @@ def border_lines(area: Any, heights: F64, step_m: float = STEP_M) -> tuple[F64, 
         area: Polygon or MultiPolygon.
         heights: ``(M, 3)`` points of the source; a border vertex takes the height of the nearest
             one.
-        step_m: Largest distance between neighbouring vertices.
     """
     tree = scipy.spatial.KDTree(heights[:, :2])
     lines: list[F64] = []
     for part in shapely.get_parts(area):
         for ring in (part.exterior, *part.interiors):
-            xy = densify(shapely.get_coordinates(ring), step_m)
+            xy = densify(shapely.get_coordinates(ring), STEP_M)
             lines.append(np.column_stack([xy, heights[tree.query(xy)[1], 2]]))
     return tuple(lines)

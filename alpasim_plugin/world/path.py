@@ -15,6 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, I64, Bool
 
+CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
@@ -66,7 +67,7 @@ def sample_clothoid(
     return np.column_stack([x, y, heading(s), start_curvature_per_m + rate * s])
 
 
-def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> F64:
+def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
     """Join two poses by a quintic Hermite curve with zero curvature at both ends, and straights
     where a turn is longer on one side.
 
@@ -79,11 +80,9 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> 
     before, after = _leads(p0, yaw0, p1, yaw1)
     q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
     q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
-    turn = _turn(q0, yaw0, q1, yaw1, step_m)
-    head, tail = (
-        _straight(p0, q0, yaw0, step_m)[:-1],
-        _straight(q1, p1, float(turn[-1, 2]), step_m)[1:],
-    )
+    turn = _turn(q0, yaw0, q1, yaw1)
+    head = _straight(p0, q0, yaw0)[:-1]
+    tail = _straight(q1, p1, float(turn[-1, 2]))[1:]
     curve = np.concatenate([head, turn, tail])
     curve[0, :2], curve[-1, :2] = p0[:2], p1[:2]
     return curve
@@ -106,16 +105,16 @@ def _leads(p0: F64, yaw0: float, p1: F64, yaw1: float) -> tuple[float, float]:
     return a - shorter, b - shorter
 
 
-def _straight(p: F64, q: F64, yaw: float, step_m: float) -> F64:
+def _straight(p: F64, q: F64, yaw: float) -> F64:
     """Return ``(N, 3)`` rows from p to q; the single row p where they are the same."""
-    n = int(np.ceil(float(np.hypot(*(q[:2] - p[:2]))) / step_m - 1e-6))
+    n = int(np.ceil(float(np.hypot(*(q[:2] - p[:2]))) / CONNECTOR_STEP_M - 1e-6))
     share = np.linspace(0.0, 1.0, n + 1)[:, None]
     return np.column_stack([p[:2] + share * (q[:2] - p[:2]), np.full(n + 1, yaw)])
 
 
-def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
+def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
     chord = float(np.hypot(p1[0] - p0[0], p1[1] - p0[1]))
-    n = max(8, int(np.ceil(1.2 * chord / step_m)))
+    n = max(8, int(np.ceil(1.2 * chord / CONNECTOR_STEP_M)))
     t = np.linspace(0.0, 1.0, n + 1)
     still = np.zeros(2)
     directions = [np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (yaw0, yaw1)]
@@ -134,14 +133,14 @@ def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
     return np.column_stack([best(t), yaw])
 
 
-def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
-    """Return ``(N, 3)`` points beside a curve ``(N, 3+)`` of x, y, heading, at signed distances
+def offset_line(curve: F64, offset_m: npt.ArrayLike) -> F64:
+    """Return ``(N, 3)`` points, at height 0, beside a curve ``(N, 3+)`` of x, y, heading, at signed distances
     (left positive) along its normals.
     """
     d = np.broadcast_to(offset_m, (len(curve),))
     x = curve[:, 0] - d * np.sin(curve[:, 2])
     y = curve[:, 1] + d * np.cos(curve[:, 2])
-    return np.column_stack([x, y, np.full(len(curve), z_m)])
+    return np.column_stack([x, y, np.zeros(len(curve))])
 
 
 @dataclass(frozen=True)

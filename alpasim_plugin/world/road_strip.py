@@ -46,10 +46,9 @@ class Profile:
         """Lane kind of that strip."""
         return "parking" if self.parking_m > 0 else "shoulder"
 
-    def right_extent_m(self, forward: int | None = None) -> float:
+    def right_extent_m(self) -> float:
         """Distance from the reference line to the right road edge."""
-        n = self.forward if forward is None else forward
-        return self.median_m / 2 + n * self.lane_width_m + self.strip_m
+        return self.median_m / 2 + self.forward * self.lane_width_m + self.strip_m
 
     def left_extent_m(self) -> float:
         """Distance from the reference line to the left road edge; on a one-way road the strip lies
