@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import densify, project
@@ -218,7 +217,7 @@ def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
     return lat_deg, lon_deg, values.get("alt_0", 0.0)
 
 
-def earth_xyz(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike) -> F64:
+def earth_xyz(lat_deg: F64 | float, lon_deg: F64 | float, height_m: F64 | float) -> F64:
     """Return earth-centred, earth-fixed coordinates ``(..., 3)`` in metres."""
     lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
     e2 = FLATTENING * (2.0 - FLATTENING)
