@@ -415,8 +415,8 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
         ego = EgoState(now, pose(now), situation.speed_mps, 0.0, yaw_rate)
         times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
-        shown = {name: read_only(camera) for name, camera in cameras.items()}
-        yield Observation(now, frames, shown, read_only(ego), read_only(history), route)
+        specs = {name: read_only(camera) for name, camera in cameras.items()}
+        yield Observation(now, frames, specs, read_only(ego), read_only(history), route)
 
 
 def _drive(

@@ -212,13 +212,13 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
     padded[:ny, :nx] = raster
     finite = np.isfinite(padded).reshape(shape)
     count = finite.sum(axis=(1, 3))
-    row, column = np.indices(padded.shape)
+    row, column = np.indices(padded.shape, dtype=np.float64) + 0.5
 
     def mean(values: F64) -> F64:
         total = np.where(finite, values.reshape(shape), 0.0).sum(axis=(1, 3))
         return np.asarray(total[count > 0] / count[count > 0])
 
-    return mean(padded), mean(row + 0.5), mean(column + 0.5)
+    return mean(padded), mean(row), mean(column)
 
 
 def _line(files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64) -> F64:

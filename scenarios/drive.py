@@ -177,10 +177,11 @@ def _rows(values: Any, width: int = 3) -> F64:
 def _map_of(document: JsonObject) -> LaneMap:
     lanes = {}
     for fields in document["lanes"]:
-        lines = {name: _rows(fields[name]) for name in ("centre", "left", "right")}
-        lane = Lane(**{**fields, **lines, "successors": tuple(fields["successors"])})
+        edges = {name: _rows(fields[name]) for name in ("centre", "left", "right")}
+        lane = Lane(**{**fields, **edges, "successors": tuple(fields["successors"])})
         lanes[lane.lane_id] = lane
-    return LaneMap(lanes, **{name: tuple(map(_rows, document[name])) for name in LINES})
+    lines: dict[str, Any] = {name: tuple(map(_rows, document[name])) for name in LINES}
+    return LaneMap(lanes, **lines)
 
 
 def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightField:
@@ -217,7 +218,7 @@ def _photograph(folder: Path, frame: JsonObject) -> Photograph:
         _rows(frame["transform_matrix"], 4),
         str(folder / frame["file_path"]),
         frame["use"],
-        tuple(frame.get("exposure", (1.0, 1.0, 1.0))),  # type: ignore[arg-type]  # three gains
+        tuple(frame.get("exposure", (1.0, 1.0, 1.0))),  # three gains
     )
 
 

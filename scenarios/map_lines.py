@@ -100,7 +100,7 @@ def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:
 
 def same_way(lane: Lane, lanes: Mapping[str, Lane], name: str | None) -> str | None:
     """Return the name of a neighbour; None for one that is not there, or is driven the other way."""
-    if name not in lanes:
+    if name is None or name not in lanes:
         return None
     own, other = ((one.centre[-1] - one.centre[0])[:2] for one in (lane, lanes[name]))
     return name if own @ other > 0 else None

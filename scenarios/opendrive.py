@@ -219,11 +219,11 @@ def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
 
 def earth_xyz(lat_deg: F64 | float, lon_deg: F64 | float, height_m: F64 | float) -> F64:
     """Return earth-centred, earth-fixed coordinates ``(..., 3)`` in metres."""
-    lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
+    lat, lon, height = np.broadcast_arrays(np.deg2rad(lat_deg), np.deg2rad(lon_deg), height_m)
     e2 = FLATTENING * (2.0 - FLATTENING)
     n = SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
-    level = (n + height_m) * np.cos(lat)
-    z = (n * (1.0 - e2) + height_m) * np.sin(lat)
+    level = (n + height) * np.cos(lat)
+    z = (n * (1.0 - e2) + height) * np.sin(lat)
     return np.stack([level * np.cos(lon), level * np.sin(lon), z], axis=-1)
 
 

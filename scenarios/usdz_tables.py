@@ -222,7 +222,7 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject
             "RIGHT_LANE": (lane.right_neighbour,),
         }
         for kind, others in found.items():
-            objects = [ids[other] for other in others if other in ids]
+            objects = [ids[other] for other in others if other is not None and other in ids]
             if objects:
                 add(kind, ids[key], objects)
     if not out:

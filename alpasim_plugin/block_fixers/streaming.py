@@ -108,7 +108,8 @@ def run_layers(layers: Iterable[nn.Module], x: Tensor, streaming: StreamingState
     reads them from the streaming state and leaves its own there.
     """
     for layer in layers:
-        x = layer.next(x, streaming) if hasattr(layer, "next") else layer(x)
+        step = getattr(layer, "next", None)
+        x = layer(x) if step is None else step(x, streaming)
     return x
 
 

@@ -285,7 +285,7 @@ def _image(reader: _Binary | _Words) -> _Image:
             f"image {name}: its pose is not finite or no rotation",
             "give unit quaternions and finite shifts",
         )
-    return _Image(number, name, camera, inverse(se3(pose[4:], pose[:4] / length)))
+    return _Image(number, name, camera, inverse(se3(pose[4:], np.array(pose[:4]) / length)))
 
 
 def _point(reader: _Binary | _Words) -> tuple[float, ...]:

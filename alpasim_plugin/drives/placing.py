@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -333,7 +334,7 @@ def given_map(
 
     lanes = {}
     for key, lane in lane_map.lanes.items():
-        edges = {
+        edges: dict[str, Any] = {
             name: laid(getattr(lane, name), placed.ground) for name in ("centre", "left", "right")
         }
         lanes[key] = replace(lane, **edges)

@@ -145,7 +145,7 @@ class WeatherRenderer(Renderer):
         if self.lights.is_night:
             lamps = self.lights.lux(view, T_world_rig) / np.float32(WHITE_LUX)
             compressed = (lamps / (1 + lamps / np.float32(BRIGHTEST)))[..., None]
-            illumination = np.asarray(illumination + compressed * LAMP_RGB, np.float32)
+            illumination = (illumination + compressed * LAMP_RGB).astype(np.float32)
         light *= illumination
         if environment.rain:
             light += self._mirrored(view, spots, T_world_rig[2, 3])

@@ -23,8 +23,17 @@ from evaluators.metrics import MetricTable
 from evaluators.opening import Run, read_run
 
 SCHEMA_VERSION = 2
-MADE_WITH = ("key", "command", "version", "started_at", "versions", "hardware")
-MADE_WITH += ("renderers", "policies", "seeds")
+MADE_WITH = (
+    "key",
+    "command",
+    "version",
+    "started_at",
+    "versions",
+    "hardware",
+    "renderers",
+    "policies",
+    "seeds",
+)
 APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
 
 

@@ -233,7 +233,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
     """
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
-    document = {"queries": [], "lens": None, "failed": None}
+    document: JsonObject = {"queries": [], "lens": None, "failed": None}
     if cause.log is not None:
         document = _document(run, cause, cause.log)
     names = dict.fromkeys(name for query in document["queries"] for name in query["seen"])
@@ -293,7 +293,7 @@ def _queries(
     queries: list[JsonObject] = []
     for plan in shown_plans(log, cause.failed_us):
         pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
-        own = dict(debug.get(plan.now_us) or debug_row({}))
+        own: JsonObject = dict(debug.get(plan.now_us) or debug_row({}))
         own["lines"] = [[name, _in_world(pose, xy, place)] for name, xy in own["lines"]]
         own["boxes"] = [
             [name, *(round(scale * side, 1) for side in box)]

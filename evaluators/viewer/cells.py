@@ -136,7 +136,7 @@ class Wanted:
     ] = ()
 
     @property
-    def axes(self) -> dict[str, tuple[str, ...] | tuple[int, ...]]:
+    def axes(self) -> dict[str, tuple[object, ...]]:
         """Give what was asked for of each axis of a run."""
         asked = {
             "scene": self.scenes,

@@ -6,6 +6,7 @@ the image's gradient back to the projected splats.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,8 @@ class Splats(NamedTuple):
         )
 
 
-class GradientOutput(NamedTuple):
+@dataclass(frozen=True)
+class GradientOutput:
     """One rendered view with its graph.
 
     Attributes:
@@ -205,7 +207,7 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     bounds the ellipse.
     """
     local = _in_camera(splats.means, camera)
-    drawn = (local[2] >= near_m) & (splats.logit_opacities >= logit(np.array(ALPHA_MIN)))
+    drawn = (local[2] >= near_m) & (splats.logit_opacities >= float(logit(ALPHA_MIN)))
     index = torch.nonzero(drawn)[:, 0]
     x, y, z = local[:, index]
     low_x, high_x, low_y, high_y = camera.slope_limits()
