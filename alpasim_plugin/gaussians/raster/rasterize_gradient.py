@@ -207,7 +207,7 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     bounds the ellipse.
     """
     local = _in_camera(splats.means, camera)
-    drawn = (local[2] >= near_m) & (splats.logit_opacities >= float(logit(ALPHA_MIN)))
+    drawn = (local[2] >= near_m) & (splats.logit_opacities >= float(logit(np.array(ALPHA_MIN))))
     index = torch.nonzero(drawn)[:, 0]
     x, y, z = local[:, index]
     low_x, high_x, low_y, high_y = camera.slope_limits()
