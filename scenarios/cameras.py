@@ -74,12 +74,17 @@ def check_mounts(drawn: Drawn, cameras: Sequence[CameraSpec], vehicle: Vehicle) 
         outside = np.abs(camera.T_rig_camera[:3, 3] - centre) - half  # along each axis, metres
         deep_m = -float(outside.max())
         far_m = float(np.linalg.norm(np.maximum(outside, 0.0)))
-        if deep_m > DEEPEST_M or far_m > FARTHEST_M:
-            at = np.round(camera.T_rig_camera[:3, 3], 2).tolist()
-            with drawn.at("cameras", i):
+        at = np.round(camera.T_rig_camera[:3, 3], 2).tolist()
+        with drawn.at("cameras", i):
+            if deep_m > DEEPEST_M:
                 raise InputError(
-                    f"camera {camera.name!r} at {at}: {max(deep_m, 0.0):.2f} m inside and {far_m:.2f} m away from the car's body",
+                    f"camera {camera.name!r} at {at}: {deep_m:.2f} m inside the car's body",
                     "mount it at the body's surface, or give the vehicle its true size",
+                )
+            if far_m > FARTHEST_M:
+                raise InputError(
+                    f"camera {camera.name!r} at {at}: {far_m:.2f} m away from the car's body",
+                    "use the calibration of this car, or give the vehicle its true size",
                 )
 
 

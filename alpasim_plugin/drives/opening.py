@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, transform_points
-from alpasim_plugin.core.reading import contents, parsing, real, some_of
+from alpasim_plugin.core.reading import contents, natural_order, parsing, real, some_of
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
+from alpasim_plugin.drives.points import agreeing
 from alpasim_plugin.drives.source import Points, SourceDrive, in_order, timed
 from alpasim_plugin.gaussians.fit.photographs import (
+    AXES,
     FILE,
     KNOWN_KEYS,
     Picture,
@@ -26,7 +27,11 @@ from alpasim_plugin.gaussians.fit.photographs import (
 )
 from alpasim_plugin.gaussians.sh import C0
 
-LEAST_SEEN = 0.5  # share of the points that photographs show, with the axes that are taken
+PAIRS, FEWEST, CLEARLY = (
+    6,
+    40,
+    1.5,
+)  # pairs that the axes are tried on; matches that tell; by how much one must be better
 FORMS = "a folder with transforms.json, a KITTI odometry folder (not raw, which has no poses), or a COLMAP model"
 
 
@@ -57,16 +62,21 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
 
 def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
-    document, listed = read_pictures(folder, "opengl")
+    document, listed = read_pictures(folder, "opencv")
     if not listed:
         raise InputError(f"{folder / FILE}: no frames", "list the photographs with their poses")
     notes = []
     some = photographs or any(os.path.isfile(one.file) for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())
     if "axes" not in document:
-        notes.append(
-            "no 'axes': the camera's are those of OpenGL, as nerfstudio and Instant-NGP mean"
-        )
+        if not some:
+            raise InputError(
+                f"{folder / FILE}: no key 'axes', and no photographs to recognise it by",
+                'write "axes": "opengl" into the file, as nerfstudio and Instant-NGP mean it, or "axes": "opencv" (y down, z forward)',
+            )
+        axes, note = recognised_axes(folder, there)
+        notes.append(note)
+        listed = [replace(one, T_world_camera=one.T_world_camera @ AXES[axes]) for one in listed]
     if missing:
         notes.append(
             f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {some_of(missing)}"
@@ -109,11 +119,6 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
         xyz = np.asarray(cloud.means, dtype=np.float64)
         points = Points(xyz, rgb, np.zeros((len(cloud), 3, 3)))
-    if points is not None and "axes" not in document and _seen(points, pictures) < LEAST_SEEN:
-        raise InputError(
-            f"{folder / FILE}: no 'axes', and with those of OpenGL few of its points are seen",
-            'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file',
-        )
     return SourceDrive(
         "transforms",
         real(folder).name,
@@ -126,12 +131,30 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     )
 
 
-def _seen(points: Points, pictures: Sequence[Picture]) -> float:
-    """Return the share of points that some photographs show."""
-    seen = np.zeros(len(points), dtype=np.bool_)
-    for one in pictures[:: max(1, len(pictures) // 32)]:
-        local = transform_points(inverse(one.T_world_camera), points.xyz)
-        pixel = (local @ one.lens.K.T)[:, :2] / np.maximum(local[:, 2:], 1e-9)
-        inside = ((pixel >= 0) & (pixel < [one.lens.width, one.lens.height])).all(axis=1)
-        seen |= inside & (local[:, 2] > 0)
-    return float(seen.mean())
+def recognised_axes(folder: Path, pictures: Sequence[Picture]) -> tuple[str, str]:
+    """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs
+    fit together, and a note.
+
+    With the wrong one epipolar lines are mirrored, or points lie behind the cameras.
+
+    Args:
+        folder: Holds the file.
+        pictures: Read as if it were that of OpenCV.
+
+    Raises:
+        InputError: Both fit, or neither.
+    """
+    there = sorted(pictures, key=lambda one: natural_order(one.file.as_posix()))
+    chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
+    counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
+    inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))
+    best, other = sorted(inliers, key=lambda axes: -inliers[axes])
+    if inliers[best] < FEWEST or inliers[best] < CLEARLY * inliers[other]:
+        raise InputError(
+            f"{folder / FILE}: no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})",
+            'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file',
+        )
+    return (
+        best,
+        f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}",
+    )

@@ -147,6 +147,33 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     )
 
 
+def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
+    """Return for each turn of the camera's axes how many matches of two photographs lie before
+    both, where both see them.
+
+    Args:
+        one, other: Photographs.
+        turns: ``(4, 4)`` each, applied to the poses on the camera's side.
+    """
+    views = [small_view(picture) for picture in (one, other)]
+    views = [resized(view, 640) if view.camera.width > 640 else view for view in views]
+    found = matches(views)
+    n = len(found)
+    if not n:
+        return [0 for _ in turns]
+    at = np.array([[m.at_first, m.at_second] for m in found]).reshape(-1, 2)
+    tracks = Tracks(np.tile([0, 1], n), np.repeat(np.arange(n), 2), at, n)
+    counts = []
+    for turn in turns:
+        turned = [
+            PinholeCamera(c.width, c.height, c.K, inverse(turn) @ c.T_camera_world)
+            for c in (view.camera for view in views)
+        ]
+        error = place(tracks, turned).error_px.reshape(-1, 2)
+        counts.append(int((error < ERROR_PX).all(axis=1).sum()))
+    return counts
+
+
 NEAR, FAR = 2.0, 9.0  # of the piece of road that is looked at, in camera heights
 ASIDE = (0.75, 1.5)  # to both sides: under the wheels, where there is least to see, and beside them
 CORNERS, CORNER_CONTRAST, APART_PX = (

@@ -16,7 +16,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.build import import_drive
-from tests.drives.street import write_colmap
+from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
 
@@ -154,6 +154,15 @@ def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
     with pytest.raises(InputError):
         import_drive(folder, tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_axes_that_both_fit_are_asked_for(tmp_path, quick_fit):
+    folder = write_transforms(tmp_path / "walk", say_axes=False)
+    blank = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    for path in (folder / "images").iterdir():
+        cv2.imwrite(str(path), blank)
+    with pytest.raises(InputError):
+        import_drive(folder, tmp_path / "out")
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])

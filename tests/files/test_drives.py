@@ -204,7 +204,7 @@ def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path):
         read_source(folder, photographs=False)
 
 
-def test_photographs_of_another_machine(tmp_path):
+def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"])
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -212,6 +212,10 @@ def test_photographs_of_another_machine(tmp_path):
     (folder / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"/home/someone/images/1\.png"):
         read_source(folder)
+    del document["axes"]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="'axes'"):
+        read_source(folder, photographs=False)
 
 
 def test_a_pose_of_kitti_belongs_to_the_number_of_a_photograph(tmp_path):
