@@ -15,7 +15,7 @@ from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.flags import Positional
 
 Kind = Literal["policy", "scenario", "renderer", "fixer", "metric"]
 TRY: dict[Kind, str] = {
@@ -31,40 +31,39 @@ Examples:
 
 - `simrun new policy my_policy`: my_policy.py with the class MyPolicy, and test_my_policy.py
 
-- `simrun new scenario my_scene --folder scenes`
+- `simrun new scenario my_scene`
 """
 
 
 def new(
     kind: Annotated[Kind, Positional("What to write.")],
     name: Annotated[str, Positional("Its name: lower case, digits and underscores.")],
-    folder: Annotated[Path, Flag("Where it goes.")] = Path("."),
     as_json: Json = False,
 ) -> None:
-    """Write a working policy, scenario, renderer, fixer or metric, with a test."""
+    """Write a working policy, scenario, renderer, fixer or metric into the working folder, with a
+    test.
+    """
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise InputError(
             f"name {name!r}: not a name of a Python file",
             "use lower case, digits and underscores: my_policy",
         )
-    if not os.path.isdir(folder):
-        raise InputError(f"--folder {folder}: no such folder", "make it first")
     words = {
         "name": name,
         "file": f"{name}.yaml" if kind == "scenario" else f"{name}.py",
         "test": f"test_{name}.py",
         "Class": "".join(part.capitalize() for part in name.split("_")),
     }
-    targets = {folder / words["file"]: f"{kind}.txt", folder / words["test"]: f"{kind}_test.txt"}
+    targets = {Path(words["file"]): f"{kind}.txt", Path(words["test"]): f"{kind}_test.txt"}
     for path in targets:
         if os.path.exists(path):
-            raise InputError(f"{path}: it exists already", "choose another name or --folder")
+            raise InputError(f"{path}: it exists already", "choose another name, or remove it")
     templates = files("alpasim_plugin.cli") / "templates"
     for path, template in targets.items():
         text = (templates / template).read_text(encoding="utf-8")
         write_text(path, Template(text).substitute(words))
-    command = TRY[kind].format(file=folder / words["file"], cls=words["Class"])
-    test = f"python -m pytest {folder / words['test']}"
+    command = TRY[kind].format(file=words["file"], cls=words["Class"])
+    test = f"python -m pytest {words['test']}"
     if not find_spec("pytest"):
         test += "   # after: pip install pytest"
     lines = [f"wrote    {path}" for path in targets]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.renderers.weather import in_weather
 
 
 def make_renderer(
@@ -27,6 +26,8 @@ def make_renderer(
         InputError: Unknown name or device.
         RendererError: The device does not work.
     """
+    from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
+
     renderer: Renderer = build(
         unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads
     )

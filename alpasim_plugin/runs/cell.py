@@ -45,7 +45,6 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
 from alpasim_plugin.log.schema import session_uuid
-from alpasim_plugin.renderers.weather import in_weather
 from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.lenses import through_lenses
@@ -421,6 +420,8 @@ def _renderer_of_pinholes(
 ) -> Renderer:
     session = {"seed": seed, "device": device, "threads": threads}
     built: Renderer = build(spec.base, scenario=scenario, **session)
+    from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
+
     base = in_weather(built, scenario, seed)
     if spec.fixer is None:
         return base

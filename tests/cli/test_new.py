@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import shlex
-from pathlib import Path
 
 import pytest
 
@@ -25,22 +24,24 @@ def run_tests_of(file):
 
 
 @pytest.mark.parametrize("kind", ["policy", "scenario", "renderer", "fixer", "metric"])
-def test_a_template_works_as_it_is_written(kind, tmp_path, capsys):
-    assert run_command(["new", kind, "my_own", "--folder", str(tmp_path), "--json"]) == 0
+def test_a_template_works_as_it_is_written(kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["new", kind, "my_own", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
-    main, test = (Path(name) for name in made["files"])
+    main, test = (tmp_path / name for name in made["files"])
     assert main.is_file()
     assert "$" not in main.read_text() + test.read_text()
     assert run_tests_of(test) == 1
     parse(shlex.split(made["try"])[1:])
     if main.suffix == ".py":
         compile(main.read_text(), str(main), "exec")
-    assert run_command(["new", kind, "my_own", "--folder", str(tmp_path)]) == 2
+    assert run_command(["new", kind, "my_own"]) == 2
     assert "it exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["MyPolicy", "my-policy", "class", "../up", ""])
-def test_a_name_that_is_no_file_of_python_is_refused(name, tmp_path, capsys):
-    assert run_command(["new", "policy", name, "--folder", str(tmp_path)]) == 2
+def test_a_name_that_is_no_file_of_python_is_refused(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["new", "policy", name]) == 2
     assert "not a name of a Python file" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -172,15 +172,14 @@ def commands(root: Path) -> Iterator[list[str]]:
     yield ["refine", f"{run}/run.json", "-o", "fixed.mp4"]
 
 
-def other_commands(root: Path) -> Iterator[list[str]]:
+def other_commands() -> Iterator[list[str]]:
     """Yield commands of the verbs that read other files of a stranger's folder, or none."""
-    run = root.name
     yield ["view", "evil.yaml"]
     yield ["run", "--renderer", "clean", "evil.yaml", "--dry-run"]
     yield ["check", "renderer", "clean", "--scenario", "evil.yaml"]
     yield ["check", "driver", "127.0.0.1:1", "--scenario", "evil.yaml"]
     yield ["serve", "--renderer", "clean", "--scenes", "evil.yaml", "--upstream", "none"]
-    yield ["new", "policy", "mine", "--folder", run]
+    yield ["new", "policy", "mine"]
     yield ["docs", "security"]
     yield ["doctor", "--json"]
 
@@ -223,7 +222,7 @@ def test_nothing_in_a_run_folder_runs_and_reading_writes_nothing(
     (root / LOCK).symlink_to(victim)
     change(root, victim)
     monkeypatch.chdir(folder)
-    others = other_commands(root) if case == "every name" else ()
+    others = other_commands() if case == "every name" else ()
     walked = set()
     outside = tmp_path / "outside"
     outside_before = state_of(outside)

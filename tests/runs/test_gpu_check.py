@@ -36,4 +36,4 @@ def test_images_that_differ_fail_the_section():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
 def test_without_a_card_the_check_ends_with_an_error_of_the_machine():
-    assert run_command(["doctor", "--gpu"]) == 4
+    assert run_command(["doctor", "--gpu", "--budget", "5"]) == 4

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
 from scenarios.opendrive import read_lanes
@@ -52,6 +53,14 @@ def scenario(folder: Path, parts: tuple[str, ...], *overrides: str, seed: int | 
 
 def named(start: str, goal: str) -> tuple[str, str]:
     return f"map.route.from={start}", f"map.route.to={goal}"
+
+
+def test_the_command_names_the_ends_of_a_route(tmp_path, capsys):
+    scenario(tmp_path, two_roads())
+    command = ["--renderer", "clean", "--dry-run", str(tmp_path / "map.xodr")]
+    assert run_command([*command, "--from", "1:20", "--to", "2:150"]) == 0
+    assert run_command([*command, "--from", "1:20", "--to", "9:150"]) == 2
+    assert "9" in capsys.readouterr().err
 
 
 def test_a_named_route_is_driven_from_place_to_place(tmp_path):
