@@ -226,9 +226,10 @@ def _min_ade_by_index(
         until = min(plan.now_us + longest_us, float(line_us[-1]))
         span = np.flatnonzero((line_us >= plan.query_us) & (line_us <= until))
         found = _errors(samples, line_us[span], target_xyz[span], preset)
-        errors = np.stack([error for error in found if error is not None] or [np.zeros(0)])
-        if len(errors) < len(found):
+        covering = [error for error in found if error is not None]
+        if len(covering) < len(found):
             return []
+        errors = np.stack(covering)
         running = np.cumsum(errors, axis=1) / np.arange(1, len(span) + 1)
         best = running.min(axis=0)
         after_now = int(np.searchsorted(line_us, plan.now_us)) + 1

@@ -114,7 +114,6 @@ def test_a_run_with_a_policy_that_prints_gives_one_document(parts, capsys):
     [
         ("Transposed", "xy (2, 41)"),
         ("BadReset", "KeyError: 'route'"),
-        ("NoSensors", "sensors is 'front'"),
     ],
 )
 def test_in_a_run_the_faults_of_a_policy_are_its_own(parts, name, found, capsys):
@@ -125,3 +124,9 @@ def test_in_a_run_the_faults_of_a_policy_are_its_own(parts, name, found, capsys)
     assert found in told
     assert "1 by the policy's own fault" in told
     assert "infrastructure" not in told
+
+
+def test_sensors_that_are_none_are_refused_before_anything_is_driven(parts, capsys):
+    assert run_command([*GREY, "--policy", "talking_policies.py:NoSensors", *SHORT]) == 2
+    assert "sensors is 'front'" in capsys.readouterr().err
+    assert not list(parts.rglob("manifest.json"))

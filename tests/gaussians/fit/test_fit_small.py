@@ -135,7 +135,7 @@ def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
     def breaks(*args, **kwargs):
         calls.append(1)
         out = real(*args, **kwargs)
-        return out._replace(rgb=out.rgb * float("nan")) if len(calls) == 4 else out
+        return replace(out, rgb=out.rgb * float("nan")) if len(calls) == 4 else out
 
     monkeypatch.setattr(loop, "rasterize_gradient", breaks)
     with pytest.raises(InfrastructureError) as error:
