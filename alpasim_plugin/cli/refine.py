@@ -114,5 +114,6 @@ def summary_lines(summary: RefineSummary, out: Path) -> list[str]:
         f"  ms/frame  {times}; with the files {summary.wall_s * 1e3 / summary.frames:.1f}",
         f"  to input  {psnr}, mean {summary.mean_levels:.2f} and at most {summary.max_levels} grey levels",
         f"    events  {events}",
-        f"    output  {out}",
+        f"    output  {out}"
+        + (f"   (without the input's {', '.join(summary.left_out)})" if summary.left_out else ""),
     ]

@@ -21,7 +21,7 @@ from alpasim_plugin.core.types import I64, U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
-UPRIGHT = (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)  # a display matrix that turns nothing
+SQUARE = 1e-3  # by how much a turn may miss a quarter
 BT601, BT709 = 5, 1  # matrices of ITU-T H.273
 WRITABLE = {
     UNSPECIFIED: BT601,
@@ -37,6 +37,8 @@ _MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000
 
 def load_av() -> Any:
     """Return the module ``av``.
+
+    Args:
 
     Raises:
         InfrastructureError: It is not installed, or does not load.
@@ -71,7 +73,8 @@ class TimedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """What a video states about itself.
+    """What a video states about itself; images are upright, so width and height are those after
+    the quarter turns and mirrors of its display matrix.
 
     Attributes:
         width, height: Pixels.
@@ -80,6 +83,7 @@ class VideoFormat:
         frames: Number of frames that the container claims, None where it claims none.
         pixel_aspect: Width of a pixel over its height.
         colour: Matrix, primaries and transfer as numbered by ITU-T H.273; 2 where not stated.
+        left_out: What the file holds besides and is not read.
     """
 
     width: int
@@ -89,6 +93,7 @@ class VideoFormat:
     frames: int | None
     pixel_aspect: Fraction
     colour: tuple[int, int, int]
+    left_out: tuple[str, ...] = ()
 
 
 class VideoReader:
@@ -152,7 +157,7 @@ class VideoReader:
                     found,
                     "rewrite its time stamps, for example with ffmpeg -i IN -vf setpts=N/FR/TB OUT",
                 )
-            image = self._image(frame)
+            image = self._upright(frame)
             if image.shape[:2] != (self.format.height, self.format.width):
                 found = f"frame {index} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
                 raise self._refusal(found, "cut it where the size changes")
@@ -172,21 +177,20 @@ class VideoReader:
         if first is None:
             raise self._refusal("no frames")
         self._first: Any = first
-        matrix = first.side_data.get("DISPLAYMATRIX")
-        if matrix is not None and tuple(np.frombuffer(bytes(matrix), np.int32)) != UPRIGHT:
-            raise self._refusal(
-                "players turn or mirror it by its display matrix",
-                "rewrite it upright, for example with ffmpeg -i IN OUT",
-            )
-        rate = self._stream.average_rate
+        height, width = self._upright(first).shape[:2]
+        turned = (width, height) != (first.width, first.height)
+        aspect = Fraction(self._stream.sample_aspect_ratio or 1)
+        others = [one for one in self._container.streams.video if one.index != self._stream.index]
+        tracks = [f"video track {one.index} ({one.width}x{one.height})" for one in others]
         self.format = VideoFormat(
-            width=first.width,
-            height=first.height,
-            rate=Fraction(rate) if rate else None,
+            width=width,
+            height=height,
+            rate=Fraction(self._stream.average_rate) if self._stream.average_rate else None,
             time_base=Fraction(self._stream.time_base),
             frames=self._stream.frames or None,
-            pixel_aspect=Fraction(self._stream.sample_aspect_ratio or 1),
+            pixel_aspect=1 / aspect if turned else aspect,
             colour=(int(first.colorspace), int(first.color_primaries), int(first.color_trc)),
+            left_out=(*tracks, "sound") if self._container.streams.audio else tuple(tracks),
         )
 
     def _check_end(self, count: int, reached: int) -> None:
@@ -216,12 +220,32 @@ class VideoReader:
         except self._av.FFmpegError as error:
             raise self._refusal(f"damage after frame {count}: {error.strerror or error}") from error
 
-    def _image(self, frame: Any) -> U8:
+    def _upright(self, frame: Any) -> U8:
         # By the matrix that the frame states; BT.601 where it states none.
         image: U8 = frame.to_ndarray(
             format="rgb24", interpolation=exact_conversion(self._av), threads=1
         )
-        return image
+        return np.ascontiguousarray(self._displayed(frame, image))
+
+    def _displayed(self, frame: Any, image: U8) -> U8:
+        """Return an image under the frame's display matrix: quarter turns and mirrors.
+
+        The matrix, of 32 bits fixed point, takes a pixel (x, y) to (a x + c y, b x + d y).
+        """
+        stated = frame.side_data.get("DISPLAYMATRIX")
+        if stated is None:
+            return image
+        matrix = np.frombuffer(bytes(stated), dtype=np.int32).reshape(3, 3)[:2, :2]
+        turn = matrix / max(int(np.abs(matrix).max()), 1)
+        (a, b), (c, d) = np.rint(turn).tolist()
+        if np.abs(turn - np.rint(turn)).max() > SQUARE or abs(a * d - b * c) != 1:
+            raise self._refusal(
+                f"a display matrix {turn.round(3).tolist()}, which is neither a quarter turn nor a mirror",
+                "rewrite it upright, for example with ffmpeg -i IN OUT",
+            )
+        if a == 0:
+            image, a, d = image.swapaxes(0, 1), c, b
+        return image[:: int(d), :: int(a)]
 
     def _refusal(self, found: str, do: str = GIVE) -> InputError:
         return InputError(f"{self.path}: {found}", do)

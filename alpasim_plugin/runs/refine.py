@@ -191,6 +191,7 @@ class RefineSummary:
         events: Number of frames that a guard replaced by the unrefined ones, by event.
         refused_psnr_db: Where the fixer changed a frame beyond the limit, that frame's PSNR against
             the source; from there on the source's frames were written as they are.
+        left_out: What the source holds besides, such as sound; the result has none of it.
     """
 
     fixer: str
@@ -208,6 +209,7 @@ class RefineSummary:
     max_levels: int
     events: Mapping[str, int]
     refused_psnr_db: float | None
+    left_out: tuple[str, ...]
 
 
 def refine_video(
@@ -281,6 +283,7 @@ def _summary(fixer: Fixer, source: VideoFormat, stats: StreamStats, wall_s: floa
         max_levels=difference.max_levels,
         events=dict(stats.events),
         refused_psnr_db=stats.refused_psnr_db,
+        left_out=source.left_out,
     )
 
 

@@ -16,7 +16,7 @@ from alpasim_plugin.core.errors import EvaluatorError, SimrunError
 from alpasim_plugin.core.interfaces import Evaluator
 from alpasim_plugin.core.parts import PartSpec, build, names, resolve
 from alpasim_plugin.core.parts.spec import BUILTIN
-from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.table import METRICS, MetricTable, table_of
@@ -67,7 +67,7 @@ def score(
         One series per metric, over the whole log including the warm-up.
 
     Raises:
-        EvaluatorError: The log cannot be scored (`check_rollout`), an evaluator failed, or
+        EvaluatorError: The log cannot be scored (NaN pose, repeated time), an evaluator failed, or
             two gave the same metric.
         InputError: Unknown preset.
     """
@@ -159,20 +159,64 @@ def handover_us(rollout: RolloutLog) -> int:
 
 
 def check_rollout(rollout: RolloutLog) -> None:
-    """Refuse logs from which no number may be taken; what else can be wrong with a log, its reader
-    refuses.
+    """Refuse logs from which no number may be taken.
 
     Raises:
-        EvaluatorError: No pose of the ego or of the recorded drive, or one that is not finite.
+        EvaluatorError: No ego pose, times that do not increase, poses that are not finite,
+            quaternions that are not rotations, or a size that is not positive; for the ego, the
+            recorded drive or any actor.
     """
-    for who, track in (("the ego", rollout.ego), ("the recorded drive", rollout.ego_log)):
-        poses = np.hstack([track.xyz, track.quat])
-        if not (len(poses) and np.isfinite(poses).all()):
-            raise EvaluatorError(
-                f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: "
-                f"{len(poses)} poses, of which {int(np.isfinite(poses).all(axis=1).sum())} are finite",
-                "repair or leave out this log",
-            )
+    _check_track("the ego", rollout.ego, rollout)
+    _check_track("the recorded drive", rollout.ego_log, rollout)
+    _check_size("the ego", rollout.ego_box.length_m, rollout.ego_box.width_m, rollout)
+    for actor in rollout.actors.values():
+        _check_track(f"actor {actor.actor_id!r}", actor.track, rollout)
+        _check_size(f"actor {actor.actor_id!r}", actor.box.length_m, actor.box.width_m, rollout)
+    for plan in rollout.plans:
+        for track in (plan.trajectory, *plan.samples):
+            if len(track):
+                _check_track(f"the plan at {plan.now_us} us", track, rollout)
+
+
+def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
+    def refuse(problem: str) -> EvaluatorError:
+        return EvaluatorError(
+            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: {problem}",
+            "repair or leave out this log",
+        )
+
+    if len(track) == 0:
+        raise refuse("no pose at all")
+    if track.xyz.shape != (len(track), 3) or track.quat.shape != (len(track), 4):
+        raise refuse(
+            f"{len(track)} times, positions of shape {track.xyz.shape}, rotations of shape {track.quat.shape}"
+        )
+    steps = np.diff(track.t_us)
+    if np.any(steps <= 0):
+        i = int(np.argmax(steps <= 0))
+        kind = (
+            "is repeated"
+            if steps[i] == 0
+            else f"is followed by the earlier {int(track.t_us[i + 1])} us"
+        )
+        raise refuse(f"time {int(track.t_us[i])} us {kind}")
+    finite = np.isfinite(track.xyz).all(axis=1) & np.isfinite(track.quat).all(axis=1)
+    if not finite.all():
+        raise refuse(f"a pose that is not finite at {int(track.t_us[int(np.argmin(finite))])} us")
+    off = np.abs(np.linalg.norm(track.quat, axis=1) - 1.0)
+    if float(off.max()) > 1e-3:
+        i = int(np.argmax(off))
+        raise refuse(
+            f"a quaternion of length {float(np.linalg.norm(track.quat[i])):.6g} at {int(track.t_us[i])} us"
+        )
+
+
+def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) -> None:
+    if not (np.isfinite([length_m, width_m]).all() and length_m > 0 and width_m > 0):
+        raise EvaluatorError(
+            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: a box of {length_m} x {width_m} m",
+            "give every box a positive length and width",
+        )
 
 
 def with_preset(function: Callable[..., list[MetricSeries]]) -> Callable[[Preset], Any]:

@@ -203,7 +203,10 @@ CASES: dict[str, tuple[bool, Change]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * ("some names" in case)) for case in CASES],
+)
 def test_nothing_in_a_run_folder_runs_and_reading_writes_nothing(
     case,
     finished,

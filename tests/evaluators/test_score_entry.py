@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.types import Trajectory
+from alpasim_plugin.core.types import Box, LoggedPlan, Trajectory
 from evaluators import METRICS, MetricInfo, resolve_evaluators, rollout_values, score
 from evaluators.metrics import MetricTable
 from evaluators.metrics.score import run_evaluator, series
@@ -31,18 +31,52 @@ def broken_track(index, **values):
 
 
 @pytest.mark.parametrize(
-    "poses",
+    ("poses", "text"),
     [
-        broken_track(1, xyz=np.nan),
-        broken_track(1, quat=np.inf),
-        Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4))),
+        (broken_track(2, t_us=100_000), "time 100000 us is repeated"),
+        (broken_track(3, t_us=50_000), "time 200000 us is followed by the earlier 50000 us"),
+        (broken_track(1, xyz=np.nan), "a pose that is not finite at 100000 us"),
+        (broken_track(1, quat=np.inf), "a pose that is not finite at 100000 us"),
+        (broken_track(2, quat=[2.0, 0, 0, 0]), "a quaternion of length 2 at 200000 us"),
+        (Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4))), "no pose at all"),
+        (
+            Trajectory(np.arange(3), np.zeros((2, 3)), np.zeros((3, 4))),
+            "3 times, positions of shape (2, 3)",
+        ),
     ],
 )
-@pytest.mark.parametrize("who", ["ego", "ego_log"])
-def test_a_log_without_poses_or_with_one_that_is_not_finite_is_refused(who, poses):
+@pytest.mark.parametrize("who", ["ego", "ego_log", "actor"])
+def test_a_log_with_a_broken_track_is_refused(who, poses, text):
+    changes = {"actors": {"a": car("a", poses)}} if who == "actor" else {who: poses}
     with pytest.raises(EvaluatorError) as caught:
-        score(*bad(**{who: poses}))
+        score(*bad(**changes))
+    assert text in str(caught.value)
+    assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[
+        who
+    ] in caught.value.message
     assert "session 'uuid'" in caught.value.message
+
+
+def test_a_broken_plan_is_refused_and_named():
+    good, late = (
+        track(np.arange(3.0), 0.0, t_us=[0, 100, 200]),
+        track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100]),
+    )
+    plans = (
+        LoggedPlan(0, 100, good, (good, good)),
+        LoggedPlan(300_000, 300_100, good, (good, late)),
+    )
+    with pytest.raises(EvaluatorError) as caught:
+        score(*bad(plans=plans))
+    assert "the plan at 300000 us" in caught.value.message
+    assert "time 300100 us is repeated" in caught.value.message
+
+
+@pytest.mark.parametrize("box", [Box(0.0, 1.0, 1.0), Box(4.0, -1.0, 1.0), Box(np.nan, 1.0, 1.0)])
+def test_a_box_without_size_is_refused(box):
+    log, where = bad()
+    with pytest.raises(EvaluatorError, match="positive length and width"):
+        score(replace(log, actors={"a": car("a", track(0.0, 0.0, n=4), box)}), where)
 
 
 def test_every_series_states_unit_direction_and_reduction_as_declared():

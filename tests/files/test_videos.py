@@ -42,13 +42,42 @@ def video(path, matrix=None, tracks=1):
     return path
 
 
-def test_an_upright_display_matrix_is_taken(tmp_path):
-    with VideoReader(video(tmp_path / "a.mp4", (ONE, 0, 0, ONE))) as reader:
+def bright(image):
+    """Return whether the bright corner lies below and on the right, and its height and width."""
+    rows, columns = np.nonzero(image[..., 0] > 150)
+    middle = rows.mean() > image.shape[0] / 2, columns.mean() > image.shape[1] / 2
+    return *middle, (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "below", "right", "turned"),
+    [
+        ((ONE, 0, 0, ONE), False, False, False),
+        ((-ONE, 0, 0, -ONE), True, True, False),  # half a turn
+        ((-ONE, 0, 0, ONE), False, True, False),  # left and right exchanged
+        ((ONE, 0, 0, -ONE), True, False, False),  # upside down, mirrored
+        ((0, ONE, -ONE, 0), False, True, True),  # a quarter turn clockwise
+        ((0, -ONE, ONE, 0), True, False, True),
+        ((0, ONE, ONE, 0), False, False, True),  # rows for columns
+        ((0, -ONE, -ONE, 0), True, True, True),
+    ],
+)
+def test_quarter_turns_and_mirrors_are_applied(tmp_path, matrix, below, right, turned):
+    with VideoReader(video(tmp_path / "a.mp4", matrix)) as reader:
         image = next(iter(reader)).image
-    assert image[:8, :16].min() > 150 > 100 > image[8:].max()
+        assert (reader.format.height, reader.format.width) == image.shape[:2]
+    assert image.shape[:2] == ((WIDTH, HEIGHT) if turned else (HEIGHT, WIDTH))
+    assert bright(image) == (below, right, (16, 8) if turned else (8, 16))
 
 
-@pytest.mark.parametrize("matrix", [(0, ONE, -ONE, 0), (-ONE, 0, 0, ONE)])
-def test_turned_and_mirrored_videos_are_refused(tmp_path, matrix):
+@pytest.mark.parametrize("matrix", [(46341, 46341, -46341, 46341), (ONE, 0, 0, ONE // 2)])
+def test_other_display_matrices_are_refused(tmp_path, matrix):
     with pytest.raises(InputError, match="matrix"):
         VideoReader(video(tmp_path / "a.mp4", matrix))
+
+
+def test_a_second_video_track_is_said(tmp_path):
+    with VideoReader(video(tmp_path / "a.mp4", tracks=2)) as reader:
+        assert reader.format.left_out == (f"video track 1 ({WIDTH}x{HEIGHT})",)
+    with VideoReader(video(tmp_path / "b.mp4")) as reader:
+        assert reader.format.left_out == ()

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 
 from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
@@ -119,6 +120,7 @@ def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: 
     assert not list((tmp_path / "failures").rglob("front.mp4"))
 
 
+@pytest.mark.slow
 def test_a_policy_that_has_a_camera_after_all_drives_behind_each_renderer(tmp_path: Path) -> None:
     plan = plan_of(SEES)
     drive(plan, tmp_path)

@@ -55,6 +55,7 @@ def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not():
     assert "within 0.5 s" in found["hangs"].reason
 
 
+@pytest.mark.slow
 def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
     monkeypatch,
 ):

@@ -51,6 +51,7 @@ def test_an_interrupted_search_continues_to_the_same_boundary(searched, tmp_path
     assert removed.exists()
 
 
+@pytest.mark.slow
 def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_path):
     found = drive(tmp_path / "run", "--vary", "actors.cutter.s_m=35..2000")
     assert "no failure" in found["variants"]["clean/pure-pursuit"]["reason"]

@@ -225,6 +225,7 @@ YIELD = relation(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ruled", [True, False])
 def test_vehicles_cross_the_route_where_a_rule_says_who_goes_first(tmp_path, ruled):
     rule = (
