@@ -32,7 +32,7 @@ from evaluators.statistics.baselines import (
 )
 from evaluators.statistics.boundary_gate import judge_boundaries
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import GateVerdict, check_number_of_scenes, judge, load_gate
+from evaluators.statistics.gate import GateVerdict, check_gate, check_number_of_scenes, load_gate
 from scenarios.suite import load_suite
 
 EPILOG = """
@@ -118,7 +118,7 @@ def gate(
             stored = baseline.table
             if baseline.repeatable is False:
                 repeatable = False
-        verdict = judge(
+        verdict = check_gate(
             table_of_run(stored_run),
             spec,
             stored,

@@ -216,7 +216,7 @@ class DevicePlanes(Protocol):
 
 
 class _Plane:
-    """A plane of a frame: an array, or, where that is None, the plane of the frame's device."""
+    """An image plane of a frame (colour, opacity or depth): an array, or the one on the device."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name

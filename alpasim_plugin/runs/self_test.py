@@ -14,7 +14,7 @@ from alpasim_plugin.runs.run import Progress, execute_run
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.statistics.baselines import table_of_run
-from evaluators.statistics.gate import GateSpec, GateVerdict, judge
+from evaluators.statistics.gate import GateSpec, GateVerdict, check_gate
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
 
@@ -108,4 +108,4 @@ def judge_against(
         "population": "suite",
     }
     preset = spec.preset or DEFAULT
-    return judge(table, spec.model_copy(update=fields), first, "the reference", preset=preset)
+    return check_gate(table, spec.model_copy(update=fields), first, "the reference", preset=preset)

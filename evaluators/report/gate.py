@@ -36,7 +36,7 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
 
     Args:
         run: The run that was gated.
-        verdict: What `evaluators.statistics.gate.judge` gave.
+        verdict: What `evaluators.statistics.gate.check_gate` gave.
         gate: Name or file of the gate.
     """
     path = run.folder / GATE_FILES[0]
@@ -66,7 +66,7 @@ def _content(run: Run) -> str:
 
 
 def gate_section(run: Run) -> JsonObject | None:
-    """Return what the report shows of the last gate that judged these rollouts; None without one.
+    """Return what the report shows of the last gate that checked these rollouts; None without one.
 
     Raises:
         InputError: gate.json is damaged, or not what a gate wrote.

@@ -20,7 +20,7 @@ def judge_boundaries(
     stored: JsonView | None = None,
     stored_name: str = "",
 ) -> GateVerdict:
-    """Judge what a search along a parameter found.
+    """Check the boundaries that a search along a parameter found against a margin.
 
     Args:
         table: The run's rollouts.

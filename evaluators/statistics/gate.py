@@ -254,7 +254,7 @@ class GateVerdict:
         }
 
 
-def judge(
+def check_gate(
     rollouts: RolloutTable,
     spec: GateSpec,
     stored: RolloutTable | None = None,
@@ -288,7 +288,7 @@ def judge(
     base = _base(list(sides), spec, list(base_sides), owner, is_paired)
     compares = is_paired or stored is not None or spec.baseline is not None
     checks: list[Check] = []
-    for variant in _judged(list(sides), spec, base, is_paired):
+    for variant in _tested_variants(list(sides), spec, base, is_paired):
         side = sides[variant]
         if compares:
             other = _partner(variant, base, list(base_sides), owner)
@@ -348,7 +348,7 @@ def _base(
     return usual_base(variants)
 
 
-def _judged(
+def _tested_variants(
     variants: list[Variant], spec: GateSpec, base: Base | None, is_paired: bool
 ) -> list[Variant]:
     known = {variant.renderer for variant in variants}
@@ -360,13 +360,13 @@ def _judged(
         )
     if spec.renderers:
         return [variant for variant in variants if variant.renderer in spec.renderers]
-    judged = [variant for variant in variants if base is None or base.of(variant) != variant]
-    if not judged and is_paired and base is not None:
+    tested = [variant for variant in variants if base is None or base.of(variant) != variant]
+    if not tested and is_paired and base is not None:
         raise InputError(
             f"baseline {base.name!r}: the run has nothing else to compare with it",
             "run two renderers or two policies, or give --baseline-file",
         )
-    return judged or variants  # a gate of limits alone needs no second variant
+    return tested or variants  # a gate of limits alone needs no second variant
 
 
 def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: str) -> Variant:

@@ -15,7 +15,7 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.statistics.gate import (
     GateSpec,
     MetricRule,
-    judge,
+    check_gate,
     load_gate,
     shipped_gates,
 )
@@ -59,7 +59,7 @@ def table_of(made):
 
 def judged(run, spec, stored=None, name="", **fields: Any):
     base = None if stored is None else table_of(stored)
-    return judge(table_of(run), spec, base, name, **fields)
+    return check_gate(table_of(run), spec, base, name, **fields)
 
 
 def add(change, metric="lateral_distance_m", where=slice(None)):

@@ -16,7 +16,7 @@ from evaluators.report.ci import write_gate_files
 from evaluators.report.gate import gate_section, worst_of
 from evaluators.report.overview import overview_of
 from evaluators.statistics.baselines import table_of_run
-from evaluators.statistics.gate import judge, load_gate
+from evaluators.statistics.gate import check_gate, load_gate
 
 
 def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usual_run, tmp_path):
@@ -24,7 +24,7 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usu
     shutil.copytree(usual_run, root)
     run = read_run(root)
     spec, source = load_gate("default", run.table)
-    verdict = judge(table_of_run(run), spec, None, "", run.table)
+    verdict = check_gate(table_of_run(run), spec, None, "", run.table)
     files = write_gate_files(verdict, source, run, root)
     assert [file.name for file in files] == ["gate.md", "gate.junit.xml", "gate.json"]
     section = gate_section(run)

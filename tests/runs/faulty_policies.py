@@ -215,19 +215,18 @@ class SwappedChannels(ByYellow):
 # Scenario -> policy -> a word of the sentence that must stand first
 FAULTS: dict[str, dict[type[PurePursuit] | type[LaneCamera], str]] = {
     "bend": {
-        WorldFrame: "world coordinates",
-        WorldAxes: "world's axes",
+        WorldFrame: "not the world's",
+        WorldAxes: "in the rig frame x is forward",
         NotANumber: "not finite",
         RaisesInNumpy: "faulty_policies.py:",
         RaisesAtFrame30: "faulty_policies.py:",
         TimeStep: "off by 0.5",
         SpeedDoubled: "off by 2",
         Centimetres: "centimetres",
-        SwappedAxes: "sideways",
+        SwappedAxes: "in the rig frame x is forward",
         EmptyPlan: "(0, 2)",
         ConstantPlan: "route_rig changed no plan",
         Jitter: "from query to query",
-        OtherCamera: "rear",
         StopsForever: "standstill",
     },
     "hard/hard_brake": {

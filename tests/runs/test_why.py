@@ -13,6 +13,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core import parts
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
@@ -27,6 +28,7 @@ from tests.runs.grey_renderer import GREY
 from tests.runs.test_runs import Announced
 
 HERE = "tests.runs.test_why"
+OTHER_CAMERA = "tests.runs.faulty_policies:OtherCamera"
 BEND = """
 version: 1
 description: A bend.
@@ -242,13 +244,17 @@ def test_no_page_names_a_false_cause_and_most_show_the_right_evidence_first(
         names = {f"tests.runs.faulty_policies:{one.__name__}": word for one, word in faults.items()}
         plan = make_plan(expand(source), (renderer,), tuple(names), (0,), RunOptions())
         folder = tmp_path / scenario.replace("/", "-")
+        if scenario == "bend":
+            other = make_plan(expand(source), (renderer,), (OTHER_CAMERA,), (0,), RunOptions())
+            with pytest.raises(InputError, match="rear"):  # nothing is driven
+                execute_run(other, tmp_path / "other", 1, ["simrun"], Announced())
         execute_run(plan, folder, 1, ["simrun"], Announced())
         read = read_run(folder)
         for one in read.rollouts:
             sentences = cause_of(read, one, divergences_of(read, one)).sentences
             word = names[one.policy]
             if not sentences or word not in sentences[0]:
-                missed.append(one.policy)
+                missed.append((one.policy, sentences[:2]))
             for sentence in sentences:
                 named = [cause for cause in CAUSES if cause in sentence and cause not in word]
                 assert not named or word in sentence, (one.policy, sentence)

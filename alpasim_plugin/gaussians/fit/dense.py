@@ -160,7 +160,7 @@ class _Seen:
 
 
 def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
-    """Find each measured pixel's inverse depth from where the neighbours see it, and judge it."""
+    """Find each measured pixel's inverse depth from where the neighbours see it, and how far they agree."""
     q = guess[::STRIDE, ::STRIDE].copy()
     for _ in range(ROUNDS):
         H, g = np.full(q.shape, 1e-9, np.float32), np.zeros_like(q)
