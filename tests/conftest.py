@@ -5,8 +5,6 @@ numbers, which stand beside the properties (`tests.examples`), are drawn with
 ``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys
@@ -34,7 +32,7 @@ if (
 REPO = Path(__file__).resolve().parents[1]
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """Keep what tests fit out of the user's cache; workers inherit the folder."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = (
@@ -48,7 +46,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter):
     """Say that the laboratory's tests were not collected."""
     if not laboratory_is_installed():
         terminalreporter.write_line(NOT_COLLECTED)
@@ -76,7 +74,7 @@ def same_threads():
         torch.set_num_threads(before)
 
 
-def find_shared_data() -> Path | None:
+def find_shared_data():
     """Return the folder of third-party data sets, or None where this machine has none.
 
     ``SIMRUN_SHARED_DATA`` names it; otherwise ``../shared/data`` beside the checkout is tried.
@@ -101,7 +99,7 @@ def shared_data():
 def data_set(shared_data):
     """Give what returns one of the data sets by its folder's name, or skips."""
 
-    def found(name: str) -> Path:
+    def found(name):
         if not (shared_data / name).is_dir():
             pytest.skip(f"the data set {shared_data / name} is absent")
         return shared_data / name

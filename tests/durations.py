@@ -6,21 +6,16 @@ Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a n
 holds for one machine and one number of workers: CI's.
 """
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
-from collections.abc import Mapping
 from pathlib import Path
-
-import pytest
 
 KEPT = Path(__file__).with_name("durations.json")
 FACTOR, LEAST_S = 1.5, 3.0  # a file is slower if it takes so many times as long, and so much longer
-seconds: defaultdict[str, float] = defaultdict(float)  # by file, set-up and tear-down included
+seconds = defaultdict(float)  # by file, set-up and tear-down included
 
 
-def slower(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
+def slower(before, now):
     """Return a line for each file that became slower and for each new one that takes long, the
     worst first.
     """
@@ -32,7 +27,7 @@ def slower(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
     return [line for _, line in sorted(worse)]
 
 
-def kept_seconds() -> dict[str, float]:
+def kept_seconds():
     """Return the seconds of each file as they were kept; none where nothing is."""
     return json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
 
@@ -47,18 +42,18 @@ FIRST = (
 )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Put the files in the order in which workers take them."""
     took_s = kept_seconds()
 
-    def order_of(item: pytest.Item) -> tuple[int, float]:
+    def order_of(item):
         file = item.nodeid.partition("::")[0]
         return (FIRST.index(file) if file in FIRST else len(FIRST)), -took_s.get(file, 0.0)
 
     items.sort(key=order_of)
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption(
         "--durations-file",
         type=Path,
@@ -66,14 +61,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+def pytest_runtest_logreport(report):
     seconds[report.nodeid.partition("::")[0]] += report.duration
 
 
-def pytest_terminal_summary(
-    terminalreporter: pytest.TerminalReporter, config: pytest.Config
-) -> None:
-    file: Path | None = config.getoption("--durations-file")
+def pytest_terminal_summary(terminalreporter, config):
+    file = config.getoption("--durations-file")
     if file is None:
         return
     before = kept_seconds()

@@ -4,11 +4,7 @@ Hypothesis draws few examples by default and all of them with ``SIMRUN_HYPOTHESI
 cases of one rule are marked ``slow``.
 """
 
-from __future__ import annotations
-
 import os
-from collections.abc import Sequence
-from typing import Any
 
 import pytest
 
@@ -17,12 +13,12 @@ SHARE = {"quick": 0.1, "nightly": 1.0}[PROFILE]
 FEWEST = 4
 
 
-def examples(full: int) -> int:
+def examples(full):
     """Return the number of examples to draw of a property that deserves ``full``."""
     return max(min(full, FEWEST), round(SHARE * full))
 
 
-def first_of(cases: Sequence[Any], count: int = 1) -> list[Any]:
+def first_of(cases, count=1):
     """Return the cases of a test with one parameter, all but the first ``count`` of them marked
     ``slow``.
     """
@@ -32,7 +28,7 @@ def first_of(cases: Sequence[Any], count: int = 1) -> list[Any]:
     ]
 
 
-def first_rows_of(cases: Sequence[tuple[Any, ...]], count: int = 1) -> list[Any]:
+def first_rows_of(cases, count=1):
     """Do the same for a test with several parameters, whose cases are tuples of their values."""
     return [
         case if k < count else pytest.param(*case, marks=pytest.mark.slow)

@@ -1,7 +1,5 @@
 """Whether the laboratory, a distribution of its own, is installed."""
 
-from __future__ import annotations
-
 import sys
 from importlib import metadata
 
@@ -11,7 +9,7 @@ NOT_COLLECTED = (
 )
 
 
-def laboratory_is_installed(path: list[str] | None = None) -> bool:
+def laboratory_is_installed(path=None):
     """Return whether the folders of `path`, by default `sys.path`, hold the distribution."""
     installed = metadata.distributions(name=DISTRIBUTION, path=sys.path if path is None else path)
     return any(True for _ in installed)

@@ -2,14 +2,11 @@
 read-only root, or with a small disk.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,7 +22,7 @@ mount -t tmpfs -o mode=755 none "{closed}" && mkdir -p "{prefix}" && mount --mov
 """
 
 
-def can_become_nobody() -> bool:
+def can_become_nobody():
     """Tell whether this process may change its user and mount, in a file system of its own."""
     if os.getuid() != 0 or any(shutil.which(tool) is None for tool in TOOLS):
         return False
@@ -45,7 +42,7 @@ as_root = pytest.mark.skipif(
 
 
 @contextmanager
-def shared_folder() -> Iterator[Path]:
+def shared_folder():
     """Give a folder that every user may write."""
     folder = Path(tempfile.mkdtemp())
     folder.chmod(0o777)
@@ -55,7 +52,7 @@ def shared_folder() -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _closed() -> Path | None:
+def _closed():
     """Return the first folder on the way to the interpreter that other users may not enter."""
     prefix = Path(sys.base_prefix)
     return next(
@@ -64,13 +61,13 @@ def _closed() -> Path | None:
 
 
 def run_as_nobody(
-    command: Sequence[str],
+    command,
     *,
-    cwd: Path | str = "/",
-    mounts: str = "",
-    timeout: float = 240,
-    **variables: str,
-) -> subprocess.CompletedProcess[str]:
+    cwd="/",
+    mounts="",
+    timeout=240,
+    **variables,
+):
     """Run a command as the user "nobody".
 
     Args:

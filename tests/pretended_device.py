@@ -7,10 +7,8 @@ What cannot be pretended: speed, memory, rounding, and kernels that run at the s
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch.overrides import TorchFunctionMode
@@ -39,7 +37,7 @@ class Traffic:
     bytes_up: int = 0
     bytes_down: int = 0
 
-    def reset(self) -> None:
+    def reset(self):
         """Forget everything."""
         self.launches = self.bytes_up = self.bytes_down = 0
         self.waits.clear()
@@ -54,7 +52,7 @@ class OnDevice(torch.Tensor):
     held: torch.Tensor
 
     @staticmethod
-    def __new__(cls, held: torch.Tensor) -> OnDevice:
+    def __new__(cls, held):
         made = torch.Tensor._make_wrapper_subclass(
             cls,
             held.size(),
@@ -66,26 +64,26 @@ class OnDevice(torch.Tensor):
         made.held = held
         return made
 
-    def __repr__(self, *, tensor_contents: Any = None) -> str:
+    def __repr__(self, *, tensor_contents=None):
         return f"OnDevice({tuple(self.shape)}, {self.dtype})"
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {})
 
 
-def _wrap(value: Any) -> Any:
+def _wrap(value):
     is_host = isinstance(value, torch.Tensor) and not isinstance(value, OnDevice)
     return OnDevice(value) if is_host else value
 
 
-def _unwrap(value: Any) -> Any:
+def _unwrap(value):
     if isinstance(value, OnDevice):
         return value.held
     return HOST if isinstance(value, torch.device) else value
 
 
-def _run(func: Any, args: Any, kwargs: Any) -> Any:
+def _run(func, args, kwargs):
     """Run an operation, on the device if a tensor of it takes part or it is asked for there."""
     name = func.overloadpacket.__name__
     flat, _ = tree_flatten((args, kwargs))
@@ -121,13 +119,13 @@ def _run(func: Any, args: Any, kwargs: Any) -> Any:
     return tree_map(_wrap, result)
 
 
-def _downloaded(tensor: torch.Tensor) -> torch.Tensor:
+def _downloaded(tensor):
     traffic.bytes_down += tensor.nbytes
     traffic.waits["copy to the host"] += 1
     return tensor
 
 
-def _uploaded(tensor: torch.Tensor) -> OnDevice:
+def _uploaded(tensor):
     traffic.bytes_up += tensor.nbytes
     return OnDevice(tensor.clone())
 
@@ -135,14 +133,14 @@ def _uploaded(tensor: torch.Tensor) -> OnDevice:
 class _Dispatch(TorchDispatchMode):
     """Take operations that no tensor of the device takes part in: those that make one."""
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {})
 
 
 class _Functions(TorchFunctionMode):
     """Answer what torch would ask a real device before it dispatches."""
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
         first = args[0] if args else None
@@ -162,9 +160,7 @@ class _Functions(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-def _moved(
-    tensor: torch.Tensor, device: torch.device | None, func: Any, args: Any, kwargs: Any
-) -> Any:
+def _moved(tensor, device, func, args, kwargs):
     """Move a tensor, then convert its type if that was asked for as well."""
     if device is None or (device.type == "cuda") == isinstance(tensor, OnDevice):
         rest = [value for value in args[1:] if _device_of(value) is None]
@@ -175,7 +171,7 @@ def _moved(
     return moved.to(types[0]) if types else moved
 
 
-def _device_of(value: Any) -> torch.device | None:
+def _device_of(value):
     if isinstance(value, torch.device):
         return value
     if isinstance(value, str) and value.partition(":")[0] in ("cpu", "cuda"):
@@ -186,11 +182,11 @@ def _device_of(value: Any) -> torch.device | None:
 class _Launches:
     """A Triton kernel that takes tensors of the device, and is interpreted on the host."""
 
-    def __init__(self, kernel: Any) -> None:
+    def __init__(self, kernel):
         self.kernel = kernel
 
-    def __getitem__(self, grid: tuple[int, ...]) -> Any:
-        def launch(*args: Any, **constants: Any) -> None:
+    def __getitem__(self, grid):
+        def launch(*args, **constants):
             if any(isinstance(x, torch.Tensor) and not isinstance(x, OnDevice) for x in args):
                 raise RuntimeError("a kernel was given a tensor of the host")
             traffic.launches += 1
@@ -203,16 +199,16 @@ class _Launches:
 class _Kernels:
     """The module of Triton kernels, for the pretended device."""
 
-    def __init__(self, module: Any) -> None:
+    def __init__(self, module):
         self.module = module
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         value = getattr(self.module, name)
         return _Launches(value) if hasattr(value, "__getitem__") else value
 
 
 @contextmanager
-def pretended_device(patch: Any) -> Iterator[Traffic]:
+def pretended_device(patch):
     """Let torch have one CUDA device for a while.
 
     Args:

@@ -1,7 +1,5 @@
 """The container file: rules that it keeps, and where an engine is at hand, a build that drives."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Where the laboratory's tests are collected."""
 
-from __future__ import annotations
-
 from tests.laboratory import DISTRIBUTION, laboratory_is_installed
 
 

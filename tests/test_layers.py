@@ -18,7 +18,7 @@ A = "alpasim_plugin."
 
 # The rooms in the order in which data flows, and what each may import besides itself and `BASE`.
 BASE = (A + "core",)
-STAGES: dict[str, tuple[str, ...]] = {
+STAGES = {
     A + "world": (),
     A + "gaussians": (A + "world",),
     "scenarios": (A + "world",),
@@ -82,7 +82,7 @@ def room_of(module):
 
 
 def imported(nodes):
-    found: set[str] = set()
+    found = set()
     for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -163,7 +163,7 @@ def targets_of(module):
     guarded = {
         id(inner) for node in module.nodes if is_for_type_checkers(node) for inner in ast.walk(node)
     }
-    found: set[str] = set()
+    found = set()
     for node in module.nodes:
         if id(node) in guarded:
             continue

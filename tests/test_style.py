@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
-from collections.abc import Iterator
 
-from tests.test_layers import PACKAGES, Module, modules
+from tests.test_layers import PACKAGES, modules
 
 # Module -> why a user would wait a fifth longer without it. `goes`: it is on its way out.
 ALLOWED: dict[str, str] = {}
@@ -14,11 +13,11 @@ DEPRECATED = ("torch.jit",)
 STANDARD = ("os._exit", "sys._getframe")  # documented, whatever their names
 
 
-def is_private(name: str) -> bool:
+def is_private(name):
     return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
 
 
-def dotted(node: ast.AST) -> str:
+def dotted(node):
     """Return ``a.b.c`` of nested attributes; empty where the innermost is no name."""
     if isinstance(node, ast.Attribute):
         inner = dotted(node.value)
@@ -26,7 +25,7 @@ def dotted(node: ast.AST) -> str:
     return node.id if isinstance(node, ast.Name) else ""
 
 
-def foreign_names(module: Module) -> dict[str, str]:
+def foreign_names(module):
     """Return the names that a module imports from other distributions: name -> what it stands
     for.
     """
@@ -42,7 +41,7 @@ def foreign_names(module: Module) -> dict[str, str]:
     return {name: what for name, what in found.items() if what.split(".")[0] not in PACKAGES}
 
 
-def private_uses(module: Module) -> set[str]:
+def private_uses(module):
     foreign = foreign_names(module)
     used = set(foreign.values())
     for node in module.nodes:
@@ -86,7 +85,7 @@ PRINTING = {
 }
 
 
-def calls_of(module: Module) -> Iterator[str]:
+def calls_of(module):
     for node in module.nodes:
         if isinstance(node, ast.Call):
             yield dotted(node.func)
@@ -101,7 +100,7 @@ def test_text_is_printed_in_one_place_which_escapes_it():
     assert found - set(PRINTERS) == set()
 
 
-def names_bound(statement: ast.stmt) -> list[str]:
+def names_bound(statement):
     if isinstance(statement, ast.FunctionDef | ast.ClassDef):
         return [] if statement.decorator_list else [statement.name]
     if isinstance(statement, ast.AnnAssign) and statement.value is None:
@@ -140,7 +139,7 @@ READERS = {
 READING = {"open", "os.open", "np.load", "np.fromfile", "np.memmap", "cv2.imread", "pq.ParquetFile"}
 
 
-def reads_files(module: Module) -> bool:
+def reads_files(module):
     """Tell whether a module opens files for reading other than by `alpasim_plugin.core.reading`."""
     for node in module.nodes:
         if not isinstance(node, ast.Call):

@@ -12,8 +12,6 @@ With a folder as argument the modules are written there instead. ``checksums.jso
 digests of sources and results, so that a test without the compiler sees a forgotten run.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -30,7 +28,7 @@ IMPORTS = (
 CHECKSUMS = "checksums.json"
 
 
-def digests(folder: Path) -> dict[str, str]:
+def digests(folder):
     """Return the sha256 of every source and generated file of a folder, by name."""
     names = sorted(
         path.name
@@ -40,7 +38,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
 
 
-def compile_protos(target: Path) -> list[str]:
+def compile_protos(target):
     """Write the modules, their type stubs and the checksums into `target`; return the names of the
     modules.
 

@@ -1,7 +1,5 @@
 """A small network that depends on its past, and a renderer for it to stand in front of."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

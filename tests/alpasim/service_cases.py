@@ -2,24 +2,17 @@
 service in front of that renderer.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import cv2
 import grpc
 import numpy as np
-import pytest
 
-from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
+from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.alpasim.server.sources import UpstreamSource
 from alpasim_plugin.core.geometry import quat_from_matrix, se2
-from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import api_version, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
@@ -34,7 +27,7 @@ T_RIG_CAMERA = np.array(
 )
 
 
-def wire_pose(T: F64) -> common_pb2.Pose:
+def wire_pose(T):
     """Return the message of a pose."""
     w, x, y, z = quat_from_matrix(T[None, :3, :3])[0].tolist()
     return common_pb2.Pose(
@@ -43,9 +36,7 @@ def wire_pose(T: F64) -> common_pb2.Pose:
     )
 
 
-def pinhole(
-    width: int = WIDTH, height: int = HEIGHT, name: str = CAMERA
-) -> sensorsim_pb2.CameraSpec:
+def pinhole(width=WIDTH, height=HEIGHT, name=CAMERA):
     """Return the intrinsics of a pinhole without distortion."""
     lens = sensorsim_pb2.OpenCVPinholeCameraParam(focal_length_x=40, focal_length_y=40)
     lens.principal_point_x, lens.principal_point_y = width / 2, height / 2
@@ -55,15 +46,15 @@ def pinhole(
 
 
 def request(
-    before: F64,
-    now: F64,
-    t_us: int,
-    shutter_us: int = SHUTTER_US,
-    image_format: sensorsim_pb2.ImageFormat = sensorsim_pb2.PNG,
-    camera: str = CAMERA,
-    scene_id: str = "scene",
-    size: tuple[int, int] = (WIDTH, HEIGHT),
-) -> sensorsim_pb2.RGBRenderRequest:
+    before,
+    now,
+    t_us,
+    shutter_us=SHUTTER_US,
+    image_format=sensorsim_pb2.PNG,
+    camera=CAMERA,
+    scene_id="scene",
+    size=(WIDTH, HEIGHT),
+):
     """Return a request as AlpaSim's runtime makes it: the shutter's start lies on the line between
     two poses of the rig ``(4, 4)``.
     """
@@ -85,9 +76,7 @@ def request(
     )
 
 
-def drive(
-    steps: int, parts_at: int = 0, aside_mps: float = 0.0, brake_mps2: float = 0.0, **options: Any
-) -> list[sensorsim_pb2.RGBRenderRequest]:
+def drive(steps, parts_at=0, aside_mps=0.0, brake_mps2=0.0, **options):
     """Return the requests of a drive along x at 10 m/s that swerves or brakes from a step on; until
     then all drives are equal.
     """
@@ -104,7 +93,7 @@ def drive(
     ]
 
 
-def picture(asked: sensorsim_pb2.RGBRenderRequest) -> U8:
+def picture(asked):
     """Paint stripes that move with the camera: a function of the request alone."""
     end = asked.sensor_pose.end_pose.vec
     y, x = np.mgrid[0 : asked.resolution_h, 0 : asked.resolution_w].astype(np.float64)
@@ -115,25 +104,21 @@ def picture(asked: sensorsim_pb2.RGBRenderRequest) -> U8:
 class StandInRenderer:
     """A server of the renderer service; ``fault`` may replace an answer."""
 
-    def __init__(self) -> None:
-        self.calls: list[str] = []
-        self.fault: Any = (
-            None  # called with (request, context, image bytes); returns the bytes to send
-        )
+    def __init__(self):
+        self.calls = []
+        self.fault = None  # called with (request, context, image bytes); returns the bytes to send
 
-    def get_version(self, asked: Any, context: Any) -> common_pb2.VersionId:
+    def get_version(self, asked, context):
         """Return a triple."""
         return common_pb2.VersionId(
             version_id="stand-in", git_hash="abc", grpc_api_version=api_version()
         )
 
-    def get_available_scenes(self, asked: Any, context: Any) -> common_pb2.AvailableScenesReturn:
+    def get_available_scenes(self, asked, context):
         """Know every scene."""
         return common_pb2.AvailableScenesReturn(scene_ids=["*"])
 
-    def get_available_cameras(
-        self, asked: Any, context: Any
-    ) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(self, asked, context):
         """List one camera."""
         camera = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera
         listed = camera(
@@ -141,9 +126,7 @@ class StandInRenderer:
         )
         return sensorsim_pb2.AvailableCamerasReturn(available_cameras=[listed])
 
-    def get_available_trajectories(
-        self, asked: Any, context: Any
-    ) -> sensorsim_pb2.AvailableTrajectoriesReturn:
+    def get_available_trajectories(self, asked, context):
         """List a straight path."""
         poses = [
             common_pb2.PoseAtTime(pose=wire_pose(se2(x, 0.0, 0.0)), timestamp_us=START_US + i)
@@ -154,29 +137,23 @@ class StandInRenderer:
         )
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[listed])
 
-    def get_available_ego_masks(
-        self, asked: Any, context: Any
-    ) -> sensorsim_pb2.AvailableEgoMasksReturn:
+    def get_available_ego_masks(self, asked, context):
         """List one mask."""
         mask = sensorsim_pb2.AvailableEgoMasksReturn.EgoMaskMetadata(
             ego_mask_id=sensorsim_pb2.EgoMaskId(camera_logical_id=CAMERA)
         )
         return sensorsim_pb2.AvailableEgoMasksReturn(ego_mask_metadata=[mask])
 
-    def render_lidar(self, asked: Any, context: Any) -> sensorsim_pb2.LidarRenderReturn:
+    def render_lidar(self, asked, context):
         """Return one point."""
         return sensorsim_pb2.LidarRenderReturn(point_xyzs=[1.0, 2.0, 3.0], num_points=1)
 
-    def render_rgb(
-        self, asked: sensorsim_pb2.RGBRenderRequest, context: Any
-    ) -> sensorsim_pb2.RGBRenderReturn:
+    def render_rgb(self, asked, context):
         """Paint one frame."""
         self.calls.append("render_rgb")
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self._image(asked, context))
 
-    def batch_render_rgb(
-        self, asked: sensorsim_pb2.BatchRGBRenderRequest, context: Any
-    ) -> sensorsim_pb2.BatchRGBRenderReturn:
+    def batch_render_rgb(self, asked, context):
         """Paint one frame a camera."""
         self.calls.append("batch_render_rgb")
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
@@ -187,9 +164,7 @@ class StandInRenderer:
         ]
         return sensorsim_pb2.BatchRGBRenderReturn(items=made)
 
-    def render_aggregated(
-        self, asked: sensorsim_pb2.AggregatedRenderRequest, context: Any
-    ) -> sensorsim_pb2.AggregatedRenderReturn:
+    def render_aggregated(self, asked, context):
         """Paint frames, with bytes for the driver."""
         rgb = [
             sensorsim_pb2.RGBRenderReturn(image_bytes=self._image(r, context))
@@ -197,7 +172,7 @@ class StandInRenderer:
         ]
         return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=rgb, driver_data=b"for the driver")
 
-    def _image(self, asked: sensorsim_pb2.RGBRenderRequest, context: Any) -> bytes:
+    def _image(self, asked, context):
         data = encode_image(
             picture(asked), "png" if asked.image_format == sensorsim_pb2.PNG else "jpeg"
         )
@@ -205,7 +180,7 @@ class StandInRenderer:
 
 
 @contextmanager
-def hosted(services: dict[str, object], **options: Any) -> Iterator[Host]:
+def hosted(services, **options):
     """Run services on a free port."""
     host = Host(services, "127.0.0.1:0", **options).start()
     try:
@@ -215,20 +190,18 @@ def hosted(services: dict[str, object], **options: Any) -> Iterator[Host]:
 
 
 @contextmanager
-def channel_to(host: Host) -> Iterator[Any]:
+def channel_to(host):
     with grpc.insecure_channel(host.address, list(OPTIONS)) as channel:
         yield channel
 
 
-def trust_every_frame(monkeypatch: pytest.MonkeyPatch, trust: float = 1.0) -> None:
+def trust_every_frame(monkeypatch, trust=1.0):
     """Let the distance to the recorded path count for nothing."""
     monkeypatch.setattr(UpstreamSource, "_trust_in", lambda source, view, left: trust)
 
 
 @contextmanager
-def in_front_of(
-    upstream: Host, policy: HostPolicy = HostPolicy(), **settings: Any
-) -> Iterator[tuple[Any, Assembled]]:
+def in_front_of(upstream, policy=HostPolicy(), **settings):
     """Run the service in front of another; give a stub of it and its parts."""
     made = assemble(Settings(upstream=Upstream(upstream.address), **settings))
     with (
@@ -239,7 +212,7 @@ def in_front_of(
     made.close()
 
 
-def holes(folder: Path) -> Path:
+def holes(folder):
     """Write a mask whose left third is not trusted at all, so that noise enters there."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, : WIDTH // 3] = 0
@@ -248,5 +221,5 @@ def holes(folder: Path) -> Path:
     return path
 
 
-def answers(stub: Any, requests: Sequence[sensorsim_pb2.RGBRenderRequest]) -> list[bytes]:
+def answers(stub, requests):
     return [stub.render_rgb(r, timeout=60).image_bytes for r in requests]

@@ -1,7 +1,5 @@
 """Framing of rollout logs: any entries survive, a cut tail is told, damage is an error."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

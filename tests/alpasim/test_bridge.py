@@ -2,8 +2,6 @@
 packages with AlpaSim's pins, and used.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re

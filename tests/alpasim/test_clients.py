@@ -2,8 +2,6 @@
 once.
 """
 
-from __future__ import annotations
-
 import json
 from concurrent import futures
 
@@ -57,7 +55,7 @@ class Calls(grpc.ServerInterceptor):
     """Notes the order of the calls."""
 
     def __init__(self):
-        self.made: list[str] = []
+        self.made = []
 
     def intercept_service(self, continuation, details):
         self.made.append(details.method.rsplit("/", 1)[1])
@@ -136,7 +134,7 @@ def test_renderer_and_driver_over_sockets_at_once(scenario, scene, inside, drive
 class Scripted:
     """A driver that answers as told."""
 
-    def __init__(self, *answers: egodriver_pb2.DriveResponse):
+    def __init__(self, *answers):
         self._answers, self.sessions, self.motion = list(answers), [], []
 
     def get_version(self, request, context):

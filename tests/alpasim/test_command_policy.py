@@ -1,7 +1,5 @@
 """``--policy exec:COMMAND``: real child processes, how they drive, and how they end."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -10,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,6 @@ from alpasim_plugin.alpasim.client.command import Command
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import split_policies
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.subprocesses import MOST_BYTES, parts_print_to_stderr, say
 from alpasim_plugin.log import read_asl
@@ -78,16 +74,16 @@ serve_policy(Cruise)
     end_children()
 
 
-def python(*words: str) -> str:
+def python(*words):
     return f"exec:{shlex.join([sys.executable, *words])}"
 
 
-def made(command: str) -> Policy:
-    policy: Policy = build(resolve("policy", command), scenario=canned_scenario())
+def made(command):
+    policy = build(resolve("policy", command), scenario=canned_scenario())
     return policy
 
 
-def drive(policy: Policy) -> list[np.ndarray]:
+def drive(policy):
     scenario = canned_scenario()
     policy.reset(0, scenario.route)
     return [
@@ -96,14 +92,14 @@ def drive(policy: Policy) -> list[np.ndarray]:
     ]
 
 
-def until(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
+def until(condition, seconds=20.0):
     end_s = time.monotonic() + seconds
     while not condition() and time.monotonic() < end_s:
         time.sleep(0.02)
     return condition()
 
 
-def is_gone(pid: int) -> bool:
+def is_gone(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (

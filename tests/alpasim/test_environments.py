@@ -7,8 +7,6 @@ the tests of the wire, of logs, and of clients and services over real sockets. `
 names a wheel of the oldest torch, which no index gives for CPUs everywhere.
 """
 
-from __future__ import annotations
-
 import os
 import site
 import subprocess

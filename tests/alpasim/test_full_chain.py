@@ -108,7 +108,7 @@ class Network:
             self.stack.callback(server.stop, 0)
             return f"127.0.0.1:{port}"
         known = getattr(self, "known", {})
-        self.known: dict[str, Inside] = known
+        self.known = known
         address = f"inside:{len(known)}"
         known[address] = Inside(services)
         self.monkeypatch.setattr("grpc.insecure_channel", lambda target, options=(): known[target])

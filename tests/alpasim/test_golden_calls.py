@@ -2,10 +2,6 @@
 every answer valid and in order.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 
 from alpasim_plugin.log.asl import AslReader
@@ -45,7 +41,7 @@ def complete_logs(shared_data):
     return [sorted(scene.rglob("rollout.asl"))[0] for scene in scenes]
 
 
-def replay(log, scenes, **settings: Any):
+def replay(log, scenes, **settings):
     """Make the calls of a log in its order and check each answer; return the images."""
     entries = list(AslReader(log))
     images = []

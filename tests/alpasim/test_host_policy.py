@@ -2,14 +2,11 @@
 what they leave behind ends.
 """
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
-from typing import Any
 
 import grpc
 import numpy as np
@@ -69,8 +66,8 @@ class Cruise(Policy):
         self.is_closed = True
 
 
-def driver_service(**options: Any):
-    made: list[Cruise] = []
+def driver_service(**options):
+    made = []
 
     def make(scenario):
         made.append(Cruise())
@@ -80,11 +77,11 @@ def driver_service(**options: Any):
 
 
 @contextmanager
-def served(name, workers=2, **options: Any):
+def served(name, workers=2, **options):
     """Run one of our two servers with little to spare."""
     with ExitStack() as stack:
         if name == "EgodriverService":
-            service: object = driver_service()[0]
+            service = driver_service()[0]
         else:
             upstream = stack.enter_context(hosted({name: StandInRenderer()}))
             made = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address)))
@@ -99,7 +96,7 @@ def failure(call):
     return caught.value.code(), caught.value.details()
 
 
-def is_served(host, name, **options: Any):
+def is_served(host, name, **options):
     """Tell whether somebody else, over a connection of their own, gets an answer."""
     with grpc.insecure_channel(host.address, [("grpc.use_local_subchannel_pool", 1)]) as channel:
         answer = Stub(channel, name).get_version(EMPTY, timeout=20, **options)
@@ -265,7 +262,7 @@ def seen(name, t_us, size=(48, 32)):
     return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
 
 
-def moved(name, *times_us: int):
+def moved(name, *times_us):
     poses = [
         {"timestamp_us": t_us, "pose": {"vec": {"x": t_us * 1e-5}, "quat": {"w": 1.0}}}
         for t_us in times_us

@@ -1,7 +1,5 @@
 """`render_lidar` over our renderer: points from depth, against exact geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 wrongly is the policy's own fault.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -63,7 +61,7 @@ def free_port():
 
 
 @contextmanager
-def driver(address, *more: str):
+def driver(address, *more):
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, address, *more], env=environment

@@ -2,8 +2,6 @@
 paint is no evidence.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -49,11 +47,11 @@ def road(aside_m=0.0, dashed=False):
     )  # type: ignore[arg-type]
 
 
-def prepared(aside_m=0.0, **options: bool):
+def prepared(aside_m=0.0, **options):
     return prepare_map(road(aside_m, **options))
 
 
-def photograph(contrast=90, noise=6.0, aside_m=0.0, **options: bool):
+def photograph(contrast=90, noise=6.0, aside_m=0.0, **options):
     """A grey road with the paint of `road`, as thin as paint is, and a textured roadside."""
     scene = prepared(aside_m, **options)
     scene.segments.style[:, 0] = 5.0  # the width in pixels
@@ -168,7 +166,7 @@ def ask(size=(240, 136)):
 
 @pytest.mark.parametrize(("aside_m", "is_off"), [(0.0, False), (1.75, True)])
 def test_a_server_drops_a_wrong_map_and_says_so(aside_m, is_off, overrides, caplog):
-    def served(*more: str, moved_m=aside_m):
+    def served(*more, moved_m=aside_m):
         made = assemble(
             Settings(
                 renderer="onefixer+clean",

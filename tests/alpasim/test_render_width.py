@@ -1,7 +1,5 @@
 """A smaller image may be rendered and enlarged to the size asked for."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from tests.alpasim.test_sensorsim_local import SCENE, ask
 from tests.examples import first_of
 
 
-def frames(requests, **settings: object):
+def frames(requests, **settings):
     made = assemble(Settings(scenes=[SCENE], **settings))  # type: ignore[arg-type]
     return [made.service.frames.answers([asked], CallTime())[0] for asked in requests]
 

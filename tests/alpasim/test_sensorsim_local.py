@@ -1,7 +1,5 @@
 """The renderer service with our own renderer: what the request says is what is drawn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import grpc
@@ -11,7 +9,7 @@ import pytest
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import F64, RenderRequest
+from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.log.images import decode_image
@@ -39,7 +37,7 @@ def ask(t_s=1.0, spec=None):
     """Return the request for the recorded pose after a time, with the first moving car."""
     scenario = load_scenario(SCENE)
     t_us = scenario.start_us + int(t_s * 1e6)
-    pose: F64 = interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera
+    pose = interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera
     pair = sensorsim_pb2.PosePair(
         start_pose=wire_pose(pose, "a test"), end_pose=wire_pose(pose, "a test")
     )

@@ -2,8 +2,6 @@
 every drive as if it were alone.
 """
 
-from __future__ import annotations
-
 import grpc
 import numpy as np
 import pytest
@@ -144,7 +142,7 @@ def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overri
 def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
     upstream, overrides, tmp_path
 ):
-    def version(**settings: object):
+    def version(**settings):
         with in_front_of(upstream, **settings) as (stub, _):
             return stub.get_version(EMPTY)
 

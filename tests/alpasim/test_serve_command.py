@@ -2,8 +2,6 @@
 And the commands of its page.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -2,8 +2,6 @@
 whatever was asked before.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

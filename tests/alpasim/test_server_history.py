@@ -2,8 +2,6 @@
 road.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -31,7 +29,7 @@ def serve(kept, view, size=100):
     return known.state
 
 
-def views(*args: object, **options: object):
+def views(*args, **options):
     return [read_view(r) for r in drive(*args, **options)]  # type: ignore[arg-type]
 
 

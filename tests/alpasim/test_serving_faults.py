@@ -2,8 +2,6 @@
 lets callers in and ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import socket

@@ -2,8 +2,6 @@
 shows it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -2,8 +2,6 @@
 project allows, beside AlpaSim's own.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -48,7 +46,7 @@ def copied(folder):
     return folder
 
 
-def environment(folder, *requirements: str):
+def environment(folder, *requirements):
     """Make a virtual environment with some packages; return its Python."""
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"

@@ -1,7 +1,5 @@
 """The wire messages equal AlpaSim's in number, type and byte."""
 
-from __future__ import annotations
-
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from alpasim_plugin.log import wire

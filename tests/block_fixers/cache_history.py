@@ -1,13 +1,7 @@
 """Contents of a KV cache in order of time, for comparisons."""
 
-from __future__ import annotations
 
-from torch import Tensor
-
-from alpasim_plugin.block_fixers.kv_cache import RollingCache
-
-
-def history(cache: RollingCache, layer: int) -> tuple[Tensor, Tensor]:
+def history(cache, layer):
     """Return a layer's cached keys and values, oldest first, ``(B, latents * tokens, heads,
     head_width)``.
     """

@@ -2,8 +2,6 @@
 bit-equality needs the same number throughout.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Small networks and inputs shared by the transformer's tests."""
 
-from __future__ import annotations
-
 import torch
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
@@ -21,18 +19,18 @@ SMALL = DiTSizes(
 )
 
 
-def network(sizes: DiTSizes = SMALL, seed: int = 0, **options) -> CosmosCausalDiT:
+def network(sizes=SMALL, seed=0, **options):
     return CosmosCausalDiT.from_state_dict(random_weights(sizes, seed), **options)
 
 
 def clip(
-    frames: int,
-    sizes: DiTSizes = SMALL,
-    batch: int = 1,
-    height: int = 4,
-    width: int = 6,
-    tokens: int = 3,
-    seed: int = 1,
+    frames,
+    sizes=SMALL,
+    batch=1,
+    height=4,
+    width=6,
+    tokens=3,
+    seed=1,
 ):
     """Return x, t (one step per block of 2), text, hdmap."""
     g = torch.Generator().manual_seed(seed)
@@ -43,7 +41,7 @@ def clip(
     return x, t, text, hdmap
 
 
-def stream(net, cache, x, t, text, hdmap, blocks, mask=None) -> torch.Tensor:
+def stream(net, cache, x, t, text, hdmap, blocks, mask=None):
     """Run a clip block by block, each forward kept; ``blocks`` lists their lengths."""
     out, start = [], 0
     for latents in blocks:
@@ -55,6 +53,6 @@ def stream(net, cache, x, t, text, hdmap, blocks, mask=None) -> torch.Tensor:
     return torch.cat(out, dim=2)
 
 
-def furthest(a: torch.Tensor, b: torch.Tensor) -> float:
+def furthest(a, b):
     """Largest absolute difference."""
     return float((a.detach().double() - b.detach().double()).abs().max())

@@ -4,18 +4,15 @@ one explicit mask.
 Shares no code with the package. Slow and meant to be read beside docs/fixers.md.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
 from einops import rearrange, repeat
 
 from alpasim_plugin.block_fixers.dit import initial_weights
-from alpasim_plugin.block_fixers.sizes import DiTSizes
 
 
-def random_weights(sizes: DiTSizes, seed: int = 0) -> dict[str, torch.Tensor]:
+def random_weights(sizes, seed=0):
     """Draw weights that leave no path at zero; gains are around 1."""
     g = torch.Generator().manual_seed(seed)
     out = {}

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-
-import torch
 
 from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
@@ -34,17 +31,17 @@ class Recorded:
     list_of_frames: list[Frame]
     maps: list[U8]
 
-    def frames(self) -> list[Frame]:
+    def frames(self):
         return self.list_of_frames
 
 
-def small_settings(*overrides: str, name: str = "onefixer-dit-tiny") -> OneFixerSettings:
+def small_settings(*overrides, name="onefixer-dit-tiny"):
     settings = fixer_settings(name, (*SMALL_DIT, *overrides))
     assert isinstance(settings, OneFixerSettings)
     return settings
 
 
-def busy_settings(folder: Path, *overrides: str) -> OneFixerSettings:
+def busy_settings(folder, *overrides):
     """Return settings whose weights make every layer count, which an identity's do not."""
     settings = small_settings("holes=noise", *overrides)
     must_match = (
@@ -59,13 +56,13 @@ def busy_settings(folder: Path, *overrides: str) -> OneFixerSettings:
     return small_settings("holes=noise", *overrides, f"weights.bundle={path}")
 
 
-def fixer(settings: OneFixerSettings, scene_id: str = "scene", seed: int = 0) -> OneFixer:
+def fixer(settings, scene_id="scene", seed=0):
     return OneFixer(settings, scene_id, seed)
 
 
-def run_blocks(fixer: OneFixer, frames: list[Frame], maps: list[U8]) -> list[Frame]:
+def run_blocks(fixer, frames, maps):
     """Step through a clip of one camera in whole blocks; the last may be short."""
-    out: list[Frame] = []
+    out = []
     block = 0
     while len(out) < len(frames):
         cut = slice(len(out), len(out) + fixer.blocks.frames(block))
@@ -74,9 +71,9 @@ def run_blocks(fixer: OneFixer, frames: list[Frame], maps: list[U8]) -> list[Fra
     return out
 
 
-def record_videos(fixer: OneFixer) -> list[torch.Tensor]:
+def record_videos(fixer):
     """Return a list that fills with what the pipeline decodes, before rounding."""
-    seen: list[torch.Tensor] = []
+    seen = []
     run = fixer.pipeline.run
 
     def spy(*args):

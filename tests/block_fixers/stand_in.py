@@ -6,15 +6,10 @@ zero. With these weights every layer contributes, and latents change by a quarte
 deviation.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import torch
 
 from alpasim_plugin.block_fixers.dit import initial_weights
 from alpasim_plugin.block_fixers.networks import condition_sizes
-from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
@@ -27,7 +22,7 @@ CORRECTION = 0.05  # of the codec's last layers, on the scale of their inputs
 NOTE = "random weights, small corrections"
 
 
-def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -> None:
+def save_stand_in(path, settings, seed=0):
     """Write a bundle with stand-in weights for the tiny autoencoder and a transformer, both of the
     settings' sizes.
 

@@ -1,7 +1,5 @@
 """The rolling cache: one storage for ever, no leaks between rollouts, odd windows and blocks."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

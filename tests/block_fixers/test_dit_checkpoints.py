@@ -2,8 +2,6 @@
 nothing but tensors is unpickled.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -2,8 +2,6 @@
 the data says how they were made.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from safetensors.torch import load_file

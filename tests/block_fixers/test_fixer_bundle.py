@@ -1,7 +1,5 @@
 """Weights on disk: what loads, and what is refused with which words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -40,11 +38,11 @@ def bundle(tmp_path):
     return path
 
 
-def at(bundle, *overrides: str):
+def at(bundle, *overrides):
     return small_settings("holes=noise", f"weights.bundle={bundle}", *overrides)
 
 
-def spoil(bundle, **changes: torch.Tensor | None):
+def spoil(bundle, **changes):
     """Write the bundle again with tensors replaced, or left out; a double underscore stands for a
     dot.
     """

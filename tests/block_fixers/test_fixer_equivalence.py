@@ -1,7 +1,5 @@
 """Streaming, cached, folded, block by block: the same as the whole clip in one piece."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Every output frame is looked at; a broken one is replaced by the raw frame and counted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +14,7 @@ FRAMES = moving_picture(29)
 MAPS = maps_of(FRAMES)
 
 
-def video(*values: float):
+def video(*values):
     """Return one frame of 10 x 10 per value."""
     return torch.tensor(values).view(-1, 1, 1, 1).expand(-1, 10, 10, 3).clone()
 

@@ -1,7 +1,5 @@
 """Settings of fixers: files, overrides, names, and what is refused."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from alpasim_plugin.fixers.settings import FixerSettings, load_settings
 from tests.block_fixers.fixer_cases import small_settings
 
 
-def refusal(*overrides: str, name="onefixer-dit-tiny"):
+def refusal(*overrides, name="onefixer-dit-tiny"):
     with pytest.raises(InputError) as caught:
         fixer_settings(name, overrides)
     return str(caught.value)
@@ -83,7 +81,7 @@ def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path,
     )
     monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
 
-    def weights(*overrides: str):
+    def weights(*overrides):
         return load_settings("shipped", OneFixerSettings, overrides).weights
 
     assert weights().bundle == str(tmp_path / "here.safetensors")

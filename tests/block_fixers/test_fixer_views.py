@@ -1,7 +1,5 @@
 """Frames to tensors and back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A fixer over Wan latents: published graphs, weights by path, both decoders."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -43,7 +41,7 @@ def load_width(path):
         return int(file.get_slice(key).get_shape()[1])
 
 
-def settings_of(*overrides: str):
+def settings_of(*overrides):
     settings = fixer_settings("onefixer-2b", ["precision=fp32", "codec_precision=fp32", *overrides])
     assert isinstance(settings, OneFixerSettings)
     return settings

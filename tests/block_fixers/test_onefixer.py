@@ -1,7 +1,5 @@
 """The streaming session: rollouts, blocks, cameras, previews."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far a request lies from the predicted one."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 what has no meaning.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The tiny decoder against numbers that the original code produced."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

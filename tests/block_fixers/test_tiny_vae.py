@@ -1,7 +1,5 @@
 """The tiny autoencoder: transform, streams, render input, files."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 
@@ -240,7 +238,7 @@ def test_saving_and_loading_gives_bit_equal_results(vae, tmp_path):
 
 
 Spoil = Callable[[dict[str, Tensor]], object]
-SPOILED: dict[str, tuple[Spoil, str]] = {
+SPOILED = {
     "missing": (lambda sd: sd.pop("decoder.grow.weight"), "missing: decoder.grow.weight"),
     "missing width": (lambda sd: sd.pop("encoder.stem.bias"), "missing: encoder.stem.bias"),
     "extra": (lambda sd: sd.update({"decoder.extra": torch.zeros(1)}), "unexpected: decoder.extra"),

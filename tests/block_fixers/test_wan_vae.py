@@ -1,7 +1,5 @@
 """The Wan autoencoder on its own: streams, sizes, hard inputs, checkpoints."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 
@@ -247,7 +245,7 @@ def test_running_in_half_precision_stays_close(vae):
 
 
 Spoil = Callable[[dict[str, Tensor]], object]
-SPOILED: dict[str, tuple[Spoil, str]] = {
+SPOILED = {
     "missing bias": (
         lambda sd: sd.pop("encoder.middle.0.residual.2.bias"),
         "missing: encoder.middle.0.residual.2.bias",

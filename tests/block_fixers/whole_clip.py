@@ -7,15 +7,13 @@ grows with the square of the clip.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import to_clip, to_images
-from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
+from alpasim_plugin.block_fixers.networks import LATENT, decode, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
 from alpasim_plugin.block_fixers.sampling import (
@@ -24,7 +22,6 @@ from alpasim_plugin.block_fixers.sampling import (
     mixed_source,
     opacity_mask,
 )
-from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
@@ -50,7 +47,7 @@ class Clip:
     maps: U8
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], maps: Sequence[U8]) -> Clip:
+    def of(cls, frames, maps):
         """Stack frames of one camera and their maps; a frame without opacity counts as opaque."""
         alpha = [
             np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha
@@ -65,18 +62,18 @@ class Clip:
             np.stack(maps),
         )
 
-    def first(self, count: int) -> Clip:
+    def first(self, count):
         """Return the first frames."""
         return Clip(
             self.camera, self.t_us[:count], self.rgb[:count], self.alpha[:count], self.maps[:count]
         )
 
-    def frames(self) -> list[Frame]:
+    def frames(self):
         """Return the frames."""
         rows = zip(self.t_us, self.rgb, self.alpha, strict=True)
         return [Frame(int(t_us), self.camera, rgb, alpha) for t_us, rgb, alpha in rows]
 
-    def blocks(self, rule: Callable[[int], int]) -> Iterator[tuple[list[Frame], list[U8]]]:
+    def blocks(self, rule):
         """Yield whole blocks of frames with their maps; frames at the end that fill no block are
         left out.
         """
@@ -90,13 +87,13 @@ class Clip:
 
 
 def refine_latents(
-    networks: Networks,
-    settings: OneFixerSettings,
-    z_render: Tensor,
-    mask: Tensor,
-    condition: Tensor,
-    noise: Sequence[Tensor],
-) -> Tensor:
+    networks,
+    settings,
+    z_render,
+    mask,
+    condition,
+    noise,
+):
     """Fix the latents of a whole clip.
 
     Args:
@@ -145,13 +142,13 @@ def refine_latents(
 
 @torch.inference_mode()
 def refine_clip(
-    networks: Networks,
-    settings: OneFixerSettings,
-    rgb: Tensor,
-    alpha: Tensor | None,
-    sdmap: Tensor | None,
-    noise: Sequence[Tensor],
-) -> Tensor:
+    networks,
+    settings,
+    rgb,
+    alpha,
+    sdmap,
+    noise,
+):
     """Fix a whole clip; arguments as `BlockPipeline.run`, for all frames.
 
     Returns:
@@ -173,7 +170,7 @@ def refine_clip(
     return decode(networks, settings, clean, rgb, alpha)[0]
 
 
-def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int) -> U8:
+def whole_clip(settings, clip, scene_id, seed):
     """Fix a clip as a streaming fixer with these settings and this key would in exact arithmetic.
 
     Args:
@@ -197,5 +194,5 @@ def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int)
     shape = (LATENT, video.rgb.shape[3] // 8, video.rgb.shape[4] // 8)
     noise = latent_noise(scene_id, seed, views.cameras, draws, range(latents), shape)
     fixed = refine_clip(networks, settings, video.rgb, video.alpha, video.maps, noise)
-    images: U8 = to_images(fixed, views.size)[0]
+    images = to_images(fixed, views.size)[0]
     return images

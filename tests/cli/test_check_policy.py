@@ -2,8 +2,6 @@
 ``--json``.
 """
 
-from __future__ import annotations
-
 import json
 
 import pytest

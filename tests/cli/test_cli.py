@@ -1,7 +1,5 @@
 """The command line as a user meets it: exit codes, errors, JSON, dry runs."""
 
-from __future__ import annotations
-
 import json
 import sys
 

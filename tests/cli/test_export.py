@@ -2,8 +2,6 @@
 same scores from them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pyarrow.parquet as pq

@@ -1,7 +1,5 @@
 """``simrun fork`` as a user meets it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from alpasim_plugin.cli.main import run_command

@@ -2,8 +2,6 @@
 do not fit.
 """
 
-from __future__ import annotations
-
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -245,7 +243,7 @@ def test_every_metric_is_printed_where_all_are_asked_for(runs, capsys, verb):
     assert "plan_deviation" in printed[1]
 
 
-def _compare(capsys, *arguments: str):
+def _compare(capsys, *arguments):
     assert run_command(["compare", *arguments, "--json"]) == 0
     return json.loads(capsys.readouterr().out)["paired"]
 

@@ -2,8 +2,6 @@
 value that is wrong.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command, usual

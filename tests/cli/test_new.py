@@ -1,7 +1,5 @@
 """``simrun new``: what it writes works, and its test passes."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shlex

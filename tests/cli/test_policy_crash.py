@@ -2,8 +2,6 @@
 the check finds it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

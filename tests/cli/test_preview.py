@@ -1,7 +1,5 @@
 """``simrun view SCENARIO``: what the image shows, checked by its pixels."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

@@ -1,7 +1,5 @@
 """``simrun refine`` as a user meets it."""
 
-from __future__ import annotations
-
 import json
 from fractions import Fraction
 

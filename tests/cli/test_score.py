@@ -2,8 +2,6 @@
 files of a run.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 

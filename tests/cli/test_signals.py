@@ -1,7 +1,5 @@
 """Signals stop a command in one way, and what started it decides which are ignored."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Threads that wait do not hold on to a core for long, unless the user says so."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

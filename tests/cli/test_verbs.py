@@ -1,7 +1,5 @@
 """What every verb of ``simrun`` has in common, found by walking over all that are registered."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``simrun view``: which page it writes of which rollouts, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

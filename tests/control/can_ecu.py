@@ -4,14 +4,12 @@ message. A process, or a thread beside a test.
 python -m tests.control.can_ecu udp_multicast:239.74.163.2
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import threading
 
 from alpasim_plugin.control.can_bus import Address, open_bus
-from alpasim_plugin.control.can_codec import Codec, load_map, open_codec
+from alpasim_plugin.control.can_codec import load_map, open_codec
 
 LOOKAHEAD_S, LEAST_LOOKAHEAD_M = 0.7, 5.0
 WHEELBASE_M = 2.85
@@ -23,11 +21,11 @@ class LaneKeeper:
     with one pair of commands.
     """
 
-    def __init__(self, codec: Codec) -> None:
+    def __init__(self, codec):
         self._codec = codec
-        self._seen: dict[str, float] = {}
+        self._seen = {}
         self._sent = {codec.address(one.message): one for one in codec.map.send}
-        self._cruise_mps: float | None = None
+        self._cruise_mps = None
 
     def answer(self, frame):
         """Take in a frame and return the commands that answer it."""
@@ -60,7 +58,7 @@ class LaneKeeper:
         return wheel_deg, SPEED_GAIN * (self._cruise_mps - speed)
 
 
-def serve(bus, unit: LaneKeeper, stop: threading.Event) -> None:
+def serve(bus, unit, stop):
     """Answer the bus until `stop` is set."""
     while not stop.is_set():
         frame = bus.recv(0.05)

@@ -1,7 +1,5 @@
 """The vehicle model against its closed solution, at standstill, in reverse and at the limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

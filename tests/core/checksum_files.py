@@ -1,9 +1,6 @@
 """Make a folder that a test wrote or changed by hand into one that a run wrote."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pyarrow.parquet as pq
 
@@ -14,7 +11,7 @@ from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, STEPS_NAME,
 KEYS = ["renderer", "policy", "scene", "seed", "status", "path"]
 
 
-def vouch_for(root: Path) -> Path:
+def vouch_for(root):
     """Write ``run.json``, the manifests and ``files.json`` of a run folder again, as they stand,
     with the digests of their files, and return the folder.
     """

@@ -1,13 +1,10 @@
 """Files appear complete or not at all, and a disk that refuses is an error with four parts."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +24,7 @@ from alpasim_plugin.core.atomic import (
 )
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 
-WRITERS: dict[str, Callable[[Path, int], None]] = {
+WRITERS = {
     "bytes": lambda path, n: write_bytes(path, bytes([n]) * 4),
     "text": lambda path, n: write_text(path, f"é {n}"),
     "json": lambda path, n: write_json(path, {"n": n}),
@@ -150,7 +147,7 @@ def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_a_read_only_folder_is_an_error_with_four_parts(write, tmp_path, monkeypatch):
-    def refuse(self, *rest: object, **more: object):
+    def refuse(self, *rest, **more):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(atomic.os, "fsync", lambda handle: refuse(tmp_path))

@@ -1,7 +1,5 @@
 """Clock, seeds and errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

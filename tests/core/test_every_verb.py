@@ -3,14 +3,12 @@ references, tables, a gate and the lock file are bait, and nothing runs, no addr
 file outside of the folder changes, no verb that reads writes, and nothing prints raw.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
@@ -42,13 +40,13 @@ def finished(tmp_path_factory):
 class Listener:
     """Counts who connects to an address that a run folder names."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.socket = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.socket.getsockname()[1]}"
         self.callers = 0
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def _accept(self) -> None:
+    def _accept(self):
         while True:
             try:
                 self.socket.accept()[0].close()
@@ -64,7 +62,7 @@ def listener():
     one.socket.close()
 
 
-def stranger(finished: Path, folder: Path, address: str, is_all: bool) -> Path:
+def stranger(finished, folder, address, is_all):
     """Return a run folder whose names of parts are bait: all of them, or those of a renderer and of
     a policy beside ones that can be driven again.
     """
@@ -83,7 +81,7 @@ def stranger(finished: Path, folder: Path, address: str, is_all: bool) -> Path:
         names |= {RENDERERS[0]: f"nre://{address}", POLICIES[0]: f"alpasim://{address}"}
         names |= {SCENE_ID: f"{SCENE_ID}{RAW}"}
 
-    def bait(file: Path) -> None:
+    def bait(file):
         text = file.read_text()
         for old, new in names.items():
             text = text.replace(f'"{old}"', json.dumps(new))
@@ -108,12 +106,12 @@ def stranger(finished: Path, folder: Path, address: str, is_all: bool) -> Path:
     return vouch_for(root)
 
 
-def without_tables(root: Path, victim: Path) -> None:
+def without_tables(root, victim):
     for name in ("rollouts.parquet", "steps.parquet", "summary.json"):
         (root / name).unlink()
 
 
-def no_regular_files(root: Path, victim: Path) -> None:
+def no_regular_files(root, victim):
     for name in ("rollouts.parquet", "gate.json", "output.log"):
         (root / name).unlink(missing_ok=True)
         os.mkfifo(root / name)
@@ -129,7 +127,7 @@ def no_regular_files(root: Path, victim: Path) -> None:
         (root / name).symlink_to(target)
 
 
-def linked_folders(root: Path, victim: Path) -> None:
+def linked_folders(root, victim):
     cell = next(root.glob("rollouts/*/*/*/*"))
     for number, folder in enumerate((cell, root / "scenes")):
         outside = victim.parent / f"outside/{number}"
@@ -138,7 +136,7 @@ def linked_folders(root: Path, victim: Path) -> None:
         folder.symlink_to(outside)
 
 
-def paths_that_leave(root: Path, victim: Path) -> None:
+def paths_that_leave(root, victim):
     cells = [{"frames": {"clean": str(victim)}, "t_us": 0}, {"frames": {"clean": "../../mine.txt"}}]
     (root / "flips.json").write_text(json.dumps({"cells": cells}))
     (root / "gate.json").write_text(json.dumps({"files": ["../../mine.txt"]}))
@@ -147,7 +145,7 @@ def paths_that_leave(root: Path, victim: Path) -> None:
     (root / "run.json").write_text(json.dumps(info))
 
 
-def commands(root: Path) -> Iterator[list[str]]:
+def commands(root):
     """Yield commands of the verbs that read a run folder; what the user names is trusted."""
     run = root.name
     every = sorted(root.rglob("manifest.json"))
@@ -172,7 +170,7 @@ def commands(root: Path) -> Iterator[list[str]]:
     yield ["refine", f"{run}/run.json", "-o", "fixed.mp4"]
 
 
-def other_commands() -> Iterator[list[str]]:
+def other_commands():
     """Yield commands of the verbs that read other files of a stranger's folder, or none."""
     yield ["view", "evil.yaml"]
     yield ["run", "--renderer", "clean", "evil.yaml", "--dry-run"]
@@ -187,14 +185,14 @@ def other_commands() -> Iterator[list[str]]:
 READING = (["compare"], ["check", "run"], ["list"], ["score"], ["export"], ["fork"])
 
 
-def state_of(folder: Path) -> dict[str, tuple[int, int]]:
+def state_of(folder):
     """Return size and time of everything in a folder."""
     states = {str(path): path.lstat() for path in folder.rglob("*")}
     return {path: (state.st_size, state.st_mtime_ns) for path, state in states.items()}
 
 
 Change = Callable[[Path, Path], None]
-CASES: dict[str, tuple[bool, Change]] = {
+CASES = {
     "every name": (True, lambda root, victim: None),
     "some names, no tables": (False, without_tables),
     "no regular files": (False, no_regular_files),

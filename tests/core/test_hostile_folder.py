@@ -1,7 +1,5 @@
 """The working directory may come from anybody: nothing in it runs unless it is named."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -83,7 +81,7 @@ def hostile(tmp_path):
     return tmp_path
 
 
-def simrun(folder, *arguments: str):
+def simrun(folder, *arguments):
     """Run a command in a folder by a script that lies elsewhere, as the installed one does."""
     script = folder.parent / "bin" / "simrun"
     script.parent.mkdir(exist_ok=True)

@@ -1,7 +1,5 @@
 """Lenses against their equations, to 100 degrees from the axis."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

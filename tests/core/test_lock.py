@@ -1,7 +1,5 @@
 """One writer at a time: others are refused or wait, and a killed holder keeps nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

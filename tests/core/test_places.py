@@ -1,7 +1,5 @@
 """Which folders are chosen for what nobody named, by home, variables, owners and rights."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -40,7 +38,7 @@ def home(tmp_path, monkeypatch):
     return tmp_path
 
 
-def chosen_by_nobody(home, **variables: str):
+def chosen_by_nobody(home, **variables):
     """Return what another user's process chooses who cannot write the source: cache, kernels, and
     the mode of the cache.
     """

@@ -1,7 +1,5 @@
 """``import simrun``: the names that a user's own code imports."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What a name stands for, what a part declares, and what its digest sees."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Which rollouts the same command makes again, in one process."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -43,7 +41,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def made(folder, renderer, *more: str):
+def made(folder, renderer, *more):
     """Drive and return when the rollout's log was written."""
     words = (
         "--renderer",

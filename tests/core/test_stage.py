@@ -1,7 +1,5 @@
 """What a process does at the moment, for whoever waits for it."""
 
-from __future__ import annotations
-
 from alpasim_plugin.core.stage import announce, shown_in, stages_in
 
 

@@ -44,7 +44,7 @@ class Installed:
     package: Path  # folder of the installed modules
     work: Path
 
-    def simrun(self, *arguments: str, code=0):
+    def simrun(self, *arguments, code=0):
         """Run a command in the folder and return its JSON document."""
         command = [str(self.python), "-m", "alpasim_plugin.cli.main", *arguments, "--json"]
         path = os.pathsep.join([str(REPO), *(p for p in sys.path if "site-packages" in p)])
@@ -61,7 +61,7 @@ class Installed:
         assert done.returncode == code, done.stdout + done.stderr
         return json.loads(done.stdout)
 
-    def drive(self, out, *parts: str, workers=1):
+    def drive(self, out, *parts, workers=1):
         """Drive and return for every rollout whether it was made anew."""
         rest = (
             "--seeds",
@@ -176,7 +176,7 @@ def test_parts_named_by_import_path_are_driven_again_where_they_were_edited(
         shutil.copy(TOY / "entry_points.txt", installed.package / "simrun_toy-1.0.dist-info")
 
 
-def edit_and_drive_again(installed, out, *parts: str):
+def edit_and_drive_again(installed, out, *parts):
     """Edit the fixer's weights and then the module of all parts, and check after each what is
     driven anew.
     """

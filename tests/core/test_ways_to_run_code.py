@@ -4,8 +4,6 @@ Each way is a bait that leaves its name in a file if it is run. The working dire
 stranger's folder.
 """
 
-from __future__ import annotations
-
 import pickle
 import stat
 import subprocess
@@ -42,7 +40,7 @@ class Bait:
         return exec, (self.python,)
 
 
-def python_file(*names: str):
+def python_file(*names):
     def way(folder, bait):
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +213,7 @@ def programs(folder, bait):
     return [["doctor"], [*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
 
 
-WAYS: dict[str, Way] = {
+WAYS = {
     "module of a library that is missing": python_file(
         "colorama.py", "numexpr.py", "coverage.py", "pytz.py", "bottleneck.py"
     ),

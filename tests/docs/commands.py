@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 LAB = "docs/lab"
 LAB_VERBS = ("bench", "train")
@@ -19,7 +17,7 @@ STEP = re.compile(r"^\s*- run: (.*)$", re.M)
 NO_COMMAND = (
     r"──",  # a picture of the order of commands
 )
-NOT_RUN: tuple[tuple[str, str], ...] = (  # the first rule that fits counts
+NOT_RUN = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
     (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda", "needs weights of 4 GB, or a GPU"),
@@ -59,22 +57,22 @@ class Command:
     page: str
     words: tuple[str, ...]  # without ``simrun``
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.page}: {' '.join(self.words)}"
 
     @property
-    def is_of_lab(self) -> bool:
+    def is_of_lab(self):
         """Tell whether it is a verb of the laboratory's."""
         return bool(self.words) and self.words[0] in LAB_VERBS
 
     @property
-    def why_not_run(self) -> str:
+    def why_not_run(self):
         """Say why it is only parsed; empty if it is run."""
         line = " ".join(self.words)
         return next((why for pattern, why in NOT_RUN if re.search(pattern, line)), "")
 
 
-def pages(repo: Path) -> list[Path]:
+def pages(repo):
     """Return README and every page of docs/ but the laboratory's, which are not there where it is
     not (`tests/lab/docs`).
     """
@@ -84,17 +82,17 @@ def pages(repo: Path) -> list[Path]:
     ]
 
 
-def lab_pages(repo: Path) -> list[Path]:
+def lab_pages(repo):
     """Return the laboratory's pages; none where it is not."""
     return sorted((repo / LAB).rglob("*.md"))
 
 
-def is_of_lab(repo: Path, path: Path) -> bool:
+def is_of_lab(repo, path):
     """Tell whether a file is one of the laboratory's pages or pictures."""
     return path.is_relative_to(repo / LAB)
 
 
-def lines_of(page: Path) -> list[str]:
+def lines_of(page):
     """Return the lines of a page's shell blocks and of the steps of its CI jobs, each whole."""
     text = page.read_text(encoding="utf-8")
     blocks = [
@@ -112,7 +110,7 @@ def lines_of(page: Path) -> list[str]:
     ] + steps
 
 
-def commands(repo: Path, of: Sequence[Path]) -> list[Command]:
+def commands(repo, of):
     """Return every ``simrun`` command of some pages, in their order."""
     found = []
     for page in of:

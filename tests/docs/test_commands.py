@@ -4,8 +4,6 @@ folder with the built wheel.
 The second is slow: ``pytest -m slow`` on this file.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import re
@@ -14,7 +12,6 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +39,7 @@ RUN = [command for command in COMMANDS if not command.why_not_run]
 def parse(words):
     """Parse a command line as `simrun` does, without running it."""
     args = with_verb(words)
-    command: Any = load_verb(args[0])
+    command = load_verb(args[0])
     name, *rest = args
     while hasattr(command, "commands"):
         name, *rest = rest

@@ -1,7 +1,5 @@
 """The parts of docs/extending.md work as they stand on the page."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page of a first policy, walked: each command as it stands, each edit as it is told."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

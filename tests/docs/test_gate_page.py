@@ -2,8 +2,6 @@
 drives are known: as before, worse, better, with one new collision, and not repeatable.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The headline about driving is what its record says: over scenes and over families."""
 
-from __future__ import annotations
-
 import importlib
 
 import numpy as np

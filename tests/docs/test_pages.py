@@ -3,8 +3,6 @@
 The laboratory's pages, and what leads to them, are those of `tests/lab/docs`.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

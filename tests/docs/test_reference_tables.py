@@ -1,7 +1,5 @@
 """The tables of options, metrics and scenario keys on the pages are those of the code."""
 
-from __future__ import annotations
-
 import importlib
 
 

@@ -5,8 +5,6 @@ Slow: ``pytest -m slow`` on this file. AlpaSim's renderer, driver and control un
     ours.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -2,8 +2,6 @@
 is loaded from elsewhere.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -2,10 +2,6 @@
 takes no time.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -16,9 +12,7 @@ from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from tests.drives.street import write_kitti, write_transforms
 
 
-def at_once(
-    views: Any, kept: Any, points: Any, *rest: Any
-) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+def at_once(views, kept, points, *rest):
     """Stand in for `fitting.fitted`."""
     cloud = cloud_from_points(points.xyz, points.rgb)
     return Reconstruction(cloud, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))), {

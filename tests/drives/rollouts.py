@@ -1,13 +1,11 @@
 """A rollout's log beside the recorded path, with one standing obstacle."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from alpasim_plugin.core.types import Actor, Box, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.core.types import Actor, Box, RolloutLog, Trajectory
 
 
-def rollout_along(scenario: Scenario, aside_m: float, box: tuple[np.ndarray, float]) -> RolloutLog:
+def rollout_along(scenario, aside_m, box):
     """Return the recorded drive moved to its left, and an obstacle: its middle and its side."""
     ego = scenario.ego_log
     xyz = ego.xyz + np.array([0.0, aside_m, 0.8])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,7 +26,7 @@ K = np.array([[FOCAL, 0.0, WIDTH / 2 + 3], [0.0, FOCAL, HEIGHT / 2 - 10], [0.0, 
 RIG_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-_seen: dict[object, np.ndarray] = {}  # photographs that were drawn in this process
+_seen = {}  # photographs that were drawn in this process
 
 
 @dataclass(frozen=True)
@@ -40,11 +39,11 @@ class Street:
 
     bow_m: float = 0.3
 
-    def ground(self, x: np.ndarray) -> np.ndarray:
+    def ground(self, x):
         """Return the road's height at stations."""
         return self.bow_m * np.sin(np.pi * np.clip(x, -10, 40) / 30)
 
-    def pose(self, x: float, aside: float = 0.0) -> np.ndarray:
+    def pose(self, x, aside=0.0):
         """Return ``T_world_camera`` at a station; the world is x along, y left, z up."""
         T = np.eye(4)
         slope = float(self.ground(np.array(x + 0.5)) - self.ground(np.array(x - 0.5)))
@@ -53,9 +52,7 @@ class Street:
         T[:3, 3] = x, -aside, float(self.ground(np.array(x))) + CAMERA_M
         return T
 
-    def photograph(
-        self, T: np.ndarray, bend: np.ndarray | None = None, fisheye: bool = False
-    ) -> np.ndarray:
+    def photograph(self, T, bend=None, fisheye=False):
         """Return what a camera at a pose sees, ``(H, W, 3)`` uint8 BGR; with a lens that bends
         lines where coefficients are given.
         """
@@ -69,7 +66,7 @@ class Street:
             _seen[key] = self._photograph(T, bend, fisheye)
         return _seen[key]
 
-    def _photograph(self, T: np.ndarray, bend: np.ndarray | None, fisheye: bool) -> np.ndarray:
+    def _photograph(self, T, bend, fisheye):
         v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
         pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
         middle = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -80,7 +77,7 @@ class Street:
         direction = np.column_stack([rays, np.ones(len(rays))]) @ T[:3, :3].T
         return self._colours(T[:3, 3], direction).reshape(HEIGHT, WIDTH, 3)
 
-    def _colours(self, at: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    def _colours(self, at, ray):
         far = 1e6
         t = np.where(ray[:, 2] < -1e-3, -CAMERA_M / np.minimum(ray[:, 2], -1e-3), far)
         for _ in range(8):  # the bowed road is met where the ray is as high as it
@@ -114,7 +111,7 @@ class Street:
         return np.rint(255 * colour.clip(0, 1)).astype(np.uint8)
 
 
-def noise(place: np.ndarray, cell_m: float) -> np.ndarray:
+def noise(place, cell_m):
     """Return smooth noise 0..1 at places ``(N, 3)``: values at the corners of cells,
     interpolated.
     """
@@ -139,18 +136,18 @@ def noise(place: np.ndarray, cell_m: float) -> np.ndarray:
     return total
 
 
-def stations() -> np.ndarray:
+def stations():
     """Return where the photographs are taken."""
     return np.arange(COUNT) * STEP_M
 
 
 def write_transforms(
-    folder: Path,
-    axes: str = "opencv",
-    say_axes: bool = True,
-    street: Street | None = None,
-    **keys: object,
-) -> Path:
+    folder,
+    axes="opencv",
+    say_axes=True,
+    street=None,
+    **keys,
+):
     """Write the street as ``transforms.json``; keys of the document are added."""
     chosen = street or Street()
     (folder / "images").mkdir(parents=True)
@@ -166,9 +163,7 @@ def write_transforms(
     return folder
 
 
-def write_kitti(
-    folder: Path, street: Street | None = None, spare_pictures: int = 0, stereo: bool = True
-) -> Path:
+def write_kitti(folder, street=None, spare_pictures=0, stereo=True):
     """Write the street as a KITTI odometry folder; ``spare_pictures`` have no pose."""
     chosen = street or Street()
     base = 0.54
@@ -193,9 +188,7 @@ def write_kitti(
     return folder
 
 
-def write_colmap(
-    folder: Path, binary: bool, model: str = "SIMPLE_PINHOLE", bend: tuple[float, ...] = ()
-) -> Path:
+def write_colmap(folder, binary, model="SIMPLE_PINHOLE", bend=()):
     """Write the street as a COLMAP model in ``sparse/0`` with pictures in ``images``; the unit is
     arbitrary.
     """

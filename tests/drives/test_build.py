@@ -2,8 +2,6 @@
 is left half-written.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +69,7 @@ def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imp
 def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path, monkeypatch, quick_fit):
     source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
 
-    def stop(*given: object):
+    def stop(*given):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(build, "measure", stop)

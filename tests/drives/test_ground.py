@@ -2,8 +2,6 @@
 there are, does not move it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

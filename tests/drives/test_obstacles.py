@@ -1,7 +1,5 @@
 """What stands in a reconstruction can be hit where it is, and what was driven through is free."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

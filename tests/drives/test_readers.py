@@ -1,9 +1,6 @@
 """Every form of a recorded drive gives the same street: its way, its road and its scale."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +17,7 @@ pytestmark = pytest.mark.slow
 WAY_M = (COUNT - 1) * STEP_M
 
 
-def told(*given: Any):
+def told(*given):
     """Take reports of progress."""
 
 

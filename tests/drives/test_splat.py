@@ -2,8 +2,6 @@
 Gaussians; and not in another frame.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

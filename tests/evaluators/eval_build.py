@@ -2,10 +2,6 @@
 by centre positions.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
@@ -14,8 +10,6 @@ from alpasim_plugin.core.types import (
     Box,
     Lane,
     LaneMap,
-    LoggedImage,
-    LoggedPlan,
     RolloutLog,
     Scene,
     Trajectory,
@@ -30,7 +24,7 @@ T_RIG_BOX = np.eye(4)
 T_RIG_BOX[:3, 3] = [VEHICLE.rear_axle_to_centre_m, 0.0, VEHICLE.box.height_m / 2]
 
 
-def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None) -> Trajectory:
+def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None):
     """Poses from numbers or arrays; as many as the longest of them, 0.1 s apart unless times are
     given.
     """
@@ -40,38 +34,36 @@ def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None) -> Trajectory:
     return Trajectory(t, xyz, quat_from_yaw(np.broadcast_to(np.asarray(yaw, dtype=float), n)))
 
 
-def car(name: str, poses: Trajectory, box: Box = CAR) -> Actor:
+def car(name, poses, box=CAR):
     return Actor(name, "car", box, poses)
 
 
-def lane(
-    name: str, y: float, half_width: float = 1.75, x0: float = -50.0, x1: float = 200.0, **kwargs
-) -> Lane:
-    def line(at: float) -> np.ndarray:
+def lane(name, y, half_width=1.75, x0=-50.0, x1=200.0, **kwargs):
+    def line(at):
         return np.array([[x0, at, 0.0], [x1, at, 0.0]])
 
     edges = {"left": line(y + half_width), "right": line(y - half_width)} | kwargs
     return Lane(name, line(y), **edges)
 
 
-def road_map(*lanes: Lane, edges: Sequence[np.ndarray] = ()) -> LaneMap:
+def road_map(*lanes, edges=()):
     return LaneMap({one.lane_id: one for one in lanes}, tuple(edges))
 
 
 def rollout(
-    ego: Trajectory,
-    actors: Sequence[Actor] = (),
-    log: Trajectory | None = None,
-    plans: Sequence[LoggedPlan] = (),
-    images: Sequence[LoggedImage] = (),
-    warmup_us: int = 0,
-    box: Box = VEHICLE.box,
-) -> RolloutLog:
+    ego,
+    actors=(),
+    log=None,
+    plans=(),
+    images=(),
+    warmup_us=0,
+    box=VEHICLE.box,
+):
     """A log whose ego is at the given box centres; the recording is the same drive unless given (as
     box centres as well).
     """
     recorded = offset_trajectory(log or ego, inverse(T_RIG_BOX))
-    by_id: Mapping[str, Actor] = {one.actor_id: one for one in actors}
+    by_id = {one.actor_id: one for one in actors}
     start = int(ego.t_us[0])
     return RolloutLog(
         "scene",
@@ -90,7 +82,7 @@ def rollout(
     )
 
 
-def scene(lane_map: LaneMap, log: RolloutLog) -> Scene:
+def scene(lane_map, log):
     return Scene("scene", lane_map, log.ego_log, VEHICLE)
 
 
@@ -104,7 +96,7 @@ TWO_LANES = road_map(
 )
 
 
-def by_name(series) -> dict:
+def by_name(series):
     return {one.name: one for one in series}
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log import read_asl
 from evaluators import score
 from evaluators.alpasim import (
@@ -26,7 +25,6 @@ from evaluators.alpasim import (
     reduce_run,
     scene_score,
 )
-from evaluators.metrics.presets import Preset
 from tests.scenarios.usdz_scene import read_usdz_scene
 
 RUN = ("00000000-0000-4000-8000-00000000000a", "golden-dev")
@@ -38,31 +36,29 @@ read_log = lru_cache(maxsize=64)(read_asl)
 read_scene = lru_cache(maxsize=32)(read_usdz_scene)
 
 
-def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, Scene]:
+def read_case(log, scene, rails=True):
     """Return a log and its scene; several settings score the same ones."""
     return read_log(log), read_scene(scene, rails)
 
 
 @lru_cache(maxsize=128)
-def scored(
-    log: Path, archive: Path, preset: Preset, rails: bool = True
-) -> tuple[MetricSeries, ...]:
+def scored(log, archive, preset, rails=True):
     """Score a log against its scene; several tests look at the same series."""
     return tuple(score(*read_case(log, archive, rails), preset))
 
 
-def close(got: float, want: float) -> bool:
+def close(got, want):
     """Compare as the goldens do: 1e-4 absolute or 1e-5 relative, since poses are float32 there."""
     same = got == want or (np.isnan(got) and np.isnan(want))
     return same or abs(got - want) <= max(1e-4, 1e-5 * abs(want))
 
 
-def expected(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def expected(folder):
     """Return AlpaSim's table in a log's folder: metric -> times, values, valid; the placeholder row
     of an empty metric is left out.
     """
     table = pq.read_table(folder / "expected_metrics.parquet").to_pydict()
-    out: dict[str, list] = {}
+    out = {}
     for name, t, value, valid in zip(
         table["name"], table["timestamps_us"], table["values"], table["valid"], strict=True
     ):
@@ -88,23 +84,23 @@ class GoldenSet:
     aggregate: str
     rails: bool = True
 
-    def series(self, log: Path) -> tuple[MetricSeries, ...]:
+    def series(self, log):
         return scored(
             log, self.scenes / f"{log.parent.parent.name}.usdz", self.settings.preset(), self.rails
         )
 
-    def run(self) -> list[ScoredRollout]:
+    def run(self):
         return [
             ScoredRollout(log.parent.parent.name, log.parent.name, self.series(log), *RUN)
             for log in self.logs
         ]
 
-    def table(self, log: Path) -> Path:
+    def table(self, log):
         """Give the folder with AlpaSim's table of a log."""
         return self.folder / "rollouts" / log.parent.parent.name / log.parent.name
 
 
-def golden_set(root: Path, name: str) -> GoldenSet:
+def golden_set(root, name):
     """Return the main set ("rollouts"), "other-settings", or one of the cases."""
     if name == "rollouts":
         logs = sorted(root.glob("rollouts/*/*/rollout.asl"))
@@ -145,10 +141,10 @@ def golden_set(root: Path, name: str) -> GoldenSet:
 class Tally:
     """Count of compared values, of equal ones, and the largest difference."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.logs, self.values, self.equal, self.largest = 0, 0, 0, 0.0
 
-    def add(self, got: np.ndarray, want: np.ndarray) -> None:
+    def add(self, got, want):
         got, want = np.asarray(got, dtype=float), np.asarray(want, dtype=float)
         same = (got == want) | (np.isnan(got) & np.isnan(want))
         off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
@@ -159,16 +155,16 @@ class Tally:
         )
         self.largest = max(self.largest, float(off.max(initial=0.0)))
 
-    def row(self, name: str) -> str:
+    def row(self, name):
         return f"| {name} | {self.logs} | {self.values} | {self.equal} | {self.largest:.1e} |"
 
 
-def parity_table(root: Path) -> str:
+def parity_table(root):
     """Compare every step of every metric, and every value of the tables over sweeps, of all golden
     sets.
     """
-    steps: dict[str, Tally] = defaultdict(Tally)
-    tables: dict[str, Tally] = defaultdict(Tally)
+    steps = defaultdict(Tally)
+    tables = defaultdict(Tally)
     for name in SETS:
         one = golden_set(root, name)
         for log in one.logs:

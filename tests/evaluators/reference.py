@@ -11,14 +11,13 @@ from itertools import pairwise
 import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths, interpolate, rectangle_corners, yaw_of
-from alpasim_plugin.core.types import F64, RolloutLog
 from evaluators.metrics.footprint import origin_of
-from evaluators.metrics.presets import PRESETS, Preset
+from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.route import moving, recorded_path
 from tests.evaluators.reference_rules import actor_corners, exact, point_to_segment, sides_of, touch
 
 
-def convex_contains(ring: F64, body: F64) -> bool:
+def convex_contains(ring, body):
     """Return whether a convex ring ``(N, 2)`` in either order contains a body's corners, its border
     included. Exact.
     """
@@ -45,7 +44,7 @@ class StepRoute:
     progress_rel: float
 
 
-def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
+def route_by_step(rollout):
     """Project every step on the recorded path, segment by segment; the recording must cover all
     steps and have a length.
     """
@@ -68,9 +67,7 @@ def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
     return out
 
 
-def _along(
-    path: F64, point: F64, about_m: float = 0.0, reach_m: float = math.inf
-) -> tuple[float, float, float]:
+def _along(path, point, about_m=0.0, reach_m=math.inf):
     """Return (distance, arc length of the first nearest point at most ``reach_m`` from ``about_m``,
     total length).
     """
@@ -96,7 +93,7 @@ def _along(
 # --- plans
 
 
-def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
+def open_loop_by_plan(rollout, preset):
     """Return for each plan with poses whether any of them within the horizon touches an actor;
     sharp-cornered footprints only.
     """

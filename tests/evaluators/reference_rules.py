@@ -9,11 +9,9 @@ floating point here as well.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import shapely
@@ -26,14 +24,9 @@ from alpasim_plugin.core.geometry import (
 )
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import (
-    F64,
-    Actor,
     Lane,
-    RolloutLog,
-    Scene,
 )
 from evaluators.metrics.footprint import origin_of
-from evaluators.metrics.presets import Preset
 
 Point = tuple[Fraction, Fraction]
 
@@ -51,13 +44,13 @@ class StepContact:
     gap_m: float
 
 
-def contacts_by_step(rollout: RolloutLog, preset: Preset) -> list[StepContact]:
+def contacts_by_step(rollout, preset):
     """Classify every actor at every step; sharp-cornered footprints only."""
     origin = origin_of(rollout.ego, preset)
     out = []
     for i, t_us in enumerate(rollout.ego.t_us.tolist()):
         ego = ego_corners(rollout, preset, i, origin)
-        sides: dict[str, str] = {}
+        sides = {}
         gap_m = math.inf
         for actor in rollout.actors.values():
             box = actor_corners(actor, t_us, preset, origin)
@@ -76,7 +69,7 @@ def contacts_by_step(rollout: RolloutLog, preset: Preset) -> list[StepContact]:
     return out
 
 
-def ego_corners(rollout: RolloutLog, preset: Preset, step: int, origin: F64) -> F64:
+def ego_corners(rollout, preset, step, origin):
     """Return the ego's corners ``(4, 2)`` at a step."""
     size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (
         1.0 - preset.shrink
@@ -84,7 +77,7 @@ def ego_corners(rollout: RolloutLog, preset: Preset, step: int, origin: F64) -> 
     return _corners(rollout.ego.xyz[step], rollout.ego.quat[step], size, origin)
 
 
-def actor_corners(actor: Actor, t_us: int, preset: Preset, origin: F64) -> F64 | None:
+def actor_corners(actor, t_us, preset, origin):
     """Return an actor's corners ``(4, 2)`` at a time, None before its first and after its last
     logged time.
     """
@@ -101,7 +94,7 @@ def actor_corners(actor: Actor, t_us: int, preset: Preset, origin: F64) -> F64 |
     )
 
 
-def _corners(xyz: F64, quat: F64, size: F64, origin: F64) -> F64:
+def _corners(xyz, quat, size, origin):
     return np.asarray(
         rectangle_corners(
             (xyz[:2] - origin[:2])[None], np.array([yaw_from_quat(quat)]), size[None]
@@ -109,7 +102,7 @@ def _corners(xyz: F64, quat: F64, size: F64, origin: F64) -> F64:
     )
 
 
-def touch(a: F64, b: F64) -> bool:
+def touch(a, b):
     """Return whether two convex shapes (or a segment and one) share a point: no edge direction of
     either separates them. Exact.
     """
@@ -123,7 +116,7 @@ def touch(a: F64, b: F64) -> bool:
     return True
 
 
-def polygon_distance(a: F64, b: F64) -> float:
+def polygon_distance(a, b):
     """Return the distance of two disjoint convex polygons: the least over corners of one and sides
     of the other.
     """
@@ -137,9 +130,7 @@ def polygon_distance(a: F64, b: F64) -> float:
     return best
 
 
-def point_to_segment(
-    p: Sequence[float], a: Sequence[float], b: Sequence[float]
-) -> tuple[float, float]:
+def point_to_segment(p, a, b):
     """Return the distance of a point from a segment in any dimension, and the share of the segment
     at the nearest point.
     """
@@ -154,12 +145,12 @@ def point_to_segment(
     return math.sqrt(sum((o - f * d) ** 2 for d, o in zip(along, offset, strict=True))), f
 
 
-def exact(shape: F64) -> list[Point]:
+def exact(shape):
     """Return the points ``(N, 2)`` as fractions."""
     return [(Fraction(x), Fraction(y)) for x, y in shape.tolist()]
 
 
-def sides_of(shape: list[Point]) -> list[tuple[Point, Point]]:
+def sides_of(shape):
     """Return the sides of a closed ring, or the one segment of two points."""
     return (
         [(shape[0], shape[1])]
@@ -183,7 +174,7 @@ class StepRoad:
     boundary_gap_m: float
 
 
-def road_by_step(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[StepRoad]:
+def road_by_step(rollout, scene, preset):
     """Apply the off-road rule step by step (lane query "line", edge query "any")."""
     origin = origin_of(scene.ego_log, preset)
     lanes = {key: shifted(lane, origin) for key, lane in scene.lane_map.lanes.items()}
@@ -215,7 +206,7 @@ def road_by_step(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Step
     return out
 
 
-def line_distance(point: F64, line: F64) -> float:
+def line_distance(point, line):
     """Return the least distance of a point from the segments of a polyline."""
     if len(line) == 1:
         return float(np.linalg.norm(point - line[0]))
@@ -224,14 +215,14 @@ def line_distance(point: F64, line: F64) -> float:
     )
 
 
-def shifted(lane: Lane, origin: F64) -> Lane:
+def shifted(lane, origin):
     """Return a lane relative to an origin."""
     left = None if lane.left is None else lane.left - origin
     right = None if lane.right is None else lane.right - origin
     return Lane(lane.lane_id, lane.centre - origin, left, right, lane.kind)
 
 
-def _touches(edge: F64, body: Any, z: float, preset: Preset) -> bool:
+def _touches(edge, body, z, preset):
     for a, b in pairwise(edge):
         if (
             abs((a[2] + b[2]) / 2 - z) <= preset.edge_height_m

@@ -10,14 +10,13 @@ the footprint, no union, no index.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Context, Decimal, localcontext
 from itertools import pairwise
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64
 from tests.evaluators.reference_rules import point_to_segment
 
 _C = Context(prec=40)
@@ -36,7 +35,7 @@ class Motion:
     turn: float
     size: tuple[float, float]  # length, width
 
-    def corners(self, tau: Decimal) -> list[tuple[Decimal, Decimal]]:
+    def corners(self, tau):
         """Return the corners at a share of the stretch."""
         x, y = (
             _C.add(Decimal(a), _C.multiply(Decimal(b), tau))
@@ -48,7 +47,7 @@ class Motion:
         return [(x + cos * u - sin * v, y + sin * u + cos * v) for u, v in local]
 
 
-def separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
+def separation(a, b, tau):
     """Return the largest gap between two rectangles along the directions of their sides: apart if
     positive.
     """
@@ -56,7 +55,7 @@ def separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
         return _separation(a, b, tau)
 
 
-def _separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
+def _separation(a, b, tau):
     shapes = (a.corners(tau), b.corners(tau))
     best = Decimal("-Infinity")
     for (p, q), (_, r) in ((shape[:2], shape[1:3]) for shape in shapes):
@@ -68,7 +67,7 @@ def _separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
     return best
 
 
-def first_touch(a: Motion, b: Motion, samples: int = 48) -> float | None:
+def first_touch(a, b, samples=48):
     """Return when two rectangles first touch, as a share of the stretch; None if they stay
     apart.
     """
@@ -76,8 +75,8 @@ def first_touch(a: Motion, b: Motion, samples: int = 48) -> float | None:
         return _first_touch(a, b, samples)
 
 
-def _first_touch(a: Motion, b: Motion, samples: int) -> float | None:
-    def gap(tau: Decimal) -> Decimal:
+def _first_touch(a, b, samples):
+    def gap(tau):
         return _separation(a, b, tau)
 
     steepest = Decimal(
@@ -105,13 +104,13 @@ def _first_touch(a: Motion, b: Motion, samples: int) -> float | None:
     return None
 
 
-def _reach(a: Motion, b: Motion) -> float:
+def _reach(a, b):
     """Return the greatest distance of the centres."""
     start = (b.xy[0] - a.xy[0], b.xy[1] - a.xy[1])
     return math.hypot(*start) + math.dist(a.shift, b.shift)
 
 
-def _bottom(gap: Callable[[Decimal], Decimal], low: Decimal, high: Decimal) -> Decimal:
+def _bottom(gap, low, high):
     """Return where a function with one dip is least; as soon as it is not positive, that point will
     do.
     """
@@ -127,14 +126,14 @@ def _bottom(gap: Callable[[Decimal], Decimal], low: Decimal, high: Decimal) -> D
     return (low + high) / 2
 
 
-def _crossing(gap: Callable[[Decimal], Decimal], apart: Decimal, touching: Decimal) -> Decimal:
+def _crossing(gap, apart, touching):
     for _ in range(60):
         middle = (apart + touching) / 2
         apart, touching = (middle, touching) if gap(middle) > 0 else (apart, middle)
     return touching
 
 
-def _sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
+def _sin_cos(angle):
     """Return sine and cosine by their power series."""
     x = _C.remainder(angle, _TWO_PI)
     sums = [Decimal(0), Decimal(0)]
@@ -146,14 +145,14 @@ def _sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
     return sums[1], sums[0]
 
 
-def side_at(a: Motion, b: Motion, tau: float, tie_m: float) -> str:
+def side_at(a, b, tau, tie_m):
     """Return which side of the first rectangle the contact's normal leaves through: the direction
     along which they overlap least.
     """
     with localcontext(_C):
         box, other = a.corners(Decimal(tau)), b.corners(Decimal(tau))
         ahead = (box[0][0] - box[3][0], box[0][1] - box[3][1])
-        found: list[tuple[Decimal, str]] = []
+        found = []
         for shape in (box, other):
             for end, start in ((0, 3), (3, 0), (0, 1), (1, 0)):
                 n = (shape[end][0] - shape[start][0], shape[end][1] - shape[start][1])
@@ -180,7 +179,7 @@ def side_at(a: Motion, b: Motion, tau: float, tie_m: float) -> str:
 Ring = Sequence[tuple[float, float]]
 
 
-def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[float, float]:
+def depth_by_points(corners, rings, n=24):
     """Return the greatest distance to the rings' areas among points of a rectangle: a lower and an
     upper bound.
 
@@ -189,7 +188,7 @@ def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[f
     upper one.
     """
 
-    def at(u: float, v: float) -> float:
+    def at(u, v):
         x, y = corners[0] + u * (corners[3] - corners[0]) + v * (corners[1] - corners[0])
         return distance_to_areas(float(x), float(y), rings)
 
@@ -212,7 +211,7 @@ def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[f
     return best, upper
 
 
-def distance_to_areas(x: float, y: float, rings: Sequence[Ring]) -> float:
+def distance_to_areas(x, y, rings):
     """Return the distance of a point to the nearest area, 0 inside one."""
     return (
         0.0
@@ -221,12 +220,12 @@ def distance_to_areas(x: float, y: float, rings: Sequence[Ring]) -> float:
     )
 
 
-def distance_to_ring(x: float, y: float, ring: Ring) -> float:
+def distance_to_ring(x, y, ring):
     """Return the distance of a point to a closed polyline."""
     return min(point_to_segment((x, y), a, b)[0] for a, b in pairwise([*ring, ring[0]]))
 
 
-def inside_ring(x: float, y: float, ring: Ring) -> bool:
+def inside_ring(x, y, ring):
     """Return whether a point lies inside a ring by the even-odd rule; a ring may cross itself."""
     inside = False
     for (x0, y0), (x1, y1) in pairwise([*ring, ring[0]]):

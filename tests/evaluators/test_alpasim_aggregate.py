@@ -2,11 +2,8 @@
 hand-made rollouts.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -102,12 +99,12 @@ def test_runs_that_alpasim_stops_at_stop_here_with_the_same_metric(shared_data, 
 # --- by hand
 
 
-def rollout(name, scene="s", n=4, absent=(), **values: Any):
+def rollout(name, scene="s", n=4, absent=(), **values):
     """A rollout of n steps in which nothing happens, except for what is given as a number or one
     number a step.
     """
     line = np.arange(n, dtype=np.int64) * 100_000
-    columns: dict[str, Any] = dict.fromkeys(
+    columns = dict.fromkeys(
         ("collision_any", "collision_front", "collision_lateral", "collision_rear", "offroad"), 0.0
     )
     columns |= {
@@ -126,7 +123,7 @@ def rollout(name, scene="s", n=4, absent=(), **values: Any):
     return ScoredRollout(scene, name, tuple(made), *RUN)
 
 
-def table(*rollouts: ScoredRollout):
+def table(*rollouts):
     return over_sweeps(reduce_run(rollouts, ALPASIM))
 
 

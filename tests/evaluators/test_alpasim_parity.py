@@ -2,8 +2,6 @@
 after its modifiers.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

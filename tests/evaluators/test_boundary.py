@@ -1,7 +1,5 @@
 """Boundaries of simulated policies: the search, its intervals, and ranges without a boundary."""
 
-from __future__ import annotations
-
 import pytest
 
 from evaluators.statistics.boundary import (

@@ -1,7 +1,5 @@
 """A gate on boundaries: pass, regression, undecided, and what cannot be compared."""
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.core.errors import InputError

@@ -2,8 +2,6 @@
 hard ones.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

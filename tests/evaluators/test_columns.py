@@ -2,10 +2,6 @@
 verdicts, and what is missing.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as pads
@@ -33,7 +29,7 @@ def rows_like_a_run(renderers, policies, scenes, seeds, key):
                 for seed in seeds:
                     for _ in range(1 if rng.random() < 0.9 else int(rng.integers(0, 2))):
                         failed = rng.random() < 0.05
-                        row: dict[str, Any] = dict(
+                        row = dict(
                             zip(
                                 KEYS,
                                 (renderer, policy, f"scene-{97 * scene % 31}", seed, "ok", None),
@@ -79,7 +75,7 @@ def table_of(rows):
 
 def by_rows(rows, baseline, bases):
     """Aggregate as the documentation says, with rows in memory."""
-    out: dict[str, dict[str, Any]] = {"metrics": {}, "paired": {}, "paired_with_base": {}}
+    out = {"metrics": {}, "paired": {}, "paired_with_base": {}}
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     for policy in policies:
         mine = [row for row in rows if row["policy"] == policy]

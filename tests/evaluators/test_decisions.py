@@ -2,8 +2,6 @@
 refused.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -21,7 +19,7 @@ def rng(key):
     return np.random.Generator(np.random.Philox(key))
 
 
-def asked(*metrics: tuple[str, float], **fields):
+def asked(*metrics, **fields):
     return Question(tuple(metric_question(name, margin) for name, margin in metrics), **fields)
 
 

@@ -1,9 +1,6 @@
 """Gates: what they ask for, against what, and the one outcome that follows."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -57,7 +54,7 @@ def table_of(made):
     return RolloutTable.of_table(pa.Table.from_pylist(made))
 
 
-def judged(run, spec, stored=None, name="", **fields: Any):
+def judged(run, spec, stored=None, name="", **fields):
     base = None if stored is None else table_of(stored)
     return check_gate(table_of(run), spec, base, name, **fields)
 
@@ -82,7 +79,7 @@ def invalid(metric, where=slice(None)):
     return changed
 
 
-def both(*changes: Callable[[Rows], Rows]):
+def both(*changes):
     def changed(candidate):
         for change in changes:
             candidate = change(candidate)
@@ -99,11 +96,11 @@ ONE, THREE = slice(4, 5), slice(5, 8)
 NEW = add(1.0, "collision_at_fault", ONE)
 
 
-def gate(**fields: Any):
+def gate(**fields):
     return GateSpec(**{"version": 1, "metrics": RULES, **fields})
 
 
-def code(now, before=same, spec=None, is_noisy=False, **size: int):
+def code(now, before=same, spec=None, is_noisy=False, **size):
     """Return the exit code of a change of the run and one of its baseline."""
     stored = before(rows(renderer="clean", **size))
     return judged([*stored, *now(rows(**size))], spec or gate(), repeatable=not is_noisy).exit_code

@@ -1,7 +1,5 @@
 """Metrics of motion: drives that fail without touching anything."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

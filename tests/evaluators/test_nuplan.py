@@ -1,7 +1,5 @@
 """nuPlan's metrics against the test vectors of its devkit, and in small worlds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

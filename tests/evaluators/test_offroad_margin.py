@@ -2,8 +2,6 @@
 its border.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 step-by-step twin.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

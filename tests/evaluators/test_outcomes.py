@@ -2,8 +2,6 @@
 drives along a straight road.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -181,7 +179,7 @@ def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest()
 
 
 def test_outcomes_are_counted_by_arm_with_place_and_time():
-    def manifest(policy, scene, **flags: float):
+    def manifest(policy, scene, **flags):
         metrics = {
             name: {"value": value, "valid": True, "reason": ""}
             for name, value in ({"progress": 1.0} | flags).items()

@@ -1,7 +1,5 @@
 """Hand-made contact scenes of another benchmark: who touches whom first, by plain box overlap."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -29,7 +27,7 @@ def first_contacts(path):
     egos = [data["ego"], *data.get("ego_future_states", [])]
     worlds = [data["world"], *data.get("world_future_states", [])]
     t_us = [state["time_us"] for state in egos]
-    tracks: dict[str, tuple[list, list, Box]] = {}
+    tracks = {}
     for t, world in zip(t_us, worlds, strict=True):
         for kind in ("vehicles", "bicycles", "pedestrians"):
             for one in world.get(kind, []):
@@ -49,7 +47,7 @@ def first_contacts(path):
     )
     table = ActorTable(log, OWN_SIZE, np.zeros(3))
     contacts, _ = find_contacts(ego_footprints(log, OWN_SIZE, np.zeros(3)), table, ego.t_us)
-    first: dict[str, int] = {}
+    first = {}
     for step, actor in zip(contacts.step.tolist(), contacts.actor.tolist(), strict=True):
         first.setdefault(table.ids[actor], step)
     return first

@@ -1,7 +1,5 @@
 """Plans and images: steadiness, open-loop collisions, minADE, black frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

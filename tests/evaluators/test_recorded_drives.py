@@ -2,8 +2,6 @@
 path.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Which steps count, and what a rollout comes to."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

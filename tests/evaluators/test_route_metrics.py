@@ -1,7 +1,5 @@
 """Distance from the recorded path and progress along it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

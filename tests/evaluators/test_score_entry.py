@@ -1,7 +1,5 @@
 """The entry point: bad logs are refused, evaluators are checked, every metric states its facts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 hard cases.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

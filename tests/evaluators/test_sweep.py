@@ -1,7 +1,5 @@
 """First contact of two moving rectangles against closed forms and the 40-digit twin."""
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 

@@ -2,8 +2,6 @@
 and the twin on hard cases.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -230,7 +228,7 @@ def twin_rows(log):
     """Actors that touch in each row, by brute force: exact at steps, decimals between."""
     at_steps = contacts_by_step(log, STRICT)
     rows = [set(one.sides) for one in at_steps]
-    sides: dict[tuple[int, str], str] = {}
+    sides = {}
     for i in range(len(log.ego) - 1):
         for actor in log.actors.values():
             if actor.actor_id in at_steps[i].sides:

@@ -5,8 +5,6 @@ The numbers D-01, D-02, ... are those of docs/experiments/alpasim-parity.md. Qui
 runtime, driver and physics are not about scoring a log and have no test here.
 """
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The three-way verdict, its companions, and cells without a pair."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -3,8 +3,6 @@
 Every database is made here.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command
@@ -20,7 +18,7 @@ HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: SIM ECU\n'
 EXTENDED = 1 << 31
 
 
-def message(i, name, length, *signals: str):
+def message(i, name, length, *signals):
     return f"BO_ {i} {name}: {length} ECU\n" + "".join(f" SG_ {one}\n" for one in signals) + "\n"
 
 
@@ -29,7 +27,7 @@ ANGLE = 'ANGLE : 0|16@1- (0.1,0) [-900|900] "" SIM'
 ACCEL = 'ACCEL : 16|16@1- (0.001,0) [-10|5] "" SIM'
 
 
-def opened(folder, *parts: str, steer="", accel="", send=""):
+def opened(folder, *parts, steer="", accel="", send=""):
     """Write a database and a map of it, and open both; the standard messages fill what is not
     given.
     """
@@ -44,7 +42,7 @@ def opened(folder, *parts: str, steer="", accel="", send=""):
     return open_codec(*load_map(str(folder / "map.yaml"))), folder / "map.yaml"
 
 
-def answered(codec, *frames: can.Message):
+def answered(codec, *frames):
     """Send frames to one end of a bus and take them in at the other."""
     address = Address.parse(f"test-files-{id(frames)}")
     with open_bus(address, codec) as one, open_bus(address, codec) as other:

@@ -3,12 +3,9 @@
 Every file is made here; photographs are left out where they do not matter.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct
-from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +30,7 @@ def poses(count):
     return [Street().pose(STEP_M * i) for i in range(count)]
 
 
-def transforms(folder, names, order=None, **keys: Any):
+def transforms(folder, names, order=None, **keys):
     """Write a ``transforms.json`` whose photograph i is taken i steps along the street."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = [

@@ -4,8 +4,6 @@ by name.
 Every file is made here.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct
@@ -226,7 +224,7 @@ def write_spz(path, version, flags, extensions=b""):
     return path
 
 
-def record(kind, *values: int):
+def record(kind, *values):
     return struct.pack(f"<II{len(values)}I", kind, 4 * len(values), *values)
 
 

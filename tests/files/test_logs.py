@@ -1,7 +1,5 @@
 """Recorded logs without what a reader can do without, and what is named by mistake."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

@@ -4,8 +4,6 @@ out of order.
 Every map is made here.
 """
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np
@@ -25,7 +23,7 @@ def lane(i, before=None, after=None, more=""):
     return f'<lane id="{i}" type="driving" {more}><link>{links}</link>{WIDTH}</lane>'
 
 
-def section(s, *lanes: str, more=""):
+def section(s, *lanes, more=""):
     sides = {"left": [], "right": []}
     for one in lanes:
         sides["right" if 'id="-' in one else "left"].append(one)
@@ -35,7 +33,7 @@ def section(s, *lanes: str, more=""):
 
 def road(
     i,
-    *sections: str,
+    *sections,
     x=0.0,
     length=50.0,
     junction="-1",
@@ -54,7 +52,7 @@ def road(
     return f'<road id="{i}" length="{length}" junction="{junction}"><link>{links}</link><planView>{view}</planView><lanes>{"".join(sections)}</lanes></road>'
 
 
-def read(*parts: str):
+def read(*parts):
     root = ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
     return lane_map_of("map.xodr", parse_map("map.xodr", root), np.eye(4))
 

@@ -4,8 +4,6 @@ more than one track.
 Every file is made here.
 """
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,14 +1,10 @@
 """Small fixers with a real history, and broken ones, for tests of the loop."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.types import U8, Frame
 
 
 class Blend:
@@ -20,19 +16,19 @@ class Blend:
     label = "blend"
     blocks = BlockRule(5, 8)
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.reset(0)
 
-    def reset(self, seed: int) -> None:
-        self.past: dict[str, U8] = {}
-        self.taken: list[list[Frame]] = []  # blocks that entered the history
+    def reset(self, seed):
+        self.past = {}
+        self.taken = []  # blocks that entered the history
         self.previews = 0
 
-    def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+    def preview(self, block, maps):
         self.previews += 1
         return self._mix(block)
 
-    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+    def step(self, block, maps):
         assert len(maps) in (0, len(block))
         fixed = self._mix(block)
         self.taken.append(list(block))
@@ -40,7 +36,7 @@ class Blend:
             self.past[frame.camera] = frame.rgb
         return fixed
 
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         out = []
         for frame in block:
             mean = np.mean([f.rgb for f in block if f.camera == frame.camera], axis=0)
@@ -52,38 +48,38 @@ class Blend:
 
 
 class Raises(Blend):
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         raise RuntimeError("out of memory")
 
 
 class LosesAFrame(Blend):
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         return super()._mix(block)[:-1]
 
 
 class ShiftsTime(Blend):
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         return [replace(frame, t_us=frame.t_us + 1) for frame in super()._mix(block)]
 
 
 class GivesFloats(Blend):
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         return [replace(frame, rgb=np.full(frame.rgb.shape, np.nan, np.float32)) for frame in block]  # type: ignore[arg-type]
 
 
 class GuardSteps(Blend):
     """As a fixer whose guard passes every third frame on raw."""
 
-    def _mix(self, block: Sequence[Frame]) -> list[Frame]:
+    def _mix(self, block):
         return [
             replace(block[i], events=("fixer-nan",)) if i % 3 == 0 else fixed
             for i, fixed in enumerate(super()._mix(block))
         ]
 
 
-def fixed_offline(fixer: Blend, frames: Sequence[Frame]) -> list[Frame]:
+def fixed_offline(fixer, frames):
     """Fix the frames of one camera in whole blocks, as one would with a finished video."""
-    out: list[Frame] = []
+    out = []
     done = 0
     while len(out) < len(frames):
         block = frames[len(out) : len(out) + fixer.blocks.frames(done)]

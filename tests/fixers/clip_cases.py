@@ -1,24 +1,22 @@
 """Small clips shared by the tests of fixers."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.core.types import Frame
 
 SIZE = (32, 48)  # height, width
 STEP_US = 100_000
 
 
 def moving_picture(
-    count: int,
-    size: tuple[int, int] = SIZE,
-    key: str = "picture",
-    holes: bool = True,
-    camera: str = "front",
-) -> list[Frame]:
+    count,
+    size=SIZE,
+    key="picture",
+    holes=True,
+    camera="front",
+):
     """Return frames of a smooth texture that slides by, with a soft-edged hole in their opacity."""
     height, width = size
     texture = (
@@ -45,10 +43,10 @@ def moving_picture(
     return out
 
 
-def maps_of(frames: list[Frame]) -> list[U8]:
+def maps_of(frames):
     """Return a map per frame, different from the frame."""
     return [255 - frame.rgb[::-1].copy() for frame in frames]
 
 
-def pixels(frames: list[Frame]) -> U8:
+def pixels(frames):
     return np.stack([frame.rgb for frame in frames])

@@ -1,7 +1,5 @@
 """Small networks are fastest on one thread, and bit-equality needs the same number throughout."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

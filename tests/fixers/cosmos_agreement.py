@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap, Marking
+from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Marking
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.world.paint import painted_lines
@@ -60,7 +60,7 @@ class Clip:
     lenses: dict[str, RecordedLens]
     renders: Path
 
-    def video(self, name: str) -> tuple[list[U8], Bool]:
+    def video(self, name):
         """Decode the published render of a camera, as its pinhole shows it; and where it does."""
         camera = pinhole(name)
         v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -75,7 +75,7 @@ class Clip:
         return [cv2.remap(image, x, y, cv2.INTER_LINEAR) for image in images], shown
 
 
-def pinhole(name: str) -> CameraSpec:
+def pinhole(name):
     """Return the pinhole inside the lens of a camera whose name ends in its angle."""
     found = re.search(r"(\d+)fov", name)
     assert found
@@ -85,7 +85,7 @@ def pinhole(name: str) -> CameraSpec:
     return CameraSpec(name, WIDTH, HEIGHT, K, np.eye(4))
 
 
-def read_clip(folder: Path) -> Clip:
+def read_clip(folder):
     """Read the clip and its lenses."""
     log = read_cosmos(folder / "example")
     files = SourceFiles()
@@ -102,7 +102,7 @@ def read_clip(folder: Path) -> Clip:
     return Clip(lane_map, se3(log.ego_log.xyz, log.ego_log.quat), lenses, renders)
 
 
-def mounts() -> dict[str, F64]:
+def mounts():
     """Return the estimated mounts, camera to rig."""
     out = {}
     for name, six in json.loads(MOUNTS.read_text()).items():
@@ -112,7 +112,7 @@ def mounts() -> dict[str, F64]:
     return out
 
 
-def published_layers(image: U8) -> tuple[Bool, Bool, Bool]:
+def published_layers(image):
     """Tell lane lines, road boundaries and poles of the published palette apart, each ``(H, W)``.
 
     Layers were added up there: a lane line behind a red box is pink. Boundaries are (200, 36, 35),
@@ -131,7 +131,7 @@ def published_layers(image: U8) -> tuple[Bool, Bool, Bool]:
     return lane, boundary, pole
 
 
-def near(points: Bool, others: Bool) -> int:
+def near(points, others):
     """Count the points that lie within `WITHIN_PX` of another mask."""
     if not others.any():
         return 0
@@ -139,7 +139,7 @@ def near(points: Bool, others: Bool) -> int:
     return int((distance[points] <= WITHIN_PX).sum())
 
 
-def compare(clip: Clip, name: str, T_rig_camera: F64, every: int = 1) -> Agreement:
+def compare(clip, name, T_rig_camera, every=1):
     """Compare one camera's frames."""
     bare = replace(clip.lane_map, crosswalks=(), stop_lines=(), poles=(), signs=())
     lines = prepare_map(bare)

@@ -28,12 +28,12 @@ from alpasim_plugin.core.geometry import (
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.reading import parse_json
 from alpasim_plugin.core.reading.arrays import parse_npy
-from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_camera
 from scenarios.map_lines import is_left_of, lane_edges
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, near
-from tests.scenarios.ftheta_projection import RecordedLens, lens_of
+from tests.scenarios.ftheta_projection import lens_of
 
 # Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
 # calibration of another car of the same fleet; with it the clip's own map falls on the publisher's
@@ -48,9 +48,9 @@ T_RIG_FRONT_WIDE = np.array(
 )
 
 
-def read_tar(files: SourceFiles, path: Path) -> dict[str, bytes]:
+def read_tar(files, path):
     """Read the regular files of an uncompressed tar, by member name."""
-    members: dict[str, bytes] = {}
+    members = {}
     with tarfile.open(fileobj=io.BytesIO(files.read_bytes(path)), mode="r:") as archive:
         for info in archive:
             handle = archive.extractfile(info)
@@ -59,7 +59,7 @@ def read_tar(files: SourceFiles, path: Path) -> dict[str, bytes]:
     return members
 
 
-def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
+def read_lenses(files, folder):
     """Read ``ftheta_intrinsic``: one array of 11 numbers a camera.
 
     Layout: cx, cy, width, height, six coefficients from the constant upwards, and a flag: 1 where
@@ -70,7 +70,7 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
         InputError: The tar is missing or damaged, or an array is not a lens.
     """
     path = files.only(folder / "ftheta_intrinsic", ("*.tar",), "the f-theta intrinsics")
-    lenses: dict[str, RecordedLens] = {}
+    lenses = {}
     for name, data in read_tar(files, path).items():
         if not name.endswith(".npy"):
             continue
@@ -102,16 +102,16 @@ class Label:
     ]  # each (N, 3) metres, world; one for a polyline or surface, the eight corners for a cuboid
 
     @property
-    def feature_id(self) -> str:
+    def feature_id(self):
         """Return the id other features refer to."""
         return str(self.attributes.get("feature_id"))
 
-    def ids(self, name: str) -> tuple[str, ...]:
+    def ids(self, name):
         """Return a list attribute of ids; empty where the map gives none."""
         value = self.attributes.get(name)
         return tuple(str(v) for v in value if str(v) != "-1") if isinstance(value, list) else ()
 
-    def one_id(self, name: str) -> str | None:
+    def one_id(self, name):
         """Return a single id; the text -1 means none."""
         value = self.attributes.get(name)
         return (
@@ -119,7 +119,7 @@ class Label:
         )
 
 
-def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...]:
+def read_layer(files, folder, layer):
     """Read one layer folder, such as ``3d_lanes``; labels marked empty are left out.
 
     Raises:
@@ -135,7 +135,7 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
     labels = document.get("labels") if isinstance(document, dict) else None
     if not isinstance(labels, list):
         raise InputError(f"{path}, {name}: no list 'labels'", "use a file of the RDS-HQ layout")
-    out: list[Label] = []
+    out = []
     for number, raw in enumerate(labels):
         where = f"{path}, label {number}"
         if isinstance(raw, dict) and raw.get("labelFamily") == "EMPTY":
@@ -158,7 +158,7 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
     return tuple(out)
 
 
-def _value(attribute: dict[str, Any]) -> Any:
+def _value(attribute):
     """Unpack an attribute: ``{"name": ..., KIND: value}``, where lists come one level deeper and
     may be absent when empty.
     """
@@ -169,7 +169,7 @@ def _value(attribute: dict[str, Any]) -> Any:
     return next(iter(value.values()), []) if isinstance(value, dict) else value
 
 
-def _vertices(shape: dict[str, Any]) -> list[Any]:
+def _vertices(shape):
     if "polylines3d" in shape:
         return [line["vertices"] for line in shape["polylines3d"]["polylines"]]
     for kind in ("polyline3d", "surface", "cuboid3d"):
@@ -178,7 +178,7 @@ def _vertices(shape: dict[str, Any]) -> list[Any]:
     raise KeyError("polylines3d, polyline3d, surface or cuboid3d")
 
 
-def paint_of(styles: Any, colours: Any) -> Paint:
+def paint_of(styles, colours):
     """Return the paint of a line from its styles and colours a vertex; the most frequent pair
     decides.
 
@@ -206,7 +206,7 @@ def paint_of(styles: Any, colours: Any) -> Paint:
     return "unknown"
 
 
-def sign_pose(corners: F64) -> tuple[F64, Box]:
+def sign_pose(corners):
     """Return ``(T_world_sign (4, 4), size)`` of a cuboid ``(8, 3)``: x along its thinnest side, z
     as upright as it goes.
 
@@ -228,9 +228,7 @@ def sign_pose(corners: F64) -> tuple[F64, Box]:
 MPH = 0.44704  # m/s
 
 
-def oriented_lanes(
-    files: SourceFiles, labels: tuple[Label, ...], ego_log: Trajectory
-) -> tuple[dict[str, Lane], tuple[str, ...]]:
+def oriented_lanes(files, labels, ego_log):
     """Make lanes with edges in driving direction, left edge left.
 
     A lane runs towards the lanes named by its ``next_lane_ids``: the end of its edges that lies
@@ -240,7 +238,7 @@ def oriented_lanes(
     Raises:
         InputError: A lane has not exactly two edges, or two lanes share an id.
     """
-    raw: dict[str, tuple[F64, F64]] = {}
+    raw = {}
     for label in labels:
         if len(label.lines) != 2 or min(len(line) for line in label.lines) < 2:
             raise InputError(
@@ -257,12 +255,12 @@ def oriented_lanes(
         label.feature_id: tuple(i for i in label.ids("next_lane_ids") if i in raw)
         for label in labels
     }
-    before: dict[str, list[str]] = {key: [] for key in raw}
+    before = {key: [] for key in raw}
     for key, followers in links.items():
         for follower in followers:
             before[follower].append(key)
     turned = swapped = against = 0
-    lanes: dict[str, Lane] = {}
+    lanes = {}
     for label in labels:
         key = label.feature_id
         one, two = raw[key]
@@ -313,7 +311,7 @@ def oriented_lanes(
     return lanes, tuple(notes)
 
 
-def _same_order(one: F64, two: F64) -> F64:
+def _same_order(one, two):
     """Return the second edge, turned round where its far end lies nearer to the start of the
     first.
     """
@@ -322,7 +320,7 @@ def _same_order(one: F64, two: F64) -> F64:
     return two[::-1] if straight > crossed else two
 
 
-def _runs_towards(lane: tuple[F64, F64], other: tuple[F64, F64]) -> int:
+def _runs_towards(lane, other):
     """Return 1 if the lane's last points lie nearer to the other lane than its first ones, else
     -1.
     """
@@ -332,7 +330,7 @@ def _runs_towards(lane: tuple[F64, F64], other: tuple[F64, F64]) -> int:
     return 1 if distance[1] <= distance[0] else -1
 
 
-def _ego_vote(one: F64, two: F64, ego_log: Trajectory) -> int:
+def _ego_vote(one, two, ego_log):
     """Return 1 if the ego drove through the lane in the order of its points, -1 if against it, 0 if
     it was not there or crossed.
     """
@@ -347,7 +345,7 @@ def _ego_vote(one: F64, two: F64, ego_log: Trajectory) -> int:
     return 1 if share < np.pi / 3 else -1 if share > 2 * np.pi / 3 else 0
 
 
-def _speed_limit(label: Label) -> float | None:
+def _speed_limit(label):
     value = label.attributes.get("speed_limit")
     return float(value) * MPH if isinstance(value, (int, float)) and value > 0 else None
 
@@ -366,7 +364,7 @@ EDGE_STEP_M = 2.0
 GROUND_CELL_M = 2.0
 
 
-def read_cosmos(path: str | Path) -> RecordedLog:
+def read_cosmos(path):
     """Read one clip: the folder that holds ``3d_lanes``, ``vehicle_pose`` and the other layers.
 
     Raises:
@@ -447,7 +445,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     )
 
 
-def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
+def read_poses(files, folder):
     """Read ``vehicle_pose``: one 4x4 rig-to-world matrix a frame at 30 Hz, and the clip's name.
 
     Times count from the clip's first microsecond, which stands in the file's name; 0 where it does
@@ -457,7 +455,7 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
         InputError: Frames are missing, or a matrix is not a rigid motion.
     """
     path = files.only(folder / "vehicle_pose", ("*.tar",), "the ego poses")
-    frames: dict[int, F64] = {}
+    frames = {}
     for name, data in read_tar(files, path).items():
         match = re.search(r"\.(\d+)\.vehicle_pose\.npy$", name)
         if match is None:

@@ -12,14 +12,9 @@ and shape: no bands, no shortcuts.
 - Colours fade with ``clamp(1 - depth / depth_max)``, half widths alike.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 
 from alpasim_plugin.core.geometry import transform_points
-from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.fixers.semantic_map.draw import actor_geometry, view_of
 from alpasim_plugin.fixers.semantic_map.kernels import (
     BACK,
@@ -33,20 +28,19 @@ from alpasim_plugin.fixers.semantic_map.kernels import (
     SHAPE,
     STROKE,
 )
-from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, Segments, Triangles
 from alpasim_plugin.fixers.semantic_map.raster import SAMPLES
 from alpasim_plugin.fixers.semantic_map.style import DEPTH_MAX_M, NEAR_M, WIDTH_DEFINED_AT_PX
 
 
 def draw_map_reference(
-    scene: PreparedMap,
-    camera: CameraSpec,
-    T_world_camera: F64,
-    actors: Sequence[ActorBox] = (),
+    scene,
+    camera,
+    T_world_camera,
+    actors=(),
     *,
-    step_m: float = 2.0,
-    angle_rad: float = 0.05,
-) -> U8:
+    step_m=2.0,
+    angle_rad=0.05,
+):
     """Draw what `alpasim_plugin.fixers.semantic_map.draw.draw_map` draws, from points at most
     ``step_m`` and ``angle_rad`` apart.
 
@@ -67,7 +61,7 @@ def draw_map_reference(
     return draw_reference(strokes, len(first), np.concatenate(shapes), camera)
 
 
-def project_points(camera: CameraSpec, points: F64) -> F64:
+def project_points(camera, points):
     """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)``; NaN behind the camera."""
     x, y, z = points.T
     z = np.where(z > 0, z, np.nan)
@@ -77,12 +71,12 @@ def project_points(camera: CameraSpec, points: F64) -> F64:
 
 
 def strokes_reference(
-    segments: Segments,
-    T_camera_scene: F64,
-    camera: CameraSpec,
-    step_m: float,
-    angle_rad: float,
-) -> F64:
+    segments,
+    T_camera_scene,
+    camera,
+    step_m,
+    angle_rad,
+):
     """Cut segments into short strokes ``(N, STROKE)``, clipped at the near and the far plane."""
     rows = [np.zeros((0, STROKE))]
     for ends, (width_px, *look) in zip(segments.ends, segments.style, strict=True):
@@ -108,12 +102,12 @@ def strokes_reference(
 
 
 def shapes_reference(
-    triangles: Triangles,
-    T_camera_scene: F64,
-    camera: CameraSpec,
-    side_m: float,
-    angle_rad: float,
-) -> F64:
+    triangles,
+    T_camera_scene,
+    camera,
+    side_m,
+    angle_rad,
+):
     """Cut triangles into small shapes ``(N, SHAPE)``, clipped at the near plane."""
     rows = [np.zeros((0, SHAPE))]
     for corners, shade, look in zip(
@@ -136,7 +130,7 @@ def shapes_reference(
     return np.concatenate(rows)
 
 
-def clip_reference(polygon: F64, near_m: float) -> F64:
+def clip_reference(polygon, near_m):
     """Return the part of a convex polygon ``(N, 3+)`` with z of at least ``near_m``; further
     columns are interpolated.
     """
@@ -151,7 +145,7 @@ def clip_reference(polygon: F64, near_m: float) -> F64:
     return np.array(out).reshape(-1, polygon.shape[1])
 
 
-def _short(a: F64, b: F64, side_m: float, angle_rad: float) -> bool:
+def _short(a, b, side_m, angle_rad):
     """Tell whether a piece between two camera-frame points is short enough to be taken as straight
     in any image.
     """
@@ -159,7 +153,7 @@ def _short(a: F64, b: F64, side_m: float, angle_rad: float) -> bool:
     return bool(np.linalg.norm((b - a)[:3]) <= min(side_m, angle_rad * nearest_m))
 
 
-def _along(a: F64, b: F64, side_m: float, angle_rad: float) -> F64:
+def _along(a, b, side_m, angle_rad):
     """Return points ``(N, 3)`` from a to b."""
     if _short(a, b, side_m, angle_rad):
         return np.stack([a, b])
@@ -169,7 +163,7 @@ def _along(a: F64, b: F64, side_m: float, angle_rad: float) -> F64:
     )
 
 
-def _cut(triangle: F64, side_m: float, angle_rad: float) -> list[F64]:
+def _cut(triangle, side_m, angle_rad):
     """Halve a triangle at its longest side until all sides are short."""
     k = int(
         np.argmax([np.linalg.norm((triangle[i] - triangle[i - 2])[:3]) for i in range(3)])
@@ -185,7 +179,7 @@ def _cut(triangle: F64, side_m: float, angle_rad: float) -> list[F64]:
     )
 
 
-def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: CameraSpec) -> U8:
+def draw_reference(strokes, n_first, shapes, camera):
     """Draw strokes before ``n_first``, then all shapes, then the other strokes."""
     depth = np.zeros((camera.height, camera.width, len(SAMPLES)), np.float32)
     colour = np.zeros((camera.height, camera.width, len(SAMPLES), 3))
@@ -200,7 +194,7 @@ def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: CameraSpec) 
     return np.asarray(mean, dtype=np.uint8)
 
 
-def _window(low: F64, high: F64, depth: F32) -> tuple[slice, slice, F64] | None:
+def _window(low, high, depth):
     """Return the rows, the columns and the centres ``(h, w, 2)`` of the pixels in a box of the
     image; None outside it.
     """
@@ -213,7 +207,7 @@ def _window(low: F64, high: F64, depth: F32) -> tuple[slice, slice, F64] | None:
     return slice(y0, y1), slice(x0, x1), np.stack([x, y], axis=-1)
 
 
-def _stroke(stroke: F64, stretch: float, depth: F32, colour: F64) -> None:
+def _stroke(stroke, stretch, depth, colour):
     square = np.array([1.0, stretch])
     a, b = stroke[0:2], stroke[3:5]
     reach = stroke[HALF] / square
@@ -224,7 +218,7 @@ def _stroke(stroke: F64, stretch: float, depth: F32, colour: F64) -> None:
     along = (b - a) * square
     length2 = along @ along
 
-    def nearest(points: F64) -> tuple[F64, F64]:
+    def nearest(points):
         """Return the part along the line nearest to points ``(..., 2)``, and the squared
         distance.
         """
@@ -253,7 +247,7 @@ def _stroke(stroke: F64, stretch: float, depth: F32, colour: F64) -> None:
     )
 
 
-def _shape(shape: F64, depth: F32, colour: F64) -> None:
+def _shape(shape, depth, colour):
     corners = shape[:12].reshape(3, 4)
     xy = corners[:, :2]
     window = _window(xy.min(axis=0), xy.max(axis=0), depth)
@@ -263,7 +257,7 @@ def _shape(shape: F64, depth: F32, colour: F64) -> None:
     rows, columns, centre = window
     to_parts = np.linalg.inv(edge)  # [1, x, y] -> barycentric coordinates
 
-    def parts(points: F64) -> F64:
+    def parts(points):
         return np.asarray(to_parts[0] + points @ to_parts[1:])
 
     middle = parts(centre)
@@ -282,7 +276,7 @@ def _shape(shape: F64, depth: F32, colour: F64) -> None:
     )
 
 
-def _put(covered: Bool, inverse: F64, painted: F64, depth: F32, colour: F64) -> None:
+def _put(covered, inverse, painted, depth, colour):
     """Write covered samples ``(h, w, n)`` that are nearer than what is there; ``depth`` and
     ``colour`` are views of the buffers.
     """

@@ -1,7 +1,5 @@
 """The core does not need the rooms of the block generators and of the laboratory."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -41,7 +39,7 @@ assert fixer.trained and not fixed.events and (fixed.rgb != rgb).any()
 """
 
 
-def alone(*code: str):
+def alone(*code):
     """Run code in a process that can import neither room."""
     text = "".join((ALONE, *code)).replace("{rooms!r}", repr(ROOMS))
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=250)

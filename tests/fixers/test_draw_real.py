@@ -2,8 +2,6 @@
 `tests.fixers.cosmos_agreement` for what is compared.
 """
 
-from __future__ import annotations
-
 import av
 import cv2
 import numpy as np

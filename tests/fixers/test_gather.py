@@ -1,7 +1,5 @@
 """The fast gathering of what the generator reads equals the readable one."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

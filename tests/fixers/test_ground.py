@@ -2,15 +2,11 @@
 stands on it keeps its own depth.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import F64, Box
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.fixers.ground import (
     FARTHEST_M,
     FREE_SHARE,
@@ -35,7 +31,7 @@ HEIGHT = 48
 HEIGHT_M = 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])
-NOBODY: Mapping[str, F64] = {}
+NOBODY = {}
 
 
 def rig(x_m):

@@ -2,8 +2,6 @@
 knows.
 """
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 fault stays in the history.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +47,7 @@ def write_bundle(path):
     return path
 
 
-def at(bundle, *overrides: str):
+def at(bundle, *overrides):
     settings = fixer_settings(
         "onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides]
     )
@@ -57,7 +55,7 @@ def at(bundle, *overrides: str):
     return settings
 
 
-def session(bundle, *overrides: str, seed=0):
+def session(bundle, *overrides, seed=0):
     return PixelFixer(at(bundle, *overrides), "scene", seed)
 
 

@@ -2,15 +2,12 @@
 order, and no harm where none holds.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from alpasim_plugin.fixers.gather import CPU
-from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, PixelState
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.network.reference_blend import _sampled, in_floats
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
@@ -36,9 +33,7 @@ def inputs(references, batch=1, seed=0):
 
 
 def call(net, render, opacity, sdmap, references):
-    out: tuple[Tensor, PixelState] = net(
-        render, opacity, sdmap, net.start(render), None, None, references
-    )
+    out = net(render, opacity, sdmap, net.start(render), None, None, references)
     return out
 
 

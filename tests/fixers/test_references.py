@@ -2,9 +2,6 @@
 is.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +10,6 @@ import pytest
 from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.shutter import bands, rolling
 from alpasim_plugin.core.types import (
-    F64,
     Actor,
     Box,
     CameraSpec,
@@ -41,7 +37,7 @@ K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
 FORWARD = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
 )  # a camera that looks along x of its rig
-NOBODY: Mapping[str, F64] = {}
+NOBODY = {}
 
 
 def at(x, y=0.0, yaw=0.0):
@@ -199,7 +195,7 @@ def test_only_earlier_frames_are_references_where_the_past_is_asked_for():
 
 
 def session(which="all", hysteresis=True, road_m=0.0):
-    reads: list[int] = []
+    reads = []
 
     def read():
         reads.append(1)

@@ -1,7 +1,5 @@
 """Numbers that a refined stream adds up to."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

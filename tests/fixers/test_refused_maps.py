@@ -1,7 +1,5 @@
 """Maps and road users that cannot be drawn are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

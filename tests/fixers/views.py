@@ -1,7 +1,5 @@
 """A pinhole camera, and small parts of maps for it to look at."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.geometry import se2

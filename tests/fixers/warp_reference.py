@@ -1,10 +1,7 @@
 """The warp array by array: what its kernels are held to."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from alpasim_plugin.core.types import F32, F64, U8, Bool
 from alpasim_plugin.fixers.warp import (
     INCONSISTENT,
     INFINITY_M,
@@ -12,19 +9,16 @@ from alpasim_plugin.fixers.warp import (
     SLACK,
     SLACK_M,
     VALID,
-    Lookup,
     _walls,
 )
 
 
-def plain_on_boxes(
-    shape: tuple[int, int], K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64
-) -> Bool:
+def plain_on_boxes(shape, K, T_world_camera, T_box_world, sizes):
     """Return the same as `on_boxes` of `PlacedBoxes`, array by array: the reference of its
     kernel.
     """
     rays = plain_points(np.ones(shape), K, T_world_camera) - T_world_camera[:3, 3]
-    out: Bool = np.zeros(shape, dtype=bool)
+    out = np.zeros(shape, dtype=bool)
     for T_box, size in zip(T_box_world, sizes, strict=True):
         with np.errstate(divide="ignore"):
             hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (
@@ -34,7 +28,7 @@ def plain_on_boxes(
     return out
 
 
-def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
+def plain_coordinates(lookup):
     """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
     (
         depth,
@@ -85,7 +79,7 @@ def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     )
 
 
-def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
+def plain_points(depth, K, T_world_camera):
     """Return the points of the world ``(H, W, 3)`` that pixels show at a depth ``(H, W)``."""
     height, width = depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
@@ -96,7 +90,7 @@ def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
     )
 
 
-def _moved(T: F64, points: F64) -> F64:
+def _moved(T, points):
     """Map points ``(..., 3)`` by ``T (4, 4)``."""
-    moved: F64 = points @ T[:3, :3].T + T[:3, 3]
+    moved = points @ T[:3, :3].T + T[:3, 3]
     return moved

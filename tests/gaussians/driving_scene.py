@@ -1,16 +1,13 @@
 """A random scene with the statistics of a street."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 
 
-def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianCloud:
+def driving_like_scene(n, seed=0, sh_degree=3):
     """Return n Gaussians around a straight road, world axes ENU with the road along x, seen well
     from (0, 0, 1.6) towards +x.
 
@@ -23,13 +20,13 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
     road, facade, vehicle, foliage = counts
     far = n - int(counts.sum())
 
-    def flat(count: int, length_m: float, thickness_m: float) -> F64:
+    def flat(count, length_m, thickness_m):
         scales = length_m * size * np.exp(rng.normal(0.0, 0.4, (count, 3)))
         scales[:, 2] = thickness_m
         return np.asarray(scales)
 
     # Points are denser near the camera, as reconstructions are.
-    def ahead(count: int, reach_m: float) -> F64:
+    def ahead(count, reach_m):
         return np.asarray(-8.0 + (reach_m + 8.0) * rng.uniform(0, 1, count) ** 1.5)
 
     road_means = np.stack(
@@ -84,7 +81,7 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
     )
 
 
-def driving_camera(width: int, height: int, yaw_rad: float = 0.0) -> PinholeCamera:
+def driving_camera(width, height, yaw_rad=0.0):
     """Return a camera at (0, 0, 1.6), looking along +x turned left by the yaw, horizontal field of
     view 65 degrees.
     """

@@ -1,19 +1,15 @@
 """Small scenes and comparisons shared by the rasteriser tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, RasterOutput
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 
 LSB = 1.0 / 255.0
 
 
-def splats(
-    means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.0, 0.0, 0.0)
-) -> GaussianCloud:
+def splats(means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.0, 0.0, 0.0)):
     """Build a cloud of plain colours; scalars and single rows are repeated."""
     means = np.atleast_2d(np.asarray(means, dtype=np.float64))
     n = len(means)
@@ -28,7 +24,7 @@ def splats(
     )
 
 
-def random_cloud(n: int, seed: int = 0, degree: int = 3) -> GaussianCloud:
+def random_cloud(n, seed=0, degree=3):
     """Return Gaussians of all shapes and opacities in front of the camera at the origin looking
     along z.
     """
@@ -42,15 +38,13 @@ def random_cloud(n: int, seed: int = 0, degree: int = 3) -> GaussianCloud:
     )
 
 
-def camera(
-    width: int = 96, height: int = 64, f: float = 80.0, T_camera_world=None
-) -> PinholeCamera:
+def camera(width=96, height=64, f=80.0, T_camera_world=None):
     """Return a camera with square pixels and a slightly off-centre principal point."""
     K = np.array([[f, 0, width / 2 + 1.3], [0, f, height / 2 - 0.7], [0, 0, 1]])
     return PinholeCamera(width, height, K, np.eye(4) if T_camera_world is None else T_camera_world)
 
 
-def random_rigid(seed: int, reach_m: float = 5.0) -> np.ndarray:
+def random_rigid(seed, reach_m=5.0):
     """Return a random rotation and translation."""
     rng = stream("raster-tests", seed, "pose")
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -62,9 +56,7 @@ def random_rigid(seed: int, reach_m: float = 5.0) -> np.ndarray:
     return T
 
 
-def assert_same_image(
-    found: RasterOutput, wanted: RasterOutput, tolerance: float = 2e-5, odd_share: float = 0.0
-) -> None:
+def assert_same_image(found, wanted, tolerance=2e-5, odd_share=0.0):
     """Compare colour, alpha and depth; ``odd_share`` of the pixels may differ by a documented
     discontinuity.
     """
@@ -80,12 +72,12 @@ def assert_same_image(
         )
 
 
-def needle(length_px: float, angle: float) -> GaussianCloud:
+def needle(length_px, angle):
     quat = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
     return splats([0.1, -0.05, 2.0], [[length_px / 40, 0.02, 0.003]], 0.9, quats=quat)
 
 
-def kilometre_splats() -> GaussianCloud:
+def kilometre_splats():
     rng = np.random.default_rng(0)
     means = rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600])
     return splats(means, 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))

@@ -4,18 +4,15 @@ trusted.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.cloud import logit, sigmoid
 from alpasim_plugin.gaussians.raster.rasterize_gradient import (
-    GradientOutput,
     Splats,
     rasterize_gradient,
 )
@@ -25,7 +22,7 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import (
 )
 
 
-def cloud_of(splats: Splats) -> GaussianCloud:
+def cloud_of(splats):
     """Return splats as a cloud: float64 means, other fields float32, quaternions normalised; all
     must be drawable.
     """
@@ -65,21 +62,21 @@ class Scene:
     background: tuple[float, float, float] = (0.3, 0.6, 0.2)
     depth_weight: float = _DEPTH_SHARE
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self):
         return {name: getattr(self, name) for name in FIELDS}
 
 
 def scene(
     means,
     scales,
-    cam: PinholeCamera,
+    cam,
     *,
     opacities=0.6,
     quaternions=None,
     sh=None,
-    seed: int = 0,
+    seed=0,
     **other,
-) -> Scene:
+):
     """Build a scene; what is not given is random, and every number is one that float32 can hold."""
     rng = stream("gradient-tests", seed, "scene")
     means = np.atleast_2d(np.asarray(means, float))
@@ -96,22 +93,20 @@ def scene(
     return Scene(*(a.astype(np.float32).astype(np.float64) for a in arrays), cam, **other)
 
 
-def weights_of(cam: PinholeCamera) -> np.ndarray:
+def weights_of(cam):
     """Return ``(H, W, 5)`` random weights of colour, alpha and depth: the loss is the weighted
     sum.
     """
     return stream("gradient-tests", 0, "weights").normal(size=(cam.height, cam.width, 5))
 
 
-def weighted(out: GradientOutput | object, s: Scene) -> Tensor:
+def weighted(out, s):
     """Return the loss of rendered tensors."""
     image = torch.cat([out.rgb, out.alpha[..., None], s.depth_weight * out.depth[..., None]], dim=2)  # type: ignore[attr-defined]
     return (image * torch.as_tensor(weights_of(s.camera), dtype=image.dtype)).sum()
 
 
-def kernel_gradients(
-    s: Scene, threads: int = 1, dtype: torch.dtype = torch.float32
-) -> tuple[Gradients, GradientOutput]:
+def kernel_gradients(s, threads=1, dtype=torch.float32):
     """Return the gradients of the compiled kernels, and the image that they belong to."""
     tensors = {
         k: torch.tensor(a, dtype=dtype if k == "means" else torch.float32).requires_grad_(True)
@@ -124,7 +119,7 @@ def kernel_gradients(
     return {name: t.grad.double().numpy() for name, t in leaves.items()}, out
 
 
-def reference_loss(s: Scene, values: dict[str, np.ndarray]) -> float:
+def reference_loss(s, values):
     """Return the loss of the float64 reference at other values of the parameters."""
     cloud = GaussianCloud(
         values["means"],
@@ -141,9 +136,7 @@ def reference_loss(s: Scene, values: dict[str, np.ndarray]) -> float:
     return float((image * weights_of(s.camera)).sum())
 
 
-def central_differences(
-    function: Callable[[], float], value: np.ndarray, step: float
-) -> np.ndarray:
+def central_differences(function, value, step):
     """Return the gradient of a function by an array that it reads, changing it in place and
     back.
     """
@@ -158,7 +151,7 @@ def central_differences(
     return out
 
 
-def numeric_gradients(s: Scene, step: float = 1e-6) -> Gradients:
+def numeric_gradients(s, step=1e-6):
     """Return central finite differences of the float64 reference."""
     values = {
         **{k: a.copy() for k, a in s.arrays().items()},
@@ -170,9 +163,7 @@ def numeric_gradients(s: Scene, step: float = 1e-6) -> Gradients:
     }
 
 
-def assert_close(
-    found: Gradients, wanted: Gradients, share: float, names=(*FIELDS, "background")
-) -> None:
+def assert_close(found, wanted, share, names=(*FIELDS, "background")):
     """Compare row by row: each Gaussian's error in a field is at most ``share`` of the largest
     gradient of that row and field.
     """

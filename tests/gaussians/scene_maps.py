@@ -2,15 +2,12 @@
 crossing.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import (
-    F64,
     Actor,
     Box,
     CameraSpec,
@@ -32,7 +29,7 @@ from alpasim_plugin.world.paint import with_default_paint
 LANE_M = 3.6
 
 
-def camera_spec(width: int = 256, height: int = 144, hfov_rad: float = 1.2) -> CameraSpec:
+def camera_spec(width=256, height=144, hfov_rad=1.2):
     """A forward camera 1.5 m above the ground, 1.7 m ahead of the rear axle."""
     f = width / (2 * np.tan(hfov_rad / 2))
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
@@ -42,7 +39,7 @@ def camera_spec(width: int = 256, height: int = 144, hfov_rad: float = 1.2) -> C
     return CameraSpec("front", width, height, K, T)
 
 
-def offset(line: F64, left_m: float) -> F64:
+def offset(line, left_m):
     """Shift a polyline sideways."""
     d = np.gradient(line[:, :2], axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -53,14 +50,14 @@ def offset(line: F64, left_m: float) -> F64:
 
 
 def road_lanes(
-    axis: F64,
-    name: str,
-    lanes_each_way: int = 2,
-    is_intersection: bool = False,
-    paint: bool = False,
-) -> dict[str, Lane]:
+    axis,
+    name,
+    lanes_each_way=2,
+    is_intersection=False,
+    paint=False,
+):
     """Lanes on both sides of a road's axis ``(N, 3)``; those on its right run along it."""
-    out: dict[str, Lane] = {}
+    out = {}
     for way, sign in (("a", -1.0), ("b", 1.0)):
         for i in range(lanes_each_way):
             inner, outer = offset(axis, sign * i * LANE_M), offset(axis, sign * (i + 1) * LANE_M)
@@ -82,16 +79,16 @@ def road_lanes(
 
 
 def make_scenario(
-    lane_map: LaneMap,
-    path: F64,
-    actors: tuple[Actor, ...] = (),
-    environment: Environment | None = None,
-    degradation: Degradation | None = None,
-    ground: HeightField | None = None,
-    scene_id: str = "test",
-    seed: int = 0,
-    speed_mps: float = 10.0,
-) -> Scenario:
+    lane_map,
+    path,
+    actors=(),
+    environment=None,
+    degradation=None,
+    ground=None,
+    scene_id="test",
+    seed=0,
+    speed_mps=10.0,
+):
     """A scenario whose ego drives along ``path (N, 3)``."""
     d = np.gradient(path[:, :2], axis=0)
     yaw = np.arctan2(d[:, 1], d[:, 0])
@@ -120,7 +117,7 @@ def make_scenario(
     )
 
 
-def line(start: tuple[float, float], end: tuple[float, float], step_m: float = 2.0) -> F64:
+def line(start, end, step_m=2.0):
     """A straight polyline on level ground."""
     a, b = np.array(start), np.array(end)
     n = max(2, int(np.linalg.norm(b - a) / step_m) + 1)
@@ -128,9 +125,7 @@ def line(start: tuple[float, float], end: tuple[float, float], step_m: float = 2
     return np.column_stack([xy, np.zeros(n)])
 
 
-def parked(
-    actor_id: str, x: float, y: float, yaw: float = 0.0, label: str = "car", box: Box | None = None
-) -> Actor:
+def parked(actor_id, x, y, yaw=0.0, label="car", box=None):
     """An actor that stands still."""
     b = box or Box(4.6, 1.9, 1.5)
     t = np.array([0, 60_000_000])
@@ -154,7 +149,7 @@ STREET_ACTORS = (
 )
 
 
-def straight(**kwargs: object) -> Scenario:
+def straight(**kwargs):
     """A straight street, two lanes each way, the ego in the inner right lane."""
     lanes = road_lanes(line((-60, 0), (220, 0)), "r")
     walk = np.array([[78.0, -7.2, 0], [81.0, -7.2, 0], [81.0, 7.2, 0], [78.0, 7.2, 0]])
@@ -166,7 +161,7 @@ def straight(**kwargs: object) -> Scenario:
     return make_scenario(lane_map, line((0, -1.8), (100, -1.8)), **kwargs)  # type: ignore[arg-type]
 
 
-def curve(radius_m: float = 60.0, **kwargs: object) -> Scenario:
+def curve(radius_m=60.0, **kwargs):
     """A left curve on a slope of 3 %."""
     a = np.linspace(-0.6, 2.2, 90)
     axis = np.column_stack([radius_m * np.sin(a), radius_m * (1 - np.cos(a)), np.zeros_like(a)])
@@ -177,9 +172,9 @@ def curve(radius_m: float = 60.0, **kwargs: object) -> Scenario:
     return make_scenario(LaneMap(road_lanes(axis, "c", 1)), path, ground=field, **kwargs)  # type: ignore[arg-type]
 
 
-def crossing(**kwargs: object) -> Scenario:
+def crossing(**kwargs):
     """Two streets that cross at the origin."""
-    lanes: dict[str, Lane] = {}
+    lanes = {}
     for name, angle in (("e", 0.0), ("n", np.pi / 2), ("w", np.pi), ("s", -np.pi / 2)):
         d = np.array([np.cos(angle), np.sin(angle)])
         lanes |= road_lanes(line(tuple(12 * d), tuple(150 * d)), name, 1)
@@ -189,6 +184,6 @@ def crossing(**kwargs: object) -> Scenario:
     return make_scenario(LaneMap(lanes), line((-70, -1.8), (40, -1.8)), **kwargs)  # type: ignore[arg-type]
 
 
-def with_camera(scenario: Scenario, width: int, height: int) -> Scenario:
+def with_camera(scenario, width, height):
     """The same scenario at another image size."""
     return replace(scenario, cameras=(camera_spec(width, height),))

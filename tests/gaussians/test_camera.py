@@ -1,7 +1,5 @@
 """Check the pinhole camera."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Build, clean, move and join clouds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Where a Gaussian file stands relative to the drive, and where it might belong."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

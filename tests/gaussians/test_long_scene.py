@@ -1,7 +1,5 @@
 """A drive that is built in sections: the same from wherever a camera came, and without seams."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -9,34 +7,32 @@ import pytest
 from scipy.spatial import KDTree
 
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene import builder, site
 from alpasim_plugin.gaussians.scene.builder import build_scene
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.world.ground import height_at
 from tests.gaussians.scene_maps import camera_spec, curve
 
 pytestmark = pytest.mark.slow
 
 
-def built(scenario: Scenario) -> SceneGraph:
+def built(scenario):
     return build_scene(scenario, partial(height_at, scenario.ground))
 
 
-def view(scenario: Scenario, index: int) -> PinholeCamera:
+def view(scenario, index):
     T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
     spec = camera_spec(64, 36)
     return PinholeCamera.from_pose(64, 36, spec.K, T @ spec.T_rig_camera)
 
 
-def content(graph: SceneGraph) -> bytes:
+def content(graph):
     clouds = [level.cloud for node in graph.background for level in node.levels]
     return b"".join(cloud.means.tobytes() + cloud.sh.tobytes() for cloud in clouds)
 
 
 @pytest.fixture
-def in_sections(monkeypatch: pytest.MonkeyPatch) -> Scenario:
+def in_sections(monkeypatch):
     """Give a street on a slope that is built in sections of 40 m, of which a view needs two."""
     monkeypatch.setattr(builder, "BUILT_WHOLE_M", 50.0)
     monkeypatch.setattr(builder, "SIGHT_M", 15.0)
@@ -44,7 +40,7 @@ def in_sections(monkeypatch: pytest.MonkeyPatch) -> Scenario:
     return curve()
 
 
-def test_a_section_is_the_same_wherever_the_camera_was_before(in_sections: Scenario) -> None:
+def test_a_section_is_the_same_wherever_the_camera_was_before(in_sections):
     first, last = view(in_sections, 0), view(in_sections, -1)
     there_and_back, fresh = built(in_sections), built(in_sections)
     there_and_back.render(first, {}, 1)
@@ -58,9 +54,7 @@ def test_a_section_is_the_same_wherever_the_camera_was_before(in_sections: Scena
     assert {node.name for node in there_and_back.background} == names
 
 
-def test_sections_join_without_a_hole_or_a_second_layer(
-    in_sections: Scenario, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sections_join_without_a_hole_or_a_second_layer(in_sections, monkeypatch):
     monkeypatch.setattr(builder, "SIGHT_M", 400.0)
     joined = built(in_sections)
     joined.render(view(in_sections, 0), {}, 1)

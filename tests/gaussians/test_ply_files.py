@@ -1,7 +1,5 @@
 """PLY reading and writing, on a trained model and on small made-up ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -37,7 +35,7 @@ def element(name, names, rows):
     return header, rows.astype("<f4").tobytes()
 
 
-def write_elements(path, *parts: tuple[str, bytes], fmt="binary_little_endian"):
+def write_elements(path, *parts, fmt="binary_little_endian"):
     head = (
         f"ply\nformat {fmt} 1.0\ncomment made by a test\n"
         + "".join(h for h, _ in parts)

@@ -2,8 +2,6 @@
 waits, launches and bytes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Check the compiled backward pass on hard cases against finite differences of the reference."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 countless splats, bad numbers.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Render prepared nodes: rigid poses, colour frames, culling, order, threads."""
 
-from __future__ import annotations
-
 import multiprocessing
 import pickle
 

@@ -2,8 +2,6 @@
 compile them for two generations of cards.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

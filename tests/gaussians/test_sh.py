@@ -1,7 +1,5 @@
 """Check the harmonics: orthonormality, signs, and rotation by sampled directions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -19,7 +19,7 @@ def camera(width, height, yaw_rad=0.0, x_m=0.0):
     return PinholeCamera.from_pose(width, height, K, se2(x_m, 0, yaw_rad) @ T_rig_camera)
 
 
-def view(alpha, **pose: float):
+def view(alpha, **pose):
     sky = (alpha <= 0.5).astype(np.float32)
     return SkyView(camera(alpha.shape[1], alpha.shape[0], **pose), sky)
 

@@ -2,8 +2,6 @@
 cannot be is said.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 

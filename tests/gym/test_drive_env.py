@@ -2,8 +2,6 @@
 how episodes end.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

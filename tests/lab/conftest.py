@@ -1,7 +1,5 @@
 """Collect the laboratory's tests only where its distribution is installed."""
 
-from __future__ import annotations
-
 from tests.alpasim.conftest import bundle, overrides  # noqa: F401 - fixtures
 from tests.block_fixers.conftest import weights  # noqa: F401 - a fixture
 from tests.laboratory import laboratory_is_installed

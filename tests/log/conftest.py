@@ -1,7 +1,5 @@
 """One rollout log written by us, as a file and as read back."""
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.log import read_asl

@@ -1,9 +1,5 @@
 """A small rollout in every kind of entry, for the tests of the log."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se2, se3
@@ -31,9 +27,7 @@ CAMERA = CameraSpec(
 )
 
 
-def straight(
-    n: int, speed_mps: float = 10.0, first_us: int = T0_US, y_m: float = 0.0, yaw_rad: float = 0.3
-) -> Trajectory:
+def straight(n, speed_mps=10.0, first_us=T0_US, y_m=0.0, yaw_rad=0.3):
     t_us = first_us + STEP_US * np.arange(n, dtype=np.int64)
     s = speed_mps * (t_us - first_us) / 1e6
     xyz = np.column_stack([s * np.cos(yaw_rad), y_m + s * np.sin(yaw_rad), np.full(n, 0.25)])
@@ -65,7 +59,7 @@ HEADER = RolloutHeader(
 )
 
 
-def present(t_us: int) -> dict[str, np.ndarray]:
+def present(t_us):
     out = {}
     for actor in ACTORS:
         i = np.flatnonzero(actor.track.t_us == t_us)
@@ -74,7 +68,7 @@ def present(t_us: int) -> dict[str, np.ndarray]:
     return out
 
 
-def ego_at(step: int) -> EgoState:
+def ego_at(step):
     log = HEADER.ego_log
     return EgoState(
         int(log.t_us[step]),
@@ -85,19 +79,19 @@ def ego_at(step: int) -> EgoState:
     )
 
 
-def picture(step: int) -> np.ndarray:
+def picture(step):
     y, x = np.mgrid[:40, :64]
     return np.stack([x * 3, y * 5, np.full_like(x, 20 * step)], axis=-1).astype(np.uint8)
 
 
-def plan_at(step: int) -> Trajectory:
+def plan_at(step):
     log = HEADER.ego_log
     return Trajectory(
         log.t_us[step : step + 6], log.xyz[step : step + 6], log.quat[step : step + 6]
     )
 
 
-def write_rollout(path: Path, encoding: str = "png") -> Path:
+def write_rollout(path, encoding="png"):
     """Write four steps in the order of AlpaSim's runtime; the driver's first answer is empty."""
     with AslWriter(path, HEADER) as log:
         log.begin([CAMERA])
@@ -126,7 +120,7 @@ def write_rollout(path: Path, encoding: str = "png") -> Path:
     return path
 
 
-def _frame(log: AslWriter, state: EgoState, encoding: str) -> None:
+def _frame(log, state, encoding):
     T = state.T_world_rig @ CAMERA.T_rig_camera
     T_start = state.T_world_rig @ se2(-0.3, 0, 0) @ CAMERA.T_rig_camera
     poses = np.stack([T_start, T])

@@ -1,7 +1,5 @@
 """AlpaSim's own logs, read into the same type as ours."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import lru_cache
 

@@ -2,8 +2,6 @@
 one.
 """
 
-from __future__ import annotations
-
 import os
 
 from alpasim_plugin.log.run_folder.checksums import checksums_of, problem_of

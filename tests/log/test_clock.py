@@ -2,8 +2,6 @@
 read as others are.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Damaged and foreign logs: what is read, what is refused, and in which words."""
 
-from __future__ import annotations
-
 import pickle
 import struct
 

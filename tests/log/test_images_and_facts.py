@@ -1,7 +1,5 @@
 """Camera images and the facts beside a log."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

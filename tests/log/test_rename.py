@@ -1,7 +1,5 @@
 """Copies of logs: byte-equal where nothing is renamed, and otherwise only what is asked for."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -2,8 +2,6 @@
 on the pages.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

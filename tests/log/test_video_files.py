@@ -1,7 +1,5 @@
 """MP4 files: exact times, colours within the codec's loss, odd sizes padded."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -2,8 +2,6 @@
 damaged, without pictures.
 """
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import av

@@ -1,7 +1,5 @@
 """Numbers on the wire: float32 poses, quaternion norms, and what is refused at writing."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

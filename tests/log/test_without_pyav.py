@@ -1,7 +1,5 @@
 """PyAV is loaded where a video is read or written and nowhere else."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, CameraSpec
 from policies.painted_road import SUPERSAMPLE, Colour, PaintedRoad
 
 
@@ -40,7 +39,7 @@ class BusyRoad(PaintedRoad):
     patches: tuple[Patch, ...] = ()
     blocks: tuple[Block, ...] = ()
 
-    def colours(self, s_m: F64, offset_m: F64) -> F32:
+    def colours(self, s_m, offset_m):
         out = super().colours(s_m, offset_m)
         on_road = (offset_m > self.road_m[0]) & (offset_m < self.road_m[1])
         for patch in self.patches:
@@ -53,13 +52,13 @@ class BusyRoad(PaintedRoad):
             out[on_road & inside] = patch.colour
         return out
 
-    def painted(self, camera: CameraSpec, T: F64) -> F32:
+    def painted(self, camera, T):
         image = super().painted(camera, T)
         for block in sorted(self.blocks, key=lambda b: -b.s_m):
             self._draw(image, camera.K, T, block)
         return image
 
-    def _draw(self, image: F32, K: F64, T_world_camera: F64, block: Block) -> None:
+    def _draw(self, image, K, T_world_camera, block):
         length, width, height = block.size_m
         ends = [
             (sx * length / 2, sy * width / 2, z, 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,45 +14,41 @@ from alpasim_plugin.core.geometry import (
     transform_points,
     yaw_of,
 )
-from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import (
     F64,
-    U8,
-    CameraSpec,
     EgoState,
     Frame,
     Observation,
     Plan,
     Route,
-    Scenario,
     Trajectory,
     Vehicle,
 )
 from policies.conformance import canned_scenario
-from policies.painted_road import PaintedRoad, pinhole_camera
+from policies.painted_road import pinhole_camera
 
 CAMERA = pinhole_camera()
 NO_ROUTE = np.full((20, 3), np.nan)
 
 
-def scenario_with(camera: CameraSpec = CAMERA) -> Scenario:
+def scenario_with(camera=CAMERA):
     return canned_scenario((camera,))
 
 
-def route_of(road: PaintedRoad, T_world_rig: F64, off_m: float = 0.0) -> F64:
+def route_of(road, T_world_rig, off_m=0.0):
     s, _ = road.coordinates(T_world_rig[0, 3], T_world_rig[1, 3])
     points = np.array([road.pose(float(s) + 80 / 19 * i, off_m)[:3, 3] for i in range(20)])
     return transform_points(inverse(T_world_rig), points)
 
 
 def observe(
-    rgb: U8,
-    ego: EgoState,
-    route_rig: F64 = NO_ROUTE,
-    history: Trajectory | None = None,
-    camera: CameraSpec = CAMERA,
-    age_us: int = 0,
-) -> Observation:
+    rgb,
+    ego,
+    route_rig=NO_ROUTE,
+    history=None,
+    camera=CAMERA,
+    age_us=0,
+):
     past = history or trajectory_from_poses([ego.t_us], ego.T_world_rig[None])
     return Observation(
         ego.t_us,
@@ -66,13 +61,13 @@ def observe(
 
 
 def look(
-    policy: Policy,
-    rgb: U8,
-    speed_mps: float = 10.0,
-    route_rig: F64 = NO_ROUTE,
-    times: int = 6,
-    camera: CameraSpec = CAMERA,
-) -> Plan:
+    policy,
+    rgb,
+    speed_mps=10.0,
+    route_rig=NO_ROUTE,
+    times=6,
+    camera=CAMERA,
+):
     """Show a still picture for a while to a policy that is told it stands still at that speed's
     plan, and return the last plan.
     """
@@ -95,24 +90,24 @@ class Drive:
 
 
 def close_loop(
-    policy: Policy,
-    road: PaintedRoad | Callable[[float], PaintedRoad],
-    speed_mps: float,
-    seconds: float,
-    offset_m: float = 0.0,
-    route_off_m: float = 0.0,
-    with_route: bool = True,
-    camera: CameraSpec = CAMERA,
-    seed: int = 0,
-) -> Drive:
+    policy,
+    road,
+    speed_mps,
+    seconds,
+    offset_m=0.0,
+    route_off_m=0.0,
+    with_route=True,
+    camera=CAMERA,
+    seed=0,
+):
     """Drive with the bicycle; ``road`` may depend on the time in seconds."""
     road_at = road if callable(road) else lambda _: road
     first = road_at(0.0)
     controller = make_controller("bicycle", Vehicle())
     ego = EgoState(0, first.pose(0.0, offset_m), speed_mps)
     policy.reset(seed, Route(np.array([first.pose(float(s))[:3, 3] for s in range(200)])))
-    seen: list[EgoState] = []
-    plans: list[Plan] = []
+    seen = []
+    plans = []
     for k in range(round(seconds * 10)):
         here = road_at(k * 0.1)
         seen.append(ego)
@@ -130,6 +125,6 @@ def close_loop(
     return Drive(s, offset, np.array([e.speed_mps for e in seen]), plans)
 
 
-def to_world(plan: Plan, T_world_rig: F64) -> Trajectory:
+def to_world(plan, T_world_rig):
     xyz = transform_points(T_world_rig, np.column_stack([plan.xy, np.zeros(len(plan.xy))]))
     return Trajectory(plan.times_us, xyz, quat_from_yaw(plan.yaw + yaw_of(T_world_rig)))

@@ -1,7 +1,5 @@
 """The camera policy really drives by its pixels: change them and the plan changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,16 +2,13 @@
 it in files.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import Photograph, Scenario
+from alpasim_plugin.core.types import Photograph
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
@@ -23,7 +20,7 @@ EXPOSURE = 1.2  # of the fitted photographs
 WIDE, HIGH = 64, 48
 
 
-def recorded_drive(folder: Path, count: int = 9) -> Scenario:
+def recorded_drive(folder, count=9):
     """Write a model and photographs every 0.2 s, the fourth held out, and of a right camera 0.5 m
     beside; return the scenario.
     """
@@ -46,9 +43,7 @@ def recorded_drive(folder: Path, count: int = 9) -> Scenario:
     return replace(scenario, model=str(folder / "model"), recording=shots)
 
 
-def _photograph(
-    scenario: Scenario, folder: Path, camera: str, i: int, aside_m: float
-) -> Photograph:
+def _photograph(scenario, folder, camera, i, aside_m):
     spec, t_us = scenario.cameras[0], int(scenario.ego_log.t_us[0]) + 200_000 * i
     shift = np.eye(4)
     shift[1, 3] = aside_m

@@ -2,8 +2,6 @@
 recording's exposure and frames.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

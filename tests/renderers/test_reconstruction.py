@@ -2,8 +2,6 @@
 pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import permutations
 

@@ -2,8 +2,6 @@
 reconstruction believes that they were taken.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

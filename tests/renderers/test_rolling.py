@@ -2,8 +2,6 @@
 rig, a passing car.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Weather: what distance, water and lamps do to light, and who is shown it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drive an installed Chromium over its debugging pipe: no driver package, no port, no download."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -10,9 +8,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -36,7 +31,7 @@ LAUNCH = (
 )
 
 
-def find_chromium() -> str | None:
+def find_chromium():
     """Return the path of an installed Chromium, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
@@ -44,7 +39,7 @@ def find_chromium() -> str | None:
 class Browser:
     """One page in a fresh profile; everything that the page requests, logs or throws is kept."""
 
-    def __init__(self, executable: str) -> None:
+    def __init__(self, executable):
         self._profile = tempfile.TemporaryDirectory(
             prefix="simrun-chromium-", ignore_cleanup_errors=True
         )
@@ -64,8 +59,8 @@ class Browser:
         os.close(from_browser)
         self._buffer = b""
         self._next = 0
-        self.requests: list[str] = []
-        self.complaints: list[str] = []
+        self.requests = []
+        self.complaints = []
         targets = self._call("Target.getTargets", session=None)["targetInfos"]
         page = next(t["targetId"] for t in targets if t["type"] == "page")
         self._session = self._call(
@@ -74,15 +69,15 @@ class Browser:
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         return self
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+        kind,
+        error,
+        traceback,
+    ):
         os.killpg(self._process.pid, signal.SIGTERM)
         try:
             self._process.wait(10)
@@ -93,15 +88,15 @@ class Browser:
         os.close(self._write)
         self._profile.cleanup()
 
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
+    def call(self, method, **params):
         """Call a method of the page."""
         return self._call(method, session=self._session, **params)
 
-    def open(self, path: Path, width: int = 1400, height: int = 900, dark: bool = False) -> None:
+    def open(self, path, width=1400, height=900, dark=False):
         """Open a file and wait until it is loaded."""
         self.visit(path.resolve().as_uri(), width, height, dark)
 
-    def visit(self, url: str, width: int = 1400, height: int = 900, dark: bool = False) -> None:
+    def visit(self, url, width=1400, height=900, dark=False):
         """Open an address and wait until it is loaded."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -125,7 +120,7 @@ class Browser:
                 raise TimeoutError(f"{url} did not load in {PATIENCE_S} s")
             time.sleep(0.05)
 
-    def press(self, key: str, code: int = 0, shift: bool = False) -> None:
+    def press(self, key, code=0, shift=False):
         """Press and release a key as a person does, with what the page's element in focus makes of
         it.
         """
@@ -134,7 +129,7 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyDown", **stroke, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", **stroke)
 
-    def evaluate(self, expression: str) -> Any:
+    def evaluate(self, expression):
         """Evaluate JavaScript in the page and return its value."""
         answer = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
@@ -143,9 +138,9 @@ class Browser:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
 
-    def _call(self, method: str, session: str | None, **params: Any) -> dict[str, Any]:
+    def _call(self, method, session, **params):
         self._next += 1
-        message: dict[str, Any] = {"id": self._next, "method": method, "params": params}
+        message = {"id": self._next, "method": method, "params": params}
         if session:
             message["sessionId"] = session
         os.write(self._write, json.dumps(message).encode() + b"\0")
@@ -157,7 +152,7 @@ class Browser:
                 return dict(answer["result"])
             self._note(answer)
 
-    def _receive(self) -> dict[str, Any]:
+    def _receive(self):
         while b"\0" not in self._buffer:
             chunk = os.read(self._read, 1 << 20)
             if not chunk:
@@ -166,7 +161,7 @@ class Browser:
         message, _, self._buffer = self._buffer.partition(b"\0")
         return dict(json.loads(message))
 
-    def _note(self, event: dict[str, Any]) -> None:
+    def _note(self, event):
         method, params = event.get("method"), event.get("params", {})
         if method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])

@@ -8,8 +8,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -70,7 +68,7 @@ class Plan:
     rng_seed: int = 7
 
 
-def make_run(folder: Path, plan: Plan | None = None) -> Path:
+def make_run(folder, plan=None):
     """Write a run folder and return it."""
     plan = plan or Plan()
     rng = np.random.default_rng(plan.rng_seed)
@@ -102,7 +100,7 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
     return folder
 
 
-def _write_flips(folder: Path, plan: Plan) -> None:
+def _write_flips(folder, plan):
     """Write when plans parted for every flip, as the runtime does from the logs; the second one has
     no answer.
     """
@@ -147,16 +145,16 @@ def _write_flips(folder: Path, plan: Plan) -> None:
     )
 
 
-def _slug(name: str) -> str:
+def _slug(name):
     return "".join(c if c.isalnum() or c in "._@+-" else "-" for c in name).strip("-.") or "unnamed"
 
 
-def _json(path: Path, value: Any) -> None:
+def _json(path, value):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(value, indent=1, allow_nan=False))
 
 
-def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
+def _scene(scene, index, plan):
     length_m = 8.0 * plan.steps * 0.1
     s = np.linspace(-15, length_m + 30, 160)
     bend = (0.0, 0.014, -0.006, 0.003)[index % 4]
@@ -209,19 +207,19 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     }
 
 
-def _smooth(rng: np.random.Generator, n: int) -> np.ndarray:
+def _smooth(rng, n):
     """Make a wandering curve of about unit size."""
     knots = rng.normal(0, 1, 9)
     return np.interp(np.linspace(0, 8, n), np.arange(9), knots) if n < 4 else _cubic(knots, n)
 
 
-def _cubic(knots: np.ndarray, n: int) -> np.ndarray:
+def _cubic(knots, n):
     return np.asarray(CubicSpline(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, n)))
 
 
 def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type: ignore[no-untyped-def]
     key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed}
-    row: dict[str, Any] = key | {
+    row = key | {
         "path": f"rollouts/{_slug(renderer)}/{_slug(policy)}/{_slug(scene)}/{seed}",
         "wall_s": round(float(rng.uniform(2.0, 6.0)), 3),
         "frames": plan.steps,
@@ -271,7 +269,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         for k in range(plan.steps)
     ]
     collided = bool(hit[:end].any())
-    values: dict[str, float | None] = {
+    values = {
         "collision_any": float(collided),
         "collision_at_fault": float(collided),
         "collision_front": 0.0,
@@ -325,7 +323,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
     return row, steps
 
 
-def _files(folder: Path, row: dict[str, Any], content: dict[str, Any], plan: Plan) -> None:
+def _files(folder, row, content, plan):
     place = folder / row["path"]
     place.mkdir(parents=True, exist_ok=True)
     manifest = {"status": row["status"], "path": row["path"], "events": []}
@@ -334,7 +332,7 @@ def _files(folder: Path, row: dict[str, Any], content: dict[str, Any], plan: Pla
         (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
 
 
-def _picture(renderer: str, k: int, width: int, height: int) -> np.ndarray:
+def _picture(renderer, k, width, height):
     image = np.zeros((height, width, 3), np.uint8)
     horizon = int(height * 0.45)
     image[:horizon] = np.linspace((225, 190, 150), (240, 225, 205), horizon)[:, None]
@@ -373,7 +371,7 @@ def _picture(renderer: str, k: int, width: int, height: int) -> np.ndarray:
     return image
 
 
-def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
+def _write_rows(folder, rows):
     fields = [
         ("renderer", pa.string()),
         ("policy", pa.string()),
@@ -394,7 +392,7 @@ def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), folder / "rollouts.parquet")
 
 
-def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
+def _write_steps(folder, steps):
     fields = [
         ("renderer", pa.string()),
         ("policy", pa.string()),
@@ -414,7 +412,7 @@ def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
     )
 
 
-def summary_of(rows: list[dict[str, Any]], plan: Plan, table: RolloutTable) -> dict[str, Any]:
+def summary_of(rows, plan, table):
     """Aggregate as the runtime does."""
     own = {policy: [r for r in rows if r["policy"] == policy] for policy in plan.policies}
     failed = [r for r in rows if r["status"] != "ok"]
@@ -458,7 +456,7 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan, table: RolloutTable) -> d
     }
 
 
-def _failed(row: dict[str, Any]) -> dict[str, Any]:
+def _failed(row):
     error = {
         "message": f"camera front <script>: {row['failure']}",
         "hint": "run with --set guard=off",
@@ -466,7 +464,7 @@ def _failed(row: dict[str, Any]) -> dict[str, Any]:
     return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
 
 
-def _run_json(plan: Plan, maps: dict[str, Any]) -> dict[str, Any]:
+def _run_json(plan, maps):
     return {
         "schema_version": 1,
         "command": [

@@ -1,12 +1,9 @@
 """The block of every rollout: what is packed is what the tables say, and it stays small."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import gzip
 import json
-from typing import Any
 from urllib.parse import unquote
 
 import pytest
@@ -24,7 +21,7 @@ from evaluators.report.rollouts import (
 
 def unpacked(data):
     """Read a block as the page's script does."""
-    document: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(data)))
+    document = json.loads(gzip.decompress(base64.b64decode(data)))
     return document
 
 

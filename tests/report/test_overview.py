@@ -2,14 +2,11 @@
 gate.md.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json
 import re
 from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -32,12 +29,12 @@ from tests.report.make_run import Plan, make_run
 PRIMARY = METRICS.primary
 
 
-def pair(diff, low, high, verdict, **more: Any):
+def pair(diff, low, high, verdict, **more):
     entry = {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01}
     return entry | {"verdict": verdict, "margin": 0.02, "n_scenes": 3} | more
 
 
-def with_pairs(folder, **tables: Any):
+def with_pairs(folder, **tables):
     """Return a run of one policy with these tables of primary differences."""
     run = read_run(folder)
     shown = {

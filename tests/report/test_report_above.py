@@ -1,9 +1,5 @@
 """The maps from above: what is drawn is where and when it was."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -17,12 +13,12 @@ VARIANTS = {("a", "p"): (0, 0)}
 X = np.linspace(0, 50, 51)
 
 
-def scene(x, y, **more: Any):
+def scene(x, y, **more):
     vehicle = {"length_m": 4.8, "width_m": 1.9, "rear_axle_to_centre_m": 1.4}
     return {"ego_log": {"x_m": list(x), "y_m": list(y)}, "vehicle": vehicle} | more
 
 
-def series_of(x, y, **more: Any):
+def series_of(x, y, **more):
     names = {"ego_x_m": x, "ego_y_m": y, "ego_yaw_rad": 0.0 * np.asarray(x)} | more
     t_us = np.arange(len(x)) * 100_000
     return {name: (t_us, np.array(values, float)) for name, values in names.items()}

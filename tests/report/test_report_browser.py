@@ -1,7 +1,5 @@
 """The report in a real browser, opened from disk. Slow: needs an installed Chromium."""
 
-from __future__ import annotations
-
 import pytest
 
 from evaluators.report.html import write_report

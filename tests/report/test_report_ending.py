@@ -1,7 +1,5 @@
 """The last lines of a run on the terminal."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from evaluators.metrics.outcomes import outcomes_of

@@ -1,7 +1,5 @@
 """What a report says of fixers: untrained ones, refused frames, hit rates."""
 
-from __future__ import annotations
-
 from evaluators.report.fixers import fixer_cautions
 
 DRAFTED = {

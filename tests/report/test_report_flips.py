@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -13,11 +11,11 @@ from evaluators.report.flips import find_flips, flip_rows
 from evaluators.report.html import write_report
 
 
-def rollout(renderer, seed=0, status="ok", **metrics: float):
+def rollout(renderer, seed=0, status="ok", **metrics):
     return Rollout(renderer, "p", "s", seed, status, metrics=metrics)
 
 
-def run_of(*rollouts: Rollout):
+def run_of(*rollouts):
     return Run(Path(), {"renderers": ["clean", "3dgs"]}, {}, rollouts, ())
 
 

@@ -1,7 +1,5 @@
 """The gate at the head of the report: verdict, baseline, every check, the worst scenes first."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

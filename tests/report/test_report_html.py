@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import re
 from html.parser import HTMLParser
@@ -20,11 +18,11 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.ids: list[str] = []
-        self.handlers: list[str] = []
+        self.open = []
+        self.tags = []
+        self.addresses = []
+        self.ids = []
+        self.handlers = []
         self.text = ""
         self.feed(text)
         self.close()

@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import json
 import re
-from typing import Any
 
 from evaluators.numbers import DASH
 from evaluators.opening import read_run
@@ -12,7 +9,7 @@ from evaluators.report.tables import metric_rows, pair_rows
 from evaluators.report.terminal import metric_lines
 
 
-def entry(mean: float | None, **more: Any) -> dict[str, Any]:
+def entry(mean, **more):
     base = {
         "mean": mean,
         "ci95": 0.0192,

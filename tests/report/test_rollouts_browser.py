@@ -2,8 +2,6 @@
 installed Chromium.
 """
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 from policies.simple import LogReplay
 
 
@@ -17,17 +17,17 @@ class Raises:
 
     sensors: tuple[SensorSpec, ...] = ()
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         pass
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         raise ValueError("no weights")
 
 
 class KillsItsProcess(Raises):
     """Dies as under the out-of-memory killer."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         os.kill(os.getpid(), signal.SIGKILL)
         raise AssertionError("unreachable")
 
@@ -35,7 +35,7 @@ class KillsItsProcess(Raises):
 class MissesItsWeights(Raises):
     """Cannot be made."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         raise FileNotFoundError("weights.pt")
 
 
@@ -46,11 +46,11 @@ class RemembersEarlierRollouts(Raises):
 
     lives = 0
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         type(self).lives += 1
-        self.start_us: int | None = None
+        self.start_us = None
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         self.start_us = observation.t_us if self.start_us is None else self.start_us
         times = observation.t_us + np.arange(0, 2_000_001, 500_000, dtype=np.int64)
         seconds = (times - observation.t_us) * 1e-6
@@ -70,7 +70,7 @@ class RemembersEarlierRollouts(Raises):
 class ShiversByTheClock(LogReplay):
     """Drives the recording but for some millimetres to the side, by the clock: not repeatable."""
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         plan = super().act(observation)
         aside = np.array([0.0, 1e-3 * (time.monotonic_ns() % 11)])
         return Plan(plan.t_us, plan.times_us, plan.xy + aside, plan.yaw)

@@ -21,7 +21,6 @@ from alpasim_plugin.core.types import (
     LaneMap,
     Latency,
     Rates,
-    RolloutLog,
     Route,
     Scenario,
     Trajectory,
@@ -45,13 +44,13 @@ SMALL = Plan(
 
 
 def straight_track(
-    x0_m: float,
-    y_m: float,
-    z_m: float,
-    speed_mps: float,
-    duration_s: float,
-    period_us: int = 10_000,
-) -> Trajectory:
+    x0_m,
+    y_m,
+    z_m,
+    speed_mps,
+    duration_s,
+    period_us=10_000,
+):
     """Return a track along x at constant speed."""
     t_us = np.arange(0, int(duration_s * 1e6) + 1, period_us, dtype=np.int64)
     x = x0_m + speed_mps * t_us * 1e-6
@@ -64,7 +63,7 @@ def straight_road():
     """Give 3 s at 10 m/s in the right lane of a straight road; 1 s of it is warm-up."""
     x = np.linspace(-50.0, 250.0, 151)
 
-    def line(y_m: float) -> np.ndarray:
+    def line(y_m):
         return np.stack([x, np.full_like(x, y_m), np.zeros_like(x)], axis=1)
 
     lanes = {
@@ -132,7 +131,7 @@ class Watched:
     folder: Path
     run: Run
 
-    def log(self, renderer: str) -> RolloutLog:
+    def log(self, renderer):
         return read_asl(
             self.folder
             / "rollouts"
@@ -143,7 +142,7 @@ class Watched:
             / "rollout.asl"
         )
 
-    def metrics(self, renderer: str) -> dict[str, list[tuple[int, float]]]:
+    def metrics(self, renderer):
         (rollout,) = (r for r in self.run.rollouts if (r.renderer, r.seed) == (renderer, 0))
         (own,) = series_by_cell(self.run.steps_of(rollout)).values()
         return {

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import yaw_of
-from alpasim_plugin.core.types import F64, Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 from policies.lane_camera import LaneCamera
 from policies.simple import PurePursuit
 
@@ -19,26 +18,26 @@ class Follower(PurePursuit):
 
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         super().reset(seed, route)
         self.queries = 0
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         self.queries += 1
         return self.spoil(super().act(observation), observation)
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return plan
 
 
 class WorldFrame(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         T = observation.ego.T_world_rig
         return replace(plan, xy=plan.xy @ T[:2, :2].T + T[:2, 3], yaw=plan.yaw + yaw_of(T))
 
 
 class WorldAxes(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         T = observation.ego.T_world_rig
         return replace(plan, xy=plan.xy @ T[:2, :2].T, yaw=plan.yaw + yaw_of(T))
 
@@ -46,58 +45,58 @@ class WorldAxes(Follower):
 class NotANumber(Follower):
     """Divides by the yaw rate, which is zero on a straight."""
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         xy = plan.xy.copy()
         xy[5:] *= np.nan if self.queries > 20 else 1.0
         return replace(plan, xy=xy)
 
 
 class RaisesInNumpy(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         gaps = np.hypot(*plan.xy.T)[self.queries * 3 :]
         return replace(plan, debug={"nearest": np.argmin(gaps)})  # the line to name
 
 
 class RaisesAtFrame30(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         if self.queries == 30:
             raise RuntimeError("thirty")
         return plan
 
 
 class TimeStep(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.t_us + 2 * (plan.times_us - plan.t_us))
 
 
 class SpeedDoubled(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=2 * plan.xy)
 
 
 class Centimetres(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=100 * plan.xy)
 
 
 class SwappedAxes(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, xy=plan.xy[:, ::-1].copy(), yaw=np.pi / 2 - plan.yaw)
 
 
 class EmptyPlan(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         return replace(plan, times_us=plan.times_us[:0], xy=plan.xy[:0], yaw=plan.yaw[:0])
 
 
 class ConstantPlan(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         x = 8.0e-6 * (plan.times_us - plan.t_us)
         return replace(plan, xy=np.stack([x, 0.02 * x], axis=1), yaw=0 * x + 0.02)
 
 
 class Jitter(Follower):
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         side = np.random.Generator(np.random.Philox(self.queries)).choice([-14.0, 14.0])
         x = plan.xy[:, 0]
         y = plan.xy[:, 1] + side * np.minimum(x / 20.0, 1.0) ** 2
@@ -112,7 +111,7 @@ class OtherCamera(Follower):
 class StopsForever(Follower):
     """Stops for something that it sees at once, and never goes on."""
 
-    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+    def spoil(self, plan, observation):
         reach_m = np.hypot(*plan.xy.T)
         room_m = observation.ego.speed_mps**2 / 6.0
         share = np.minimum(1.0, room_m / np.maximum(reach_m[-1], 0.1))
@@ -130,14 +129,14 @@ class BlindToCars(Follower):
 class Looker(LaneCamera):
     """Looks at lane markings and cars."""
 
-    def seen(self, observation: Observation) -> Observation:
+    def seen(self, observation):
         return observation
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         return super().act(self.seen(observation))
 
 
-def changed(observation: Observation, change: Any) -> Observation:
+def changed(observation, change):
     """Return an observation with changed images."""
     frames = {
         name: replace(frame, rgb=change(frame.rgb)) for name, frame in observation.frames.items()
@@ -146,23 +145,23 @@ def changed(observation: Observation, change: Any) -> Observation:
 
 
 class MirroredImages(Looker):
-    def seen(self, observation: Observation) -> Observation:
+    def seen(self, observation):
         return changed(observation, lambda rgb: rgb[:, ::-1].copy())
 
 
 class IgnoresRoute(Looker):
-    def seen(self, observation: Observation) -> Observation:
+    def seen(self, observation):
         return replace(observation, route_rig=np.full_like(observation.route_rig, np.nan))
 
 
 class LateImages(Looker):
     """Looks at images of 0.8 s ago as if they were new."""
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         super().reset(seed, route)
-        self.waiting: list[Observation] = []
+        self.waiting = []
 
-    def seen(self, observation: Observation) -> Observation:
+    def seen(self, observation):
         self.waiting = [*self.waiting, observation][-9:]
         frames = {
             name: replace(frame, t_us=observation.frames[name].t_us)
@@ -175,7 +174,7 @@ class LateImages(Looker):
 class BrakesLate(Looker):
     """Believes what is ahead to be twice as far away."""
 
-    def _obstacle_now(self, observation: Observation) -> Any:
+    def _obstacle_now(self, observation):
         track = super()._obstacle_now(observation)
         return None if track is None else replace(track, distance_m=3.0 * track.distance_m + 10.0)
 
@@ -185,14 +184,14 @@ class ByYellow(Looker):
 
     AHEAD_M, BESIDE_M = 7.0, 1.8
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario):
         super().__init__(scenario)
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         c = self.camera
         p = np.linalg.inv(c.T_rig_camera) @ [self.AHEAD_M, 0.0, 0.0, 1.0]
         row = round(float(c.K[1, 1] * p[1] / p[2] + c.K[1, 2]))
-        rows: F64 = self.seen(observation).frames[c.name].rgb[row - 2 : row + 3].astype(float)
+        rows = self.seen(observation).frames[c.name].rgb[row - 2 : row + 3].astype(float)
         red, _, blue = rows.mean(axis=0).T
         columns = np.flatnonzero(red - blue > 45)
         left_m = 0.0
@@ -200,7 +199,7 @@ class ByYellow(Looker):
             left_m = -(columns.mean() - c.K[0, 2]) * p[2] / c.K[0, 0] - self.BESIDE_M
         t = 0.1 * np.arange(41)
         bend = 2 * left_m / self.AHEAD_M**2
-        x: F64 = observation.ego.speed_mps * t
+        x = observation.ego.speed_mps * t
         times = observation.t_us + (1e6 * t).astype(np.int64)
         return Plan(
             observation.t_us, times, np.stack([x, bend * x**2 / 2], axis=1), np.asarray(bend * x)
@@ -208,12 +207,12 @@ class ByYellow(Looker):
 
 
 class SwappedChannels(ByYellow):
-    def seen(self, observation: Observation) -> Observation:
+    def seen(self, observation):
         return changed(observation, lambda rgb: rgb[..., ::-1].copy())
 
 
 # Scenario -> policy -> a word of the sentence that must stand first
-FAULTS: dict[str, dict[type[PurePursuit] | type[LaneCamera], str]] = {
+FAULTS = {
     "bend": {
         WorldFrame: "not the world's",
         WorldAxes: "in the rig frame x is forward",

@@ -1,10 +1,8 @@
 """A policy that drives by how bright its camera is: what a renderer shows decides where it goes."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Plan, SensorSpec
 
 BY_GREY = "tests.runs.grey_policy:DrivesByGrey"
 
@@ -16,10 +14,10 @@ class DrivesByGrey:
 
     sensors = (SensorSpec("front", 300_000),)
 
-    def reset(self, seed: int, route: Route) -> None:
+    def reset(self, seed, route):
         self.seed = seed
 
-    def act(self, observation: Observation) -> Plan:
+    def act(self, observation):
         times = observation.t_us + np.arange(0, 2_000_001, 500_000, dtype=np.int64)
         seconds = (times - observation.t_us) * 1e-6
         dark = (

@@ -2,11 +2,9 @@
 show.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from alpasim_plugin.core.types import Frame, RenderRequest
+from alpasim_plugin.core.types import Frame
 
 GREY = "tests.runs.grey_renderer:Grey"
 
@@ -16,7 +14,7 @@ class Grey:
 
     level = 90
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         shape = (request.camera.height, request.camera.width, 3)
         return Frame(request.t_us, request.camera.name, np.full(shape, self.level, dtype=np.uint8))
 

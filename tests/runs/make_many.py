@@ -7,7 +7,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,13 +46,13 @@ class Many:
     more: Mapping[str, Any] = field(default_factory=dict)
 
 
-def make_one(root: Path, one: Many) -> Path:
+def make_one(root, one):
     """Write a finished run folder below ``root`` and return it."""
     folder = root / one.name
     rows = rows_of(one)
     write_run_json(folder, info_of(one) | {"outcome": {"n_rollouts": len(rows), "n_failed": 0}})
     write_table(folder / "rollouts.parquet", rows, ROLLOUTS_TABLE.arrow(METRICS))
-    metrics: dict[str, Any] = {}
+    metrics = {}
     for policy in one.policies:
         found = aggregate([row for row in rows if row["policy"] == policy])
         metrics |= (
@@ -70,7 +69,7 @@ def make_one(root: Path, one: Many) -> Path:
     return folder
 
 
-def rows_of(one: Many) -> list[dict[str, Any]]:
+def rows_of(one):
     """Draw the rollouts: a cell's own part is the same in all runs and behind all renderers, so
     that pairs are sharp.
     """
@@ -107,7 +106,7 @@ def rows_of(one: Many) -> list[dict[str, Any]]:
     return rows
 
 
-def info_of(one: Many) -> dict[str, Any]:
+def info_of(one):
     """Return ``run.json`` as a run writes it, as far as lists and trends read it."""
     project = {
         "commit": one.commit,
@@ -161,14 +160,14 @@ def info_of(one: Many) -> dict[str, Any]:
     return info | dict(one.more)
 
 
-def unfinish(folder: Path) -> Path:
+def unfinish(folder):
     """Turn a finished run folder into one that was stopped."""
     for name in ("summary.json", "rollouts.parquet"):
         (folder / name).unlink()
     return folder
 
 
-def copies(folder: Path, count: int) -> None:
+def copies(folder, count):
     """Copy a run folder beside itself, ``count`` times."""
     for k in range(count):
         shutil.copytree(folder, folder.with_name(f"{folder.name}-{k:04d}"))

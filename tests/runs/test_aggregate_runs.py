@@ -1,7 +1,5 @@
 """Several runs aggregated as one: parts of a night give what the whole night gives."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 (docs/experiments/verdict-error.md).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Frames are rendered only when the policy takes them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Renderer names, and what of a fixer enters a run's content keys."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,9 +1,6 @@
 """What is driven and rendered once: rollouts without a camera, and the past of a fork."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +8,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.interfaces import Renderer, complete
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
+from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer, run_cell
 from alpasim_plugin.runs.fork import SwitchedRenderer
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from policies.simple import ConstantVelocity
 from scenarios.suite import expand
@@ -36,7 +33,7 @@ class Counts(Grey):
 
     frames = 0
 
-    def render(self, request: RenderRequest) -> Frame:
+    def render(self, request):
         self.frames += 1
         return super().render(request)
 
@@ -44,33 +41,31 @@ class Counts(Grey):
 class SeesAfterAll(ConstantVelocity):
     """Has a camera, which its class does not declare."""
 
-    def reset(self, seed: int, route: object) -> None:
+    def reset(self, seed, route):
         self.sensors = (SensorSpec("front"),)
 
-    def __init__(self, scenario: object) -> None:
+    def __init__(self, scenario):
         self.sensors = (SensorSpec("front"),)
 
 
-def plan_of(
-    policy: str = "constant-velocity", renderers: tuple[str, ...] = (GREY, DARKER), **options: str
-) -> RunPlan:
+def plan_of(policy="constant-velocity", renderers=(GREY, DARKER), **options):
     refs = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
     return make_plan(refs, renderers, (policy,), (0,), RunOptions(**options))  # type: ignore[arg-type]
 
 
-def drive(plan: RunPlan, root: Path, workers: int = 1) -> tuple[dict, Announced]:
+def drive(plan, root, workers=1):
     announced = Announced()
     run = execute_run(plan, root, workers, ["simrun"], announced, report=False)
     return run.summary, announced
 
 
-def origins(root: Path) -> dict[str, str | None]:
+def origins(root):
     """Return the renderer and scene of each rollout with the rollout that it was copied from."""
     manifests = [read_manifest(path.parent) for path in sorted(root.rglob("manifest.json"))]
     return {f"{m['renderer'][-6:]} {m['scene']}": m.get("copied_from") for m in manifests}
 
 
-def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path: Path) -> None:
+def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
     plan = plan_of()
     summary, _ = drive(plan, tmp_path / "run", workers=2)
     assert summary["copies"] == 2
@@ -92,7 +87,7 @@ def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path: Path) -> N
     assert [row["copied_from"] is not None for row in rows] == [False, True] * 2
 
 
-def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path: Path) -> None:
+def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path):
     plan = plan_of()
     drive(plan, tmp_path)
     made = origins(tmp_path)
@@ -108,7 +103,7 @@ def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path: Pa
     assert inspect_run(tmp_path, full=True).damage == ()
 
 
-def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: Path) -> None:
+def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path):
     plan = plan_of(video="all")
     drive(plan, tmp_path / "all")
     for cell, level in zip(plan.cells, (Grey.level, Darker.level) * 2, strict=True):
@@ -121,25 +116,25 @@ def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_policy_that_has_a_camera_after_all_drives_behind_each_renderer(tmp_path: Path) -> None:
+def test_a_policy_that_has_a_camera_after_all_drives_behind_each_renderer(tmp_path):
     plan = plan_of(SEES)
     drive(plan, tmp_path)
     assert set(origins(tmp_path).values()) == {None}
     assert {reused for _, reused in drive(plan, tmp_path)[1].results} == {True}
 
 
-def test_a_rollout_that_failed_is_not_copied(tmp_path: Path) -> None:
+def test_a_rollout_that_failed_is_not_copied(tmp_path):
     plan = plan_of("tests.runs.broken_policies:Raises")
     summary, _ = drive(plan, tmp_path)
     assert (summary["copies"], summary["failures"]["n_failed"]) == (0, 4)
 
 
-def test_the_first_renderer_drives_and_another_one_alone_drives_itself(tmp_path: Path) -> None:
+def test_the_first_renderer_drives_and_another_one_alone_drives_itself(tmp_path):
     drive(plan_of(renderers=(DARKER,)), tmp_path)
     assert set(origins(tmp_path).values()) == {None}
 
 
-def test_a_fork_shows_the_past_only_to_a_renderer_with_a_history() -> None:
+def test_a_fork_shows_the_past_only_to_a_renderer_with_a_history():
     early, late = (SimpleNamespace(t_us=t_us, camera=SMALL) for t_us in (0, 200_000))
     for has_history in (True, False):
         first, then = (complete(make(), Renderer) for make in (Counts, Counts))
@@ -151,7 +146,7 @@ def test_a_fork_shows_the_past_only_to_a_renderer_with_a_history() -> None:
         assert (first.frames, then.frames) == (1, has_history + 1)
 
 
-def test_clean_has_no_history(straight_road: Scenario) -> None:
+def test_clean_has_no_history(straight_road):
     requests = [recorded_requests(straight_road, straight_road.start_us + t) for t in (0, 500_000)]
     (alone,) = make_renderer("clean", straight_road).render_batch(requests[1][:1])
     renderer = make_renderer("clean", straight_road)

@@ -2,8 +2,6 @@
 and as a gate.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -42,7 +40,7 @@ class Looks(Announced):
 
     def __init__(self):
         super().__init__()
-        self.looks: list[tuple[int, str]] = []
+        self.looks = []
 
     def looked(self, state, rollouts, ceiling):
         self.looks.append((state.n_scenes, state.answer))

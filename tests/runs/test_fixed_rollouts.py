@@ -14,7 +14,6 @@ from alpasim_plugin import run_rollout
 from alpasim_plugin.core.errors import FixerError, InputError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
-    CameraSpec,
     Frame,
     Latency,
     RenderRequest,
@@ -46,8 +45,8 @@ class Watching(LogReplay):
     sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
 
     def reset(self, seed, route):
-        self.seen: list[Frame] = []
-        self.asked: list[int] = []
+        self.seen = []
+        self.asked = []
 
     def act(self, observation):
         self.asked.append(observation.t_us)
@@ -84,17 +83,17 @@ def drive(
     scenario,
     policy=Watching,
     fixer=Blend,
-    **settings: object,
+    **settings,
 ):
-    fixers: list[Blend] = []
+    fixers = []
 
     def make():
         fixers.append(fixer())
         return fixers[-1]
 
     session = session_of(scenario, make, **settings)
-    calls: list[list[RenderRequest]] = []
-    frames: list[Frame] = []
+    calls = []
+    frames = []
     inner = session.render_batch
 
     def watched(requests):
@@ -109,7 +108,7 @@ def drive(
     return Drive(done, session, fixers, driver, [r for call in calls for r in call], frames, calls)
 
 
-def session_of(scenario, make, **settings: object):
+def session_of(scenario, make, **settings):
     base = make_renderer("clean", scenario, 0, threads=1)
     return fixed_renderer(base.render, make, FixerSettings(name="test", **settings), scenario, 1)  # type: ignore[arg-type]
 
@@ -209,7 +208,7 @@ def with_rear_camera(scenario):
     front = scenario.cameras[0]
     turned = front.T_rig_camera.copy()
     turned[:2, :3] *= -1
-    rear: CameraSpec = replace(front, name="rear", T_rig_camera=turned)
+    rear = replace(front, name="rear", T_rig_camera=turned)
     return replace(scenario, cameras=(front, rear))
 
 

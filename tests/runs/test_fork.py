@@ -1,7 +1,5 @@
 """Going back into a logged rollout and continuing it."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 
@@ -66,7 +64,7 @@ def changed(past, tmp_path_factory):
     return folder
 
 
-def go(past, root, **change: object):
+def go(past, root, **change):
     return fork_rollout(past, Change(AT_US, **change), root, ["simrun", "fork"])  # type: ignore[arg-type]
 
 

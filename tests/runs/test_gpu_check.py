@@ -1,7 +1,5 @@
 """The check of a card, tried on the CPU: its sections, and how it reports those that fail."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

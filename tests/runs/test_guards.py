@@ -1,7 +1,5 @@
 """What a renderer or a policy returns against its contract is that part's failure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which plan is in force when."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.types import Latency, Trajectory

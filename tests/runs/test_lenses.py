@@ -1,7 +1,5 @@
 """A run sees its cameras through their lenses, whoever renders."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +16,7 @@ class Directions(Renderer):
 
     def __init__(self, scenario):
         self.scenario = scenario
-        self.asked: list[RenderRequest] = []
+        self.asked = []
 
     def render(self, request):
         """Paint one frame."""

@@ -2,8 +2,6 @@
 takes.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -47,7 +45,7 @@ def root(tmp_path_factory):
     return root
 
 
-def listed(capsys, *words: str):
+def listed(capsys, *words):
     """Return name -> run of a list, in its order."""
     capsys.readouterr()
     assert run_command(["list", "runs", *words, "--json"]) == 0

@@ -1,7 +1,5 @@
 """Workers that die, hang or lose their parent cost their own item and nothing else."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -2,8 +2,6 @@
 log.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil
@@ -29,7 +27,7 @@ def read(path):
     """Return messages, topic -> schema, and the metadata, after the reader has checked every
     CRC.
     """
-    found: Messages = defaultdict(list)
+    found = defaultdict(list)
     schemas, before = {}, 0
     with path.open("rb") as stream:
         reader = mcap_reader.make_reader(stream, validate_crcs=True)

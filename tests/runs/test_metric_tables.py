@@ -2,8 +2,6 @@
 quantity may not.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

@@ -2,8 +2,6 @@
 fixing the same frames afterwards.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """The commit of the user's project, asked of real repositories."""
 
-from __future__ import annotations
-
 import subprocess
 
 import pytest
@@ -11,7 +9,7 @@ from alpasim_plugin.runs.provenance import project
 WHO = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
 
 
-def git(folder, *words: str):
+def git(folder, *words):
     return subprocess.run(
         ["git", *WHO, *words], cwd=folder, check=True, capture_output=True, text=True
     ).stdout.strip()

@@ -3,8 +3,6 @@
 `pytest -m slow tests/runs/test_ray.py`: a cluster's start takes most of the time.
 """
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """States read off a recording, at the ends of the log too."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 memory that does not grow.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 
@@ -12,7 +10,6 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.types import Frame
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 from alpasim_plugin.runs.refine import RefineFiles, refine_video
 
@@ -28,8 +25,8 @@ class Inverting:
 
     def __init__(self, rule=BlockRule(5, 8)):
         self.blocks = rule
-        self.sizes: list[int] = []
-        self.seen: list[Frame] = []
+        self.sizes = []
+        self.seen = []
 
     def reset(self, seed):
         self.sizes, self.seen = [], []

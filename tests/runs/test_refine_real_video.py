@@ -2,11 +2,8 @@
 the same camera beside it.
 """
 
-from __future__ import annotations
-
 import json
 from fractions import Fraction
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,10 +31,10 @@ def small(source, to, size, frames):
     return to
 
 
-def refine(capsys, *arguments: Path | str):
+def refine(capsys, *arguments):
     untrained = ["--set", "fixer.weights.bundle=null", "--set", "fixer.holes=render"]
     assert run_command(["refine", *map(str, arguments), *untrained, "--json"]) == 0
-    document: dict[str, object] = json.loads(capsys.readouterr().out)
+    document = json.loads(capsys.readouterr().out)
     return document
 
 

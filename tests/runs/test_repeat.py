@@ -1,7 +1,5 @@
 """`run --repeat`: a rollout of each policy is driven twice and the two logs are compared."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -17,7 +15,7 @@ SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
 FORGETFUL = "tests.runs.broken_policies:RemembersEarlierRollouts"
 
 
-def plan_of(policies, *overrides: str):
+def plan_of(policies, *overrides):
     refs = [
         *expand("smoke/lead_car", (LONGER, *BARE, *overrides)),
         *expand("smoke/straight", (SHORT, *BARE, *overrides)),

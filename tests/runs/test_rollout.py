@@ -1,7 +1,5 @@
 """The loop, with the real renderer, policies, vehicle and log."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 

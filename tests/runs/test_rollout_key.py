@@ -2,8 +2,6 @@
 same ones elsewhere are not.
 """
 
-from __future__ import annotations
-
 import shutil
 
 import pytest
@@ -32,7 +30,7 @@ def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path, monkey
     assert keys()[1] != seeing
 
 
-def fixed_key(*overrides: str):
+def fixed_key(*overrides):
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
     return (
         make_plan(

@@ -2,12 +2,9 @@
 as before.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +15,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.atomic import temporary_path
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.writer import remove_left_overs
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import default_folder, execute_run
 from scenarios.suite import expand
 from tests.runs.test_runs import Announced, comparable
@@ -26,14 +23,14 @@ from tests.runs.test_runs import Announced, comparable
 CELL = "rollouts/clean/constant-velocity/smoke-straight/0"
 
 
-def plan_of(seeds: tuple[int, ...] = (0, 1)) -> RunPlan:
+def plan_of(seeds=(0, 1)):
     refs = expand("smoke/straight", ("timing.duration_us=600000",))
     return make_plan(
         refs, ("clean", "broken-black"), ("constant-velocity",), seeds, RunOptions(images="none")
     )
 
 
-def run(root: Path, plan: RunPlan | None = None) -> Announced:
+def run(root, plan=None):
     announced = Announced()
     execute_run(
         plan or plan_of(),
@@ -60,21 +57,21 @@ def root(made, tmp_path):
     return Path(shutil.copytree(made, tmp_path / "run", copy_function=shutil.copyfile))
 
 
-def remove(path: Path) -> None:
+def remove(path):
     path.unlink()
 
 
-def cut(path: Path) -> None:
+def cut(path):
     os.truncate(path, path.stat().st_size // 2)
 
 
-def flip(path: Path) -> None:
+def flip(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(bytes(data))
 
 
-def becomes(text: str) -> Callable[[Path], None]:
+def becomes(text):
     return lambda path: path.write_text(text) and None  # type: ignore[return-value]
 
 
@@ -123,7 +120,7 @@ def test_the_same_command_makes_only_the_damaged_rollout_again(
     assert run(root).notices == []
 
 
-def lengthen(path: Path) -> None:
+def lengthen(path):
     """Change a file so that a JSON document still says the same."""
     path.write_bytes(path.read_bytes() + b"\n")
 
@@ -202,7 +199,7 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root):
 
 
 def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root):
-    def named(pid: int, at: Path = root / CELL) -> Path:
+    def named(pid, at=root / CELL):
         return at / temporary_path(Path("a.json")).name.replace(f".{os.getpid()}.", f".{pid}.")
 
     gone = [named(2**22 + 1), named(2**22 + 2, root), named(2**22 + 3, root)]

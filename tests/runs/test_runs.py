@@ -2,8 +2,6 @@
 scenes.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -31,8 +29,8 @@ class Announced:
     """Remembers what a run announced."""
 
     def __init__(self):
-        self.results: list[tuple[str, bool]] = []
-        self.notices: list[str] = []
+        self.results = []
+        self.notices = []
 
     def started(self, plan, root, threads):
         self.threads = threads

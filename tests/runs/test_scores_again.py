@@ -2,8 +2,6 @@
 nothing is driven again.
 """
 
-from __future__ import annotations
-
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand

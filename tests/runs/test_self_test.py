@@ -2,8 +2,6 @@
 not.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.cli.main import run_command

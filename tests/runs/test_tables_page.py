@@ -2,11 +2,8 @@
 statistics.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -39,7 +36,7 @@ def run(folder, monkeypatch):
     return read_run(folder / "runs" / "mine")
 
 
-def rows(repo: Path, number: int) -> list[dict[str, Any]]:
+def rows(repo, number):
     page = (repo / "docs" / "runs.md").read_text(encoding="utf-8")
     queries = re.findall(r"^```sql\n(.*?)^```", page, re.S | re.M)
     found = duckdb.execute(queries[number])

@@ -1,7 +1,5 @@
 """Searches for a boundary over real rollouts: found, continued, out of range, and refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64
-
 
 @dataclass(frozen=True)
 class FTheta:
@@ -38,7 +36,7 @@ class RecordedLens:
     )
 
 
-def lens_of(values: F64) -> RecordedLens:
+def lens_of(values):
     """Make a lens of its calibration; the direction that is not given is fitted over the image.
 
     Args:
@@ -68,11 +66,11 @@ def lens_of(values: F64) -> RecordedLens:
     return RecordedLens(float(cx), float(cy), int(width), int(height), lens, backward)
 
 
-def _polynomial(x: F64, coefficients: F64) -> F64:
+def _polynomial(x, coefficients):
     return np.asarray(np.polynomial.polynomial.polyval(x, coefficients), dtype=np.float64)
 
 
-def _fit(x: F64, y: F64) -> F64:
+def _fit(x, y):
     """Return six coefficients of the least-squares inverse through the origin (constant term
     zero).
     """
@@ -82,7 +80,7 @@ def _fit(x: F64, y: F64) -> F64:
     return np.concatenate([[0.0], coefficients / scale ** np.arange(1, 6)])
 
 
-def project_ftheta(camera: RecordedLens, points: F64) -> F64:
+def project_ftheta(camera, points):
     """Project camera-frame points ``(N, 3)`` to pixels ``(N, 2)`` of the recorded image; NaN beyond
     the lens's largest angle.
 

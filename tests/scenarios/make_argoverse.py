@@ -2,8 +2,6 @@
 and a crossing actor.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

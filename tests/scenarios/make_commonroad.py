@@ -2,8 +2,6 @@
 drive along them.
 """
 
-from __future__ import annotations
-
 
 def points(*xy):
     return "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in xy)

@@ -1,12 +1,8 @@
 """Write small AlpaSim scenes: two straight lanes along x, one parked and one moving track."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,25 +13,25 @@ START_US = 1_689_697_803_493_732
 LANE_M = 3.6
 
 
-def rail(y: float, n: int = 5, as_struct: bool = False) -> Any:
+def rail(y, n=5, as_struct=False):
     xs = np.linspace(-20.0, 100.0, n)
     if as_struct:
         return {"x": xs.tolist(), "y": [y] * n, "z": [0.0] * n}
     return [{"x": float(x), "y": y, "z": 0.0} for x in xs]
 
 
-def parquet(rows: list[dict], schema: pa.Schema | None = None) -> bytes:
+def parquet(rows, schema=None):
     sink = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), sink)
     return sink.getvalue()
 
 
-def key(name: str, **more: str) -> dict:
+def key(name, **more):
     return {"clip_id": "c", "map_id": name, **more}
 
 
-def tables(as_struct: bool = False) -> dict[str, bytes]:
-    def lane(i: int, y: float) -> dict:
+def tables(as_struct=False):
+    def lane(i, y):
         left, right = (rail(y + side * LANE_M / 2, as_struct=as_struct) for side in (1, -1))
         return {"key": key(f"L{i}"), "lane": {"left_rail": left, "right_rail": right}}
 
@@ -70,7 +66,7 @@ def tables(as_struct: bool = False) -> dict[str, bytes]:
     return {f"clipgt/{name}.parquet": parquet(table) for name, table in rows.items()}
 
 
-def rig(n: int = 60, **more: Any) -> dict:
+def rig(n=60, **more):
     t_us = [START_US + 100_000 * i for i in range(n)]
     poses = [
         [[1.0, 0, 0, 8.0 * 0.1 * i], [0, 1.0, 0, 0.0], [0, 0, 1.0, 0.0], [0, 0, 0, 1.0]]
@@ -86,7 +82,7 @@ def rig(n: int = 60, **more: Any) -> dict:
     return {"T_world_base": np.eye(4).tolist(), "rig_trajectories": [own]} | more
 
 
-def sequence() -> dict:
+def sequence():
     t_us = [START_US, START_US + 4_000_000]
     parked = [[40.0, LANE_M, 0.75, 0, 0, 0, 1.0], [40.0, LANE_M, 0.75, 0, 0, 0, 1.0]]
     moving = [
@@ -108,7 +104,7 @@ def sequence() -> dict:
     }
 
 
-def members(scene_id: str = "small") -> dict[str, bytes]:
+def members(scene_id="small"):
     meta = {"scene_id": scene_id, "version_string": "1", "sensors": {"camera_ids": []}}
     return {
         "metadata.yaml": yaml.safe_dump(meta).encode(),
@@ -118,7 +114,7 @@ def members(scene_id: str = "small") -> dict[str, bytes]:
     }
 
 
-def write(path: Path, content: dict[str, bytes] | None = None) -> Path:
+def write(path, content=None):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as z:
         for name, data in (members() if content is None else content).items():
             z.writestr(name, data)

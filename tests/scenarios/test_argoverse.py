@@ -1,7 +1,5 @@
 """Argoverse 2 logs made by hand: every part of a log arrives where it belongs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

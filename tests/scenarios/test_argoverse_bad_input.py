@@ -1,7 +1,5 @@
 """Argoverse 2 folders that are no log: each is refused with its file and what was found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Three recorded Argoverse 2 logs: the reader's world against published facts about them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -2,8 +2,6 @@
 do.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.core.errors import InputError

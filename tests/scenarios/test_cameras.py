@@ -1,7 +1,5 @@
 """The cameras of a scenario file: sections, shipped rigs, calibrations, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -5,10 +5,6 @@ Small maps are made here. The real one is compared with facts, and with the libr
 is installed.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -22,31 +18,31 @@ ROAD = {"type": "lanelet", "subtype": "road"}
 SOLID = {"type": "line_thin", "subtype": "solid"}
 
 
-def tags(values: dict[str, str]) -> str:
+def tags(values):
     return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in values.items())
 
 
-def node(key: int, x: float, y: float) -> str:
+def node(key, x, y):
     return f'<node id="{key}" lat="" lon="">{tags({"local_x": str(x), "local_y": str(y)})}</node>'
 
 
-def way(key: int, *nodes: int, **more: str) -> str:
+def way(key, *nodes, **more):
     listed = "".join(f'<nd ref="{n}"/>' for n in nodes)
     return f'<way id="{key}">{listed}{tags(more)}</way>'
 
 
-def relation(key: int, members: list[tuple[str, str, int]], more: dict[str, str]) -> str:
+def relation(key, members, more):
     listed = "".join(f'<member type="{t}" role="{r}" ref="{i}"/>' for t, r, i in members)
     return f'<relation id="{key}">{listed}{tags(more)}</relation>'
 
 
-def lanelet(key: int, left: int, right: int, *rules: int, **more: str) -> str:
+def lanelet(key, left, right, *rules, **more):
     members = [("way", "left", left), ("way", "right", right)]
     members += [("relation", "regulatory_element", rule) for rule in rules]
     return relation(key, members, {**ROAD, **more})
 
 
-def places(x0: float = 1000.0) -> list[str]:
+def places(x0=1000.0):
     """Three rows of nodes 3.5 m apart, at 0, 150 and 300 m: 11 12 13, 21 22 23, 31 32 33."""
     return [
         node(10 * row + column, x0 + 150.0 * (column - 1), 3.5 * row)
@@ -78,13 +74,13 @@ STREET = (
 )
 
 
-def written(folder: Path, parts: tuple[str, ...]) -> Path:
+def written(folder, parts):
     file = folder / "map.osm"
     file.write_text(f"<osm version='0.6'>{''.join(parts)}</osm>", encoding="utf-8")
     return file
 
 
-def street(folder: Path, parts: tuple[str, ...] = STREET):
+def street(folder, parts=STREET):
     return read_street(SourceFiles(), written(folder, parts))
 
 
@@ -121,7 +117,7 @@ def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_pa
 
 
 def test_latitude_and_longitude_become_east_and_north(tmp_path):
-    def globe(text: str) -> str:
+    def globe(text):
         return text.replace('lat="" lon=""', 'lat="{}" lon="{}"')
 
     nodes = [

@@ -1,7 +1,5 @@
 """Every shipped scenario: it loads, its expert drives cleanly, and its parts fit together."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

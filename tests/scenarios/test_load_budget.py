@@ -2,8 +2,6 @@
 bounded.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from alpasim_plugin.core.config import load_yaml

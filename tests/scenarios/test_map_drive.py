@@ -3,9 +3,6 @@
 Every map is made here.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,14 +18,14 @@ from scenarios.street_map import with_cycles
 from tests.files.test_opendrive import lane, road, section
 
 
-def light(i: str, s: float, more: str = "", kind: str = "1000001", t: float = -5.0) -> str:
+def light(i, s, more="", kind="1000001", t=-5.0):
     return (
         f'<signal id="{i}" s="{s}" t="{t}" type="{kind}" dynamic="yes" orientation="+" '
         f'zOffset="0" height="3" width="0.4">{more}</signal>'
     )
 
 
-def with_signals(text: str, *signals: str) -> str:
+def with_signals(text, *signals):
     return text.replace("</road>", f"<signals>{''.join(signals)}</signals></road>")
 
 
@@ -36,7 +33,7 @@ STOP = '<signal id="stop" s="90" t="0" type="294" dynamic="no" orientation="+" z
 BOTH = (lane(1, 1, 1), lane(-1, -1, -1))
 
 
-def two_roads(*signals: str) -> tuple[str, ...]:
+def two_roads(*signals):
     """Two straights of 100 m and 300 m, one behind the other."""
     first = road("1", section(0, *BOTH), length=100, after="road:2:start")
     return (
@@ -45,13 +42,13 @@ def two_roads(*signals: str) -> tuple[str, ...]:
     )
 
 
-def scenario(folder: Path, parts: tuple[str, ...], *overrides: str, seed: int | None = None):
+def scenario(folder, parts, *overrides, seed=None):
     file = folder / "map.xodr"
     file.write_text(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>", encoding="utf-8")
     return load_scenario(file, seed, ("map.vehicles=0", *overrides))
 
 
-def named(start: str, goal: str) -> tuple[str, str]:
+def named(start, goal):
     return f"map.route.from={start}", f"map.route.to={goal}"
 
 
@@ -133,7 +130,7 @@ def test_the_expert_waits_at_the_stop_line_and_who_drives_on_is_caught(tmp_path)
     assert signal.colour_at(on_free_road_us) == "red"
 
 
-def junction_of(*parts: str) -> str:
+def junction_of(*parts):
     links = '<laneLink from="-1" to="-1"/>'
     connection = (
         f'<connection incomingRoad="1" connectingRoad="2" contactPoint="start">{links}</connection>'

@@ -2,8 +2,6 @@
 links, AlpaSim's rule, real maps.
 """
 
-from __future__ import annotations
-
 import csv
 from xml.etree import ElementTree
 
@@ -52,14 +50,14 @@ def road(
     return f'<road id="{i}" length="{length}" junction="-1" {more}>{before}<planView>{view}</planView><lanes>{sections}</lanes></road>'
 
 
-def parsed(*roads: str, header=""):
+def parsed(*roads, header=""):
     return parse_map(
         "map.xodr",
         ElementTree.fromstring(f"<OpenDRIVE>{header}{''.join(roads)}</OpenDRIVE>"),
     )
 
 
-def lanes_of(*roads: str):
+def lanes_of(*roads):
     return lane_map_of("map.xodr", parsed(*roads), np.eye(4))[0]
 
 

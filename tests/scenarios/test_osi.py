@@ -4,10 +4,7 @@ Small traces are made here. The real ones are compared with facts and with a tab
 made of one of them.
 """
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ from scenarios.osi_messages import message_classes
 TRUTH, VIEW = message_classes()
 
 
-def moving(message, key: int, x: float, y: float, yaw: float = 0.0, kind: int = 2) -> None:
+def moving(message, key, x, y, yaw=0.0, kind=2):
     one = message.moving_object.add(type=kind)
     one.id.value = key
     size, place = one.base.dimension, one.base.position
@@ -28,7 +25,7 @@ def moving(message, key: int, x: float, y: float, yaw: float = 0.0, kind: int = 
     one.base.orientation.yaw = yaw
 
 
-def lane(message, key: int, y: float, forward: bool) -> None:
+def lane(message, key, y, forward):
     """Add a lane 3 m wide from x = 0 to 200 m, with borders of its own."""
     one = message.lane.add()
     one.id.value = key
@@ -46,7 +43,7 @@ def lane(message, key: int, y: float, forward: bool) -> None:
             border.boundary_line[-1].position.y = y + 1.5 * side
 
 
-def messages(host: int | None = 7, lanes: bool = True) -> list:
+def messages(host=7, lanes=True):
     out = []
     for step in range(30):
         message = TRUTH()
@@ -64,7 +61,7 @@ def messages(host: int | None = 7, lanes: bool = True) -> list:
     return out
 
 
-def written(folder: Path, parts: list, name: str = "trace.osi") -> Path:
+def written(folder, parts, name="trace.osi"):
     blocks = [part.SerializeToString() for part in parts]
     file = folder / name
     file.write_bytes(b"".join(len(b).to_bytes(4, "little") + b for b in blocks))
@@ -106,7 +103,7 @@ def test_without_host_and_lanes_the_first_vehicle_drives_on_its_own_path(tmp_pat
     assert made.lane_map.road_edges
 
 
-def broken(change) -> list:
+def broken(change):
     parts = messages()
     change(parts)
     return parts

@@ -1,7 +1,5 @@
 """The committed JSON Schema and the documented keys are those of the code."""
 
-from __future__ import annotations
-
 import json
 import re
 

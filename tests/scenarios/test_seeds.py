@@ -2,8 +2,6 @@
 declared ranges.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Suites: files, folders, names, seeds and overrides."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

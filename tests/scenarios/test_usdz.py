@@ -2,8 +2,6 @@
 in.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 import zipfile
@@ -32,7 +30,7 @@ from tests.scenarios.make_usdz import (
 from tests.scenarios.usdz_scene import read_usdz_scene
 
 
-def changed(**parts: bytes | None):
+def changed(**parts):
     """The small scene with members replaced, added, or (None) left out; __ stands for the slash,
     _dot_ for the dot.
     """

@@ -2,8 +2,6 @@
 every source.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What scorers see of a scene of AlpaSim."""
 
-from __future__ import annotations
-
 from alpasim_plugin.core.types import Scene
 from scenarios.usdz import read_usdz
 

@@ -2,15 +2,10 @@
 their own time.
 """
 
-from __future__ import annotations
-
 import json
 import operator
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
@@ -20,7 +15,6 @@ from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, Trajectory, Vehicle
 from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
-from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.opening import read_run
 from tests.report.make_run import DT_US, Plan, make_run
 
@@ -38,9 +32,7 @@ WATCHED = Plan(
 POSES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
 
 
-def make_watched(
-    folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: Sequence[str] = ("front",)
-) -> Path:
+def make_watched(folder, plan=WATCHED, actors=6, cameras=("front",)):
     """Write a run folder whose finished rollouts have logs, and return it.
 
     Args:
@@ -66,7 +58,7 @@ def make_watched(
     return folder
 
 
-def ego_of(steps: Any) -> Trajectory:
+def ego_of(steps):
     """Return the rig poses in a rollout's table of steps."""
     rows = steps.to_pylist()
     x, y, yaw = (
@@ -77,13 +69,13 @@ def ego_of(steps: Any) -> Trajectory:
 
 
 def write_log(
-    place: Path,
-    rollout: Rollout,
-    content: Mapping[str, Any],
-    ego: Trajectory,
-    actors: int,
-    cameras: Sequence[str],
-) -> None:
+    place,
+    rollout,
+    content,
+    ego,
+    actors,
+    cameras,
+):
     """Write ``rollout.asl`` and ``frames.jsonl``."""
     header = RolloutHeader(
         scene_id=rollout.scene,
@@ -132,7 +124,7 @@ def write_log(
     )
 
 
-def road_users(content: Mapping[str, Any], t_us: Any, count: int, salt: int) -> Sequence[Actor]:
+def road_users(content, t_us, count, salt):
     """Make road users beside the recorded drive; every third one goes its own way behind every
     renderer.
     """
@@ -159,14 +151,14 @@ def road_users(content: Mapping[str, Any], t_us: Any, count: int, salt: int) -> 
     return out
 
 
-def picture(k: int) -> np.ndarray:
+def picture(k):
     """Paint a frame that says which it is."""
     bits = [255 if k >> (BARS - 1 - bit) & 1 else 0 for bit in range(BARS)]
     row = np.repeat(np.array(bits, np.uint8), CAMERA.width // BARS)
     return np.repeat(np.tile(row, (CAMERA.height, 1))[..., None], 3, axis=2)
 
 
-def write_manifests(folder: Path) -> None:
+def write_manifests(folder):
     """Give every rollout the manifest that a run writes, as far as readers of a running run need
     it.
     """
@@ -188,7 +180,7 @@ def write_manifests(folder: Path) -> None:
         write_manifest(place, manifest)
 
 
-def unfinished(folder: Path, without: Sequence[str]) -> dict[str, bytes]:
+def unfinished(folder, without):
     """Turn a run folder into one that is still written: no tables, and these rollouts have no
     manifest yet.
 

@@ -2,8 +2,6 @@
 Chromium.
 """
 
-from __future__ import annotations
-
 import time
 from urllib.parse import quote
 

@@ -1,7 +1,5 @@
 """Small maps made by hand, for tests of maps, routes and readers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.geometry import centre_line

@@ -2,8 +2,6 @@
 closed.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -43,7 +41,7 @@ def line_track(
     )
 
 
-def idm(actor_id, x0, speed, **params: float):
+def idm(actor_id, x0, speed, **params):
     behaviour = Behaviour("idm", {"desired_speed_mps": max(speed, 1.0), **params})
     return Actor(actor_id, "car", BOX, line_track(x0, speed), behaviour=behaviour)
 
@@ -53,7 +51,7 @@ def ego_at(x, speed=0.0):
 
 
 def run(actors, ego, end_us, step_us=100_000):
-    out: dict[str, list[float]] = {}
+    out = {}
     for t in range(0, end_us + 1, step_us):
         for name, pose in actors.step(t, ego).items():
             out.setdefault(name, []).append(float(pose[0, 3]))

@@ -1,7 +1,5 @@
 """Road users who wait for the ego, and those who act against it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from scenarios.load import load_scenario
 STEP_US = 100_000
 
 
-def scene(folder, actor: str):
+def scene(folder, actor):
     file = folder / "scene.yaml"
     file.write_text(
         "version: 1\nroad: {lanes_forward: 2, segments: [{kind: straight, length_m: 300}]}\n"
@@ -25,7 +23,7 @@ def scene(folder, actor: str):
     return load_scenario(file)
 
 
-def driven(made, speed_mps: float):
+def driven(made, speed_mps):
     """Drive the ego straight ahead at a speed; return times, its front, and the actor's places."""
     actors = make_actors(made)
     begin = made.ego_log.xyz[0]

@@ -1,7 +1,5 @@
 """The driver model and the choice of a leader."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

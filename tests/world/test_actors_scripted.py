@@ -1,7 +1,5 @@
 """Scripted tracks: speeds, lane changes, walkers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

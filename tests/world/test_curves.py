@@ -1,7 +1,5 @@
 """Clothoids against Fresnel integrals, connectors between headings, and projection onto paths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Procedural roads: valid lanes, no seams, shared edges, and a main road that runs through."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

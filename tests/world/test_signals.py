@@ -1,7 +1,5 @@
 """Where a driver has to let others pass."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ LINE = Signal(np.array([[-2.0, -6.0, 0.0], [2.0, -6.0, 0.0]]), np.pi / 2, ())
 BOX = Box(4.6, 1.85, 1.5)
 
 
-def gap(x: float, y: float, speed_mps: float, heading: float, own: int = -1, front: float = 30.0):
+def gap(x, y, speed_mps, heading, own=-1, front=30.0):
     along = np.array([np.cos(heading), np.sin(heading)])
     bodies = bodies_from(np.array([x, y]), np.array([heading]), [BOX], speed_mps * along)
     return give_way_gap_m(lights_on(NORTH, [LINE]), NORTH, front, bodies, own)

@@ -1,7 +1,5 @@
 """Inputs that once gave way: each writes a scenario and returns its path."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -15,8 +13,8 @@ ROAD = "version: 1\nroad: {lanes_forward: 1, segments: [{kind: straight, length_
 Make = Callable[[Path], Path]
 
 
-def yaml(text: str) -> Make:
-    def make(folder: Path) -> Path:
+def yaml(text):
+    def make(folder):
         path = folder / "scene.yaml"
         path.write_text(text)
         return path
@@ -24,25 +22,25 @@ def yaml(text: str) -> Make:
     return make
 
 
-def road_of(length: str) -> Make:
+def road_of(length):
     return yaml(ROAD % length)
 
 
-def actors(text: str) -> Make:
+def actors(text):
     return yaml(ROAD % 400 + f"actors: [{text}]\n")
 
 
-def surroundings(text: str) -> Make:
+def surroundings(text):
     return yaml(ROAD % 200 + f"environment: {{{text}}}\n")
 
 
-def parked(n: int) -> Make:
+def parked(n):
     row = "{kind: parked, id: p%d, s_m: %.1f, count: 40, spacing_m: 7, label: car}"
     return actors(", ".join(row % (i, 10 + 0.01 * i) for i in range(n // 40)))
 
 
-def xodr(length: str = "400", geometry: str = "<line/>", s: str = "0") -> Make:
-    def make(folder: Path) -> Path:
+def xodr(length="400", geometry="<line/>", s="0"):
+    def make(folder):
         lane = '<lane id="-1" type="driving"><width sOffset="0" a="3.6" b="0" c="0" d="0"/></lane>'
         back = lane.replace('id="-1"', 'id="1"')
         view = f'<geometry s="{s}" x="-20" y="1.8" hdg="0" length="{length}">{geometry}</geometry>'
@@ -55,8 +53,8 @@ def xodr(length: str = "400", geometry: str = "<line/>", s: str = "0") -> Make:
     return make
 
 
-def tracks(**change: object) -> Make:
-    def make(folder: Path) -> Path:
+def tracks(**change):
+    def make(folder):
         content = make_usdz.members()
         sequence = make_usdz.sequence()
         for key, value in change.items():
@@ -68,8 +66,8 @@ def tracks(**change: object) -> Make:
     return make
 
 
-def cuboid_width(width: float) -> Make:
-    def make(folder: Path) -> Path:
+def cuboid_width(width):
+    def make(folder):
         rows = make_argoverse.cuboids(make_argoverse.TRACKS)
         rows["width_m"] = [width] * len(rows["width_m"])
         return make_argoverse.write_argoverse(folder / "log", annotations=rows)
@@ -77,8 +75,8 @@ def cuboid_width(width: float) -> Make:
     return make
 
 
-def commonroad_time(time_step: str) -> Make:
-    def make(folder: Path) -> Path:
+def commonroad_time(time_step):
+    def make(folder):
         states = make_commonroad.drive(20, 0)
         states[0] = states[0].replace(
             "<exact>0</exact></time>", f"<exact>{time_step}</exact></time>"
@@ -90,8 +88,8 @@ def commonroad_time(time_step: str) -> Make:
     return make
 
 
-def png_header(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
+def png_header(width, height):
+    def chunk(kind, data):
         return (
             struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         )
@@ -101,15 +99,15 @@ def png_header(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
-def pipe(name: str) -> Make:
-    def make(folder: Path) -> Path:
+def pipe(name):
+    def make(folder):
         os.mkfifo(folder / name)
         return folder / name
 
     return make
 
 
-SEEN: dict[str, Make] = {
+SEEN = {
     "road of 1e6 m": road_of("1.0e+6"),
     "road of 1e15 m": road_of("1.0e+15"),
     "road of 1e308 m": road_of("1.0e+308"),

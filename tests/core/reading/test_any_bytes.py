@@ -1,13 +1,8 @@
 """Damaged files of every kind: a reader refuses them with `SimrunError`, or returns something."""
 
-from __future__ import annotations
-
 import io
 import json
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -57,7 +52,7 @@ def by(write, name):
 
 
 # name of a file -> its valid content, and its reader
-READERS: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], Any]]] = {
+READERS = {
     "a.yaml": (lambda folder: SCENE.encode(), load_yaml),
     "scene.yaml": (lambda folder: SCENE.encode(), load_scenario),
     "a.json": (lambda folder: json.dumps({"a": [1, 2.5, "x", None]}).encode(), read_json),

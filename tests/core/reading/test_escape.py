@@ -1,7 +1,5 @@
 """Rule 6: what scenes, logs and parts are called cannot act where it is shown."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 
 from alpasim_plugin.core.errors import InputError

@@ -33,7 +33,7 @@ class Posed:
     start: Start
 
 
-def patch(centre, spread, count: int, rng: np.random.Generator, size: float) -> GaussianCloud:
+def patch(centre, spread, count, rng, size):
     """Return opaque round Gaussians of random colours around a centre."""
     means = np.asarray(centre) + rng.uniform(-1, 1, (count, 3)) * np.asarray(spread)
     quats = np.tile([1.0, 0, 0, 0], (count, 1))
@@ -41,12 +41,12 @@ def patch(centre, spread, count: int, rng: np.random.Generator, size: float) -> 
     return GaussianCloud(means, quats, np.full((count, 3), size), np.full(count, 0.95), sh)
 
 
-def at(x: float, y: float, z: float) -> np.ndarray:
+def at(x, y, z):
     """Return a place of the scene in the world."""
     return FAR + np.array([x, y, z])
 
 
-def camera_at(y_m: float) -> PinholeCamera:
+def camera_at(y_m):
     """Return a camera that looks along world x from 1.5 m above the ground."""
     T = np.eye(4)
     T[:3, :3] = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # columns: right, down, forward
@@ -55,7 +55,7 @@ def camera_at(y_m: float) -> PinholeCamera:
     return PinholeCamera.from_pose(WIDTH, HEIGHT, K, T)
 
 
-def actor_pose(i: int) -> np.ndarray:
+def actor_pose(i):
     """Return where the actor is in view i: it crosses and turns."""
     yaw = 0.1 * i
     return se3(at(7.0, -2.0 + 0.5 * i, 0.8), [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])

@@ -1,7 +1,5 @@
 """Photographs of a drawn street whose depth, poses and exposure are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -14,7 +12,7 @@ from tests.drives.street import CAMERA_M, HEIGHT, STEP_M, WALL_M, WIDTH, K, Stre
 STREET = Street(bow_m=0.0)
 
 
-def street_views(count: int = 10, aside_m: float = 0.0, first: int = 0) -> list[PosedView]:
+def street_views(count=10, aside_m=0.0, first=0):
     """Return photographs every 0.6 m along the street, the world's z up, named ``front-000000`` and
     on.
     """
@@ -26,7 +24,7 @@ def street_views(count: int = 10, aside_m: float = 0.0, first: int = 0) -> list[
     return views
 
 
-def true_depth(view: PosedView) -> np.ndarray:
+def true_depth(view):
     """Return ``(H, W)`` metres of the road and the walls, which hide nothing of each other;
     infinite for sky. The box is left out.
     """
@@ -45,7 +43,7 @@ def true_depth(view: PosedView) -> np.ndarray:
     return np.minimum(road, np.abs(wall))
 
 
-def turned(view: PosedView, turn_rad: np.ndarray, shift_m: np.ndarray) -> PosedView:
+def turned(view, turn_rad, shift_m):
     """Return a view whose pose is wrong by a rotation vector and a shift, both in its own frame."""
     wrong = np.eye(4)
     wrong[:3, :3], wrong[:3, 3] = cv2.Rodrigues(turn_rad)[0], shift_m
@@ -54,6 +52,6 @@ def turned(view: PosedView, turn_rad: np.ndarray, shift_m: np.ndarray) -> PosedV
     )
 
 
-def brightened(view: PosedView, gain: tuple[float, float, float]) -> PosedView:
+def brightened(view, gain):
     """Return a view as a camera of another exposure takes it."""
     return replace(view, rgb=np.rint(view.rgb * np.array(gain)).clip(0, 255).astype(np.uint8))

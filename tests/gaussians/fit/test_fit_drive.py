@@ -2,8 +2,6 @@
 resumes, refuses what it cannot start.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

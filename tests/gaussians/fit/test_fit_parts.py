@@ -1,7 +1,5 @@
 """Each part of the fit against something independent of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,8 +2,6 @@
 stop on a bad number.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Invented and lost paint on a road that is drawn: lines, their absence, and what is no line."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

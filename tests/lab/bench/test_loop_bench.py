@@ -1,7 +1,5 @@
 """A record of speed has every stage with its error, and ratios that are those of its times."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

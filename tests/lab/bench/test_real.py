@@ -2,8 +2,6 @@
 refused.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -35,7 +33,7 @@ class Truth(Renderer):
     """Show what the photographs of the drive show, and note the order of requests."""
 
     def __init__(self):
-        self.asked: list[int] = []
+        self.asked = []
 
     def render(self, request):
         self.asked.append(request.t_us)

@@ -2,8 +2,6 @@
 and resumed.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

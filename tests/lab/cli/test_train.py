@@ -2,8 +2,6 @@
 beside it, errors in four parts.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path
@@ -48,7 +46,7 @@ def bundle(tmp_path_factory):
     return path
 
 
-def run_train(capsys, *command: str | Path):
+def run_train(capsys, *command):
     """Run ``simrun train`` and return its document and what it said beside it."""
     assert run_command(["train", *map(str, command), "--json"]) == 0
     out, err = capsys.readouterr()

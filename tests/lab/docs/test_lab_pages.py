@@ -2,8 +2,6 @@
 all of them.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,12 +1,6 @@
 """Small image and window fixers for tests."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from pathlib import Path
-
 import torch
-from torch import Tensor
 
 from alpasim_plugin.block_fixers.codec_weights import fill_random
 from alpasim_plugin.block_fixers.networks import Parts
@@ -27,16 +21,14 @@ SMALL = (
 DAMPED = 0.3  # of the velocity and of the autoencoder's corrections: the guard finds nothing
 
 
-def image_settings(name: str, *overrides: str) -> RenderStepSettings | NoiseWindowSettings:
+def image_settings(name, *overrides):
     """Return a shipped arm's settings at a few thousand parameters."""
     settings = fixer_settings(name, (*SMALL, *overrides))
     assert isinstance(settings, RenderStepSettings | NoiseWindowSettings)
     return settings
 
 
-def busy_settings(
-    folder: Path, name: str, *overrides: str
-) -> RenderStepSettings | NoiseWindowSettings:
+def busy_settings(folder, name, *overrides):
     """Return settings whose weights make every layer count."""
     kind = image_settings(name, *overrides).decoder.kind
     path = folder / f"{name}_{kind}.safetensors"
@@ -50,7 +42,7 @@ def busy_settings(
     return image_settings(name, f"weights.bundle={path}", *overrides)
 
 
-def damp(*weights: Tensor) -> None:
+def damp(*weights):
     """Make weights small, in place."""
     with torch.no_grad():
         for weight in weights:
@@ -58,9 +50,9 @@ def damp(*weights: Tensor) -> None:
 
 
 def save(
-    path: Path,
-    parts: Mapping[str, Mapping[str, Tensor]],
-    settings: RenderStepSettings | NoiseWindowSettings,
-) -> None:
+    path,
+    parts,
+    settings,
+):
     """Write a bundle."""
     save_bundle(path, parts, settings, trained=True, note="3 updates")

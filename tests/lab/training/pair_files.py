@@ -1,15 +1,11 @@
 """Small sequences of pairs for tests."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, write_sequence
 
 
-def pair(i: int, height: int = 32, width: int = 48) -> Pair:
+def pair(i, height=32, width=48):
     """Return frame ``i`` of a scene that moves to the left by a pixel a frame."""
     x, y = np.meshgrid(np.arange(width) + i, np.arange(height))
     rgb = np.stack([x * 5 % 256, y * 7 % 256, (x + y) * 3 % 256], axis=-1).astype(np.uint8)
@@ -22,14 +18,14 @@ def pair(i: int, height: int = 32, width: int = 48) -> Pair:
 
 
 def make(
-    root: Path,
-    split: str = "train",
-    name: str = "a",
-    frames: int = 12,
-    height: int = 32,
-    width: int = 48,
-    **more: str,
-) -> PairSequence:
+    root,
+    split="train",
+    name="a",
+    frames=12,
+    height=32,
+    width=48,
+    **more,
+):
     """Write one sequence, with ``more`` of sequence.json, and open it."""
     folder = root / split / name
     write_sequence(

@@ -2,11 +2,8 @@
 as a renderer.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,14 +32,14 @@ pytestmark = pytest.mark.slow
 STEPS = 2  # U
 
 
-def arm_settings(name, *overrides: str):
+def arm_settings(name, *overrides):
     sizes = [text for text in SMALL_DIT if text.startswith("dit.")]
     settings = fixer_settings(name, (*sizes, *overrides))
     assert isinstance(settings, OneFixerSettings)
     return settings
 
 
-def run_of(data, recipe, **weights: Path):
+def run_of(data, recipe, **weights):
     schedule = Schedule(STEPS, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     batches = BatchForm(clips=2, columns=4)
     return FixerRun(

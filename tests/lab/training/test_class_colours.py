@@ -2,8 +2,6 @@
 nothing else.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 pictures get nearer to the truth.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

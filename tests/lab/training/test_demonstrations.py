@@ -2,8 +2,6 @@
 learn from.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

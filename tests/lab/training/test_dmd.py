@@ -2,8 +2,6 @@
 paper sends them and nowhere else.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -32,7 +30,7 @@ N = 4
 TEXT = torch.zeros(1, 1, 8)
 
 
-def noise(name, *shape: int):
+def noise(name, *shape):
     return torch.from_numpy(stream("dmd", 0, name).standard_normal(shape)).float()
 
 

@@ -2,8 +2,6 @@
 where they are drawn so.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cache of training holds what the rolling one holds, with gradients."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st

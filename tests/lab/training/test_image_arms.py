@@ -2,10 +2,7 @@
 drives as a fixer.
 """
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,7 +57,7 @@ def train(data, runs):
     folder.
     """
 
-    def run(recipe: str, updates: int, folder: str, *more: str) -> Path:
+    def run(recipe, updates, folder, *more):
         torch.set_num_threads(1)
         start = "init-bi" if recipe == "3dgs-enhancer" else "init"
         options = {
@@ -90,7 +87,7 @@ def train(data, runs):
 def trained(train, runs):
     """Return a function that gives a recipe's bundle, trained once."""
 
-    def bundle(recipe: str) -> Path:
+    def bundle(recipe):
         folder = runs / recipe
         if not (folder / "fixer.safetensors").exists():
             from_frames = f"harmonizer={bundle('harmonizer')}" if "temporal" in recipe else ""

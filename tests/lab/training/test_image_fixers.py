@@ -2,8 +2,6 @@
 windows cover a clip.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +36,7 @@ def settings_of(weights):
 
 @pytest.fixture
 def session(settings_of):
-    def make(name, *overrides: str, seed=0):
+    def make(name, *overrides, seed=0):
         return make_fixer(name, settings_of(name, *overrides), scene_id="scene", seed=seed)
 
     return make

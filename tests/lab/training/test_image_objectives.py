@@ -2,8 +2,6 @@
 write.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -52,7 +50,7 @@ def one_thread():
     )  # matrices this small are slower on several; tests/conftest.py sets the number back
 
 
-def normal(*shape: int, key="z"):
+def normal(*shape, key="z"):
     return torch.from_numpy(stream("tests", 0, key).standard_normal(shape, dtype=np.float32))
 
 

@@ -1,7 +1,5 @@
 """How a sequence of pairs is drawn and made: real renderers on a tiny street."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

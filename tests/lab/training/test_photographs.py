@@ -2,8 +2,6 @@
 the facts of a real set.
 """
 
-from __future__ import annotations
-
 import json
 
 import cv2

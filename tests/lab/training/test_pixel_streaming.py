@@ -1,7 +1,5 @@
 """The per-frame fixer computes in a stream what its training computed over a clip."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

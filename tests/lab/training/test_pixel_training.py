@@ -3,7 +3,6 @@ frames, resumed runs are equal.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import pytest
 import torch
@@ -190,7 +189,7 @@ def test_switches_of_the_ablation():
     net, s = generator(), sample()
     start = net.start(s.render[:, 0])
 
-    def made(**changes: Any):
+    def made(**changes):
         return pixel_losses(
             net, s, start, PixelObjectives(perceptual=0, **changes), None
         ).predictions
@@ -219,7 +218,7 @@ def test_a_redenoised_history_is_the_truth_noised_and_denoised():
         _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
 
 
-def run_of(steps=4, decay_from=3, variant="V9", **changes: Any):
+def run_of(steps=4, decay_from=3, variant="V9", **changes):
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
     schedule = Schedule(

@@ -1,7 +1,5 @@
 """The expert of the learned policy: recovery to the line, and speed behind others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

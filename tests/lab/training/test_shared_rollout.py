@@ -2,8 +2,6 @@
 gradients flow and where they do not.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -24,11 +22,11 @@ H = 4
 W = 4
 
 
-def noise(name, *shape: int):
+def noise(name, *shape):
     return torch.from_numpy(stream("rollout", 0, name).standard_normal(shape)).float()
 
 
-def uniform(name, *shape: int):
+def uniform(name, *shape):
     return torch.from_numpy(stream("rollout", 0, name).uniform(size=shape)).float()
 
 

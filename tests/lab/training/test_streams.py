@@ -30,7 +30,7 @@ def root(tmp_path_factory):
     return folder
 
 
-def streams(root, **settings: object):
+def streams(root, **settings):
     chosen = {
         "batch": 3,
         "frames": 2,

@@ -5,35 +5,27 @@ Nothing is streamed, batched by camera, cropped early or left undecoded. Images 
 to multiples of 16 like the sessions'.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 import torch
-from torch import Tensor
 
-from alpasim_plugin.block_fixers.clips import SIDE, Clip, crop_clip, pad_clip, to_clip, to_images
+from alpasim_plugin.block_fixers.clips import SIDE, crop_clip, pad_clip, to_clip, to_images
 from alpasim_plugin.block_fixers.clips import TOKEN_PX as TOKEN
-from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
+from alpasim_plugin.block_fixers.networks import LATENT, decode, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
-from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.fixers.views import HALF, ClipSize, group_views
+from alpasim_plugin.fixers.views import HALF, group_views
 from alpasim_plugin.lab.image_fixers.settings import (
-    MaplessSettings,
     NoiseWindowSettings,
-    RenderStepSettings,
 )
 from alpasim_plugin.lab.image_fixers.window_fixer import fade_weights, windows
 
 
 @torch.inference_mode()
 def whole_clip_images(
-    settings: RenderStepSettings | NoiseWindowSettings,
-    frames: Sequence[Frame],
-    scene_id: str,
-    seed: int,
-) -> U8:
+    settings,
+    frames,
+    scene_id,
+    seed,
+):
     """Fix a clip of one camera as the session of these settings would in exact arithmetic.
 
     Args:
@@ -56,20 +48,18 @@ def whole_clip_images(
         video = _in_windows(networks, exact, clip, noise)
     else:
         video = _one_by_one(networks, exact, clip, views.size)
-    images: U8 = to_images(video, views.size)[0]
+    images = to_images(video, views.size)[0]
     return images
 
 
-def _one_by_one(
-    networks: Networks, settings: RenderStepSettings, clip: Clip, size: ClipSize
-) -> Tensor:
+def _one_by_one(networks, settings, clip, size):
     """x = z_r / (alpha + sigma), z_0 = x - t v(x, t), over the clip [render, last outputs] where
     there are enough outputs.
     """
     alpha, sigma = settings.render_level.alpha, settings.render_level.sigma
     t = sigma / (alpha + sigma)
-    shown: list[Tensor] = []
-    made: list[Tensor] = []
+    shown = []
+    made = []
     for i in range(clip.rgb.shape[2]):
         rgb = clip.rgb[:, :, i : i + 1]
         video = (
@@ -94,9 +84,7 @@ def _one_by_one(
     return torch.cat(made, dim=2)
 
 
-def _in_windows(
-    networks: Networks, settings: NoiseWindowSettings, clip: Clip, noise: Sequence[Tensor]
-) -> Tensor:
+def _in_windows(networks, settings, clip, noise):
     """Sum over windows of weight times the window's frames; z <- z - v / n, n times, in each."""
     frames = clip.rgb.shape[2]
     parts = windows(frames, settings.window_frames, settings.stride_frames)
@@ -114,9 +102,7 @@ def _in_windows(
     return out
 
 
-def _window_noise(
-    settings: NoiseWindowSettings, cameras: Sequence[str], clip: Clip, scene_id: str, seed: int
-) -> list[Tensor]:
+def _window_noise(settings, cameras, clip, scene_id, seed):
     shape, n = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE), settings.latents
     count = len(windows(clip.rgb.shape[2], settings.window_frames, settings.stride_frames))
     starts = np.zeros(count, int) if settings.noise == "fixed" else np.arange(count) * n
@@ -126,7 +112,7 @@ def _window_noise(
     ]
 
 
-def _opacity(settings: MaplessSettings, clip: Clip, frames: Sequence[int]) -> Tensor | None:
+def _opacity(settings, clip, frames):
     return (
         clip.alpha[:, :, list(frames)]
         if settings.opacity_to_decoder and clip.alpha is not None

@@ -1,7 +1,5 @@
 """PSNR and SSIM of frames against slow float64 reference implementations, and at their edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import convolve2d
@@ -10,14 +8,13 @@ from alpasim_plugin.core import image_metrics
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.image_metrics import CAP_DB
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.video_metrics.frames import psnr_db, ssim
 
 RNG = stream("video", 0, "frames")
-TRUTH: U8 = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
-SMOOTH: U8 = np.stack([np.add.outer(np.arange(24) * 4, np.arange(31) * 3)] * 3, axis=-1)[
-    None
-].astype(np.uint8)
+TRUTH = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
+SMOOTH = np.stack([np.add.outer(np.arange(24) * 4, np.arange(31) * 3)] * 3, axis=-1)[None].astype(
+    np.uint8
+)
 
 
 def slow_ssim(a, b):

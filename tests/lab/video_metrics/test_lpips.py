@@ -2,8 +2,6 @@
 on disk.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 
@@ -21,9 +19,9 @@ from alpasim_plugin.lab.video_metrics.image_distance import (
     distance_for_training,
     load_distance,
 )
-from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, Kind, load_lpips
+from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, load_lpips
 
-KINDS: tuple[Kind, ...] = ("alex", "vgg")
+KINDS = ("alex", "vgg")
 
 
 def pictures(seed, count=2, side=64):

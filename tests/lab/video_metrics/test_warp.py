@@ -1,7 +1,5 @@
 """Warp L1 on videos whose motion is known (values of the checks: docs/lab/video-metrics.md)."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
