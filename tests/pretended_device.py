@@ -1,5 +1,6 @@
 """A CUDA device pretended on the CPU: tensors that say ``cuda:0``, compute on the CPU, refuse to be
-mixed with tensors of the host, and count launches, copies and waits.
+mixed with tensors of the host, and count launches, copies and waits. What is captured as a graph
+may neither wait nor copy from or to the host, and is computed again at every replay.
 
 What cannot be pretended: speed, memory, rounding, and kernels that run at the same time.
 """
@@ -7,8 +8,9 @@ What cannot be pretended: speed, memory, rounding, and kernels that run at the s
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import torch
 from torch.overrides import TorchFunctionMode
@@ -36,6 +38,7 @@ class Traffic:
     waits: Counter[str] = field(default_factory=Counter)
     bytes_up: int = 0
     bytes_down: int = 0
+    graph: object = None  # that is being captured
 
     def reset(self):
         """Forget everything."""
@@ -44,6 +47,38 @@ class Traffic:
 
 
 traffic = Traffic()
+
+
+class PretendedGraph:
+    """The operations of a capture; a replay computes them again in the same memory."""
+
+    def __init__(self):
+        self.steps = []
+
+    def replay(self):
+        """Compute everything again."""
+        traffic.launches += 1
+        with torch.utils._python_dispatch._disable_current_modes():
+            for func, args, kwargs, made in self.steps:
+                again, _ = tree_flatten(func(*args, **kwargs))
+                for place, value in zip(tree_flatten(made)[0], again, strict=True):
+                    if isinstance(place, torch.Tensor):
+                        place.copy_(value)
+
+
+@contextmanager
+def captured(graph, **options):
+    """Record what runs on the device meanwhile."""
+    traffic.graph = graph
+    try:
+        yield
+    finally:
+        traffic.graph = None
+
+
+def _outside_of_a_capture(what):
+    if traffic.graph is not None:
+        raise RuntimeError(f"{what} in a part that is captured as a graph")
 
 
 class OnDevice(torch.Tensor):
@@ -109,10 +144,14 @@ def _run(func, args, kwargs):
             f"{func}: a tensor of the host {tuple(mixed[0].shape)} beside the device"
         )
     if name in WAITS:
+        _outside_of_a_capture(name)
         traffic.waits[name] += 1
         return tree_map(_wrap, result) if name != "_local_scalar_dense" else result
     if name not in VIEWS:
         traffic.launches += 1
+        if traffic.graph is not None:
+            given = tree_map(_unwrap, args), tree_map(_unwrap, kwargs)
+            traffic.graph.steps.append((func, *given, result))
     written = func._schema.arguments[0].alias_info if func._schema.arguments else None
     if written is not None and written.is_write and result is ours[0].held:
         return args[0]
@@ -120,12 +159,14 @@ def _run(func, args, kwargs):
 
 
 def _downloaded(tensor):
+    _outside_of_a_capture("a copy to the host")
     traffic.bytes_down += tensor.nbytes
     traffic.waits["copy to the host"] += 1
     return tensor
 
 
 def _uploaded(tensor):
+    _outside_of_a_capture("a copy from the host")
     traffic.bytes_up += tensor.nbytes
     return OnDevice(tensor.clone())
 
@@ -156,7 +197,10 @@ class _Functions(TorchFunctionMode):
             return _moved(first, HOST if name == "cpu" else device, func, args, kwargs)
         if device is not None and device.type == "cuda" and name != "_parse_to":
             kwargs = {key: value for key, value in kwargs.items() if key != "device"}
-            return tree_map(_wrap, func(*args, **kwargs))
+            made = func(*args, **kwargs)
+            if traffic.graph is not None:
+                traffic.graph.steps.append((func, args, kwargs, made))
+            return tree_map(_wrap, made)
         return func(*args, **kwargs)
 
 
@@ -220,12 +264,19 @@ def pretended_device(patch):
     patch.setattr(torch.cuda, "is_available", lambda: True)
     patch.setattr(torch.cuda, "device_count", lambda: 1)
     patch.setattr(torch.cuda, "get_device_name", lambda: "pretended")
+    patch.setattr(torch.cuda, "CUDAGraph", PretendedGraph)
+    patch.setattr(torch.cuda, "graph", captured)
+    patch.setattr(torch.cuda, "Stream", lambda: SimpleNamespace(wait_stream=lambda other: None))
+    patch.setattr(torch.cuda, "current_stream", torch.cuda.Stream)
+    patch.setattr(torch.cuda, "stream", nullcontext)
+    patch.setattr(torch.cuda, "device", nullcontext)
     patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
     # Subclasses of tensors do not work in inference mode; gradients are off in either.
     plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]
     patch.setattr(pixel_fixer, "fix_frame", plain)
     overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
     torch.__future__.set_overwrite_module_params_on_conversion(True)
+    pixel_fixer._captured.cache_clear()  # a graph of a test before has another device's tensors
     traffic.reset()
     try:
         with _Functions(), _Dispatch():

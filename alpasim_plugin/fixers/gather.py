@@ -16,6 +16,7 @@ from numba import njit
 from torch import Tensor
 
 from alpasim_plugin.core.kernels import inlined_kernel, kernel
+from alpasim_plugin.fixers.network.pixel_generator import sparse_source
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
@@ -290,4 +291,4 @@ def _resize(x: Tensor, factor: float, method: int) -> Tensor:
     return out
 
 
-CPU = Operations(gather_references, blend, smaller, larger)
+CPU = Operations(gather_references, blend, smaller, larger, sparse_source)

@@ -2,22 +2,23 @@
 camera, every frame guarded.
 
 `fix_frame` is one frame through the network, tensors in and tensors out: source (Eq. 1), flow steps
-(Eq. 2), the harmlessness guard. Its state goes in and comes out, and nothing else is remembered.
-Several cameras are a batch.
+(Eq. 2), both guards. Its state goes in and comes out, and nothing else is remembered. Several
+cameras are a batch. On a GPU it waits for nothing, and is recorded as a graph.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.devices import download
+from alpasim_plugin.core.devices import CapturedFunction, Sizes, download, sizes_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import OPACITY_MEAN, U8, Frame
@@ -28,7 +29,6 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     PixelState,
     content_key,
     noise_key,
-    sparse_source,
 )
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
@@ -45,57 +45,96 @@ from alpasim_plugin.fixers.views import (
 )
 
 
-@dataclass(frozen=True)
-class PixelInputs:
-    """One frame of B cameras; sides are multiples of 16 ``scale``."""
+class GivenFrame(NamedTuple):
+    """One frame of B cameras, and what is known of the frame before."""
 
-    render: Tensor  # (B, H, W, 3) in [-1, 1]
-    opacity: Tensor  # (B, H, W, 1), 0 to 1
-    sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
+    rgb: Tensor  # (B, H, W, 3) uint8
+    rgb_before: Tensor  # as rgb; a first frame's own
+    fixed_before: Tensor  # as rgb; a first frame's own
+    output: Tensor  # this and the next three: see `PixelState`
+    render: Tensor
+    hidden: Tensor
+    recorded: Tensor
+    alpha: Tensor | None = None  # (B, H, W), 0 to 1; None where every pixel is opaque
+    maps: Tensor | None = None  # (B, H, W, 3) uint8
     references: Tensor | None = None  # (B, K, H, W, 4) uint8, colour and where it holds
-    scale: int = 1  # the network looks at images that are this many times smaller
+    keys: Tensor | None = None  # (steps, B) int64, of the noise; None: there is none
+
+
+class FixedFrame(NamedTuple):
+    """What `fix_frame` makes of one frame of B cameras."""
+
+    levels: Tensor  # (B, H, W, 3) uint8, the image
+    measured: Tensor  # (B, 6), see `guard.measures`
+    sums: Tensor  # see `trust_sums`
+    output: Tensor  # this and the next three: see `PixelState`
+    render: Tensor
+    hidden: Tensor
+    recorded: Tensor
 
 
 @torch.inference_mode()
 def fix_frame(
-    generator: LoadedGenerator,
-    settings: PixelFixerSettings,
-    inputs: PixelInputs,
-    state: PixelState,
-    source: Callable[[int], Tensor],
-) -> tuple[Tensor, PixelState]:
-    """Fix one frame.
+    generator: LoadedGenerator, settings: PixelFixerSettings, given: GivenFrame
+) -> FixedFrame:
+    """Fix one frame."""
+    _, height, width, _ = given.rgb.shape
+    scale = settings.scale_of(height, width)
+    state = PixelState(given.output, given.render, given.hidden, given.recorded)
+    render = in_range(given.rgb, scale)
+    opacity = (
+        torch.ones_like(render[..., :1])
+        if given.alpha is None
+        else padded(given.alpha, scale)[..., None]
+    )
+    sdmap = torch.full_like(render, -1.0) if given.maps is None else in_range(given.maps, scale)
+    references = given.references
+    if references is not None:
+        right, below = render.shape[2] - width, render.shape[1] - height
+        references = F.pad(references, (0, 0, 0, right, 0, below))
+    transparent = torch.zeros_like(opacity) if settings.holes == "everywhere" else opacity
 
-    Args:
-        generator: Network.
-        settings: Steps and guard.
-        inputs: The frame.
-        state: Of the same cameras, from `PixelGenerator.start` or the last call.
-        source: Returns the source z_1 (Eq. 1) of a flow step by its number, ``(B, H, W, 3)``.
-
-    Returns:
-        ``(B, H, W, 3)``, not clipped to [-1, 1], and the state after the frame, whose last output
-        is this one.
-    """
-    render = inputs.render
+    def source(draw: int) -> Tensor:
+        if given.keys is None:
+            return render
+        return generator.operations.source(render, transparent, given.keys[draw])
 
     def predict(z: Tensor, t: Tensor | None) -> tuple[Tensor, PixelState]:
-        images = render, inputs.opacity, inputs.sdmap
+        images = render, opacity, sdmap
         predicted: tuple[Tensor, PixelState] = generator.net(
-            *images, state, z, t, inputs.references, inputs.scale, generator.operations
+            *images, state, z, t, references, scale, generator.operations
         )
         return predicted
 
-    out, after = predict(source(0), None)
+    video, after = predict(source(0), None)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = render.new_full((len(render),), level.sigma)
-        out, after = predict(interpolant(out, source(index), level.sigma), t)
+        video, after = predict(interpolant(video, source(index), level.sigma), t)
     if settings.keep_render:
-        share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
+        share = render_share(video, render, opacity, sdmap, state.output)
         if share is not None:
-            out = torch.lerp(out, render, share * (1 - after.recorded))
-            after = after._replace(output=out.clamp(-1, 1))
-    return out, after
+            video = torch.lerp(video, render, share * (1 - after.recorded))
+            after = after._replace(output=video.clamp(-1, 1))
+    visible = slice(None), slice(height), slice(width)
+    output = after.output[visible]
+    levels = _grey_levels(output)
+    measured = guard.measures(
+        video[visible], levels, given.rgb, given.fixed_before, given.rgb_before
+    )
+    sums = trust_sums(output, after.render[visible], after.recorded[visible])
+    return FixedFrame(levels, measured, sums, *after)
+
+
+@lru_cache(maxsize=8)
+def _captured(
+    generator: LoadedGenerator, settings: PixelFixerSettings, sizes: Sizes
+) -> CapturedFunction:
+    """Return `fix_frame` as a graph for tensors of some sizes."""
+    return CapturedFunction(
+        lambda **given: fix_frame(generator, settings, GivenFrame(**given)),
+        sizes,
+        generator.device,
+    )
 
 
 @dataclass(frozen=True)
@@ -216,51 +255,41 @@ class PixelFixer(Fixer):
         self, view: Views, block: Sequence[Frame], histories: Mapping[str, CameraHistory]
     ) -> list[tuple[Frame, CameraHistory]]:
         """Fix the frame of each camera of a view; return it and the camera's past for the next."""
-        start = self.generator.net.start
         device = self.generator.device
         frames = [block[index] for (index,) in view.index]
         drawn = [] if isinstance(view.rgb, np.ndarray) else planes_of(frames)
-        raw = torch.as_tensor(view.rgb[:, 0]).to(device)
-        inputs = to_inputs(
-            replace(view, rgb=raw[:, None]), device, self.settings.scale_of(*view.shape)
+        rgb, alpha, maps, references = (
+            None if part is None else torch.as_tensor(part[:, 0]).to(device)
+            for part in (view.rgb, view.alpha, view.maps, view.references)
         )
+        assert rgb is not None
         pasts = [histories.get(camera) for camera in view.cameras]
         states = [
-            start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state
+            self._start(rgb[b : b + 1]) if past is None else past.state
             for b, past in enumerate(pasts)
         ]
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
-
-        def source(draw: int) -> Tensor:
-            everywhere = self.settings.holes == "everywhere"
-            if self.settings.holes == "render" or (view.alpha is None and not everywhere):
-                return inputs.render
-            frames = counts
-            if self.settings.noise == "content":
-                contents = zip(view.t_us, raw.cpu().numpy(), strict=True)
-                frames = [content_key(t_us[0], rgb) for t_us, rgb in contents]
-            keys = [
-                noise_key(self.scene_id, self.seed, camera, draw, frame)
-                for camera, frame in zip(view.cameras, frames, strict=True)
-            ]
-            opacity = torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity
-            return sparse_source(inputs.render, opacity, keys)
-
-        joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
-        video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
-        visible = slice(None), slice(height), slice(width)
-        output = after.output[visible]
-        levels = _grey_levels(output)
         before = [
-            (levels[b], raw[b]) if past is None else (past.fixed, past.raw)
+            (rgb[b], rgb[b]) if past is None else (past.raw, past.fixed)
             for b, past in enumerate(pasts)
         ]
-        fixed_before, raw_before = (torch.stack(parts) for parts in zip(*before, strict=True))
+        given = GivenFrame(
+            rgb,
+            *(torch.stack(parts) for parts in zip(*before, strict=True)),
+            *(torch.cat(parts) for parts in zip(*states, strict=True)),
+            alpha,
+            maps,
+            references,
+            self._noise_keys(view, rgb, counts),
+        )
+        fixed_frame = self._run(given)
+        levels = fixed_frame.levels
+        after = PixelState(*fixed_frame[3:])
         images, measured, sums, *rest = download(
             levels,
-            guard.measures(video[visible], levels, raw, fixed_before, raw_before),
-            trust_sums(output, after.render[visible], after.recorded[visible]),
+            fixed_frame.measured,
+            fixed_frame.sums,
             *(planes.pairs for planes in drawn),
             *(planes.alpha.mean() for planes in drawn),
         )
@@ -271,8 +300,8 @@ class PixelFixer(Fixer):
         for b, (frame, event) in enumerate(zip(frames, guard.failures(measured), strict=True)):
             state = PixelState(*(part[b : b + 1] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
-                state = start(inputs.render[b : b + 1], inputs.scale)
-            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw[b], levels[b])
+                state = self._start(rgb[b : b + 1])
+            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], rgb[b], levels[b])
             events, facts = frame.events, dict(frame.facts)
             if frame.pending is not None:  # nobody has looked at the render yet
                 events += guard.render_events(measured[b])
@@ -285,6 +314,36 @@ class PixelFixer(Fixer):
                 frame = frame.changed(references=(), events=events, facts=facts, rgb=images[b])
             fixed.append((frame, history))
         return fixed
+
+    def _start(self, rgb: Tensor) -> PixelState:
+        """Return the state before a first frame ``(1, H, W, 3)``."""
+        scale = self.settings.scale_of(*rgb.shape[1:3])
+        return self.generator.net.start(in_range(rgb, scale), scale)
+
+    def _noise_keys(self, view: Views, rgb: Tensor, counts: Sequence[int]) -> Tensor | None:
+        """Return the keys of a frame's noise ``(steps, B)``, None where it has none."""
+        settings = self.settings
+        if settings.holes == "render" or (view.alpha is None and settings.holes != "everywhere"):
+            return None
+        numbers = counts
+        if settings.noise == "content":
+            contents = zip(view.t_us, rgb.cpu().numpy(), strict=True)
+            numbers = [content_key(t_us[0], image) for t_us, image in contents]
+        keys = [
+            [
+                noise_key(self.scene_id, self.seed, camera, draw, number)
+                for camera, number in zip(view.cameras, numbers, strict=True)
+            ]
+            for draw in range(len(settings.steps))
+        ]
+        return torch.tensor(keys).to(rgb.device)
+
+    def _run(self, given: GivenFrame) -> FixedFrame:
+        """Run `fix_frame`, on a GPU as a graph that was recorded for tensors of these sizes."""
+        if not self.generator.captured:
+            return fix_frame(self.generator, self.settings, given)
+        tensors = {name: part for name, part in given._asdict().items() if part is not None}
+        return FixedFrame(*_captured(self.generator, self.settings, sizes_of(tensors))(tensors))
 
 
 def _grey_levels(images: Tensor) -> Tensor:
@@ -304,32 +363,17 @@ def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[F
     return replace(view, rgb=rgb[:, None], alpha=alpha[:, None]), frames
 
 
-def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:
-    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of
-    16 ``scale``.
-    """
-    height, width = view.shape
-    right, below = -width % (GRID_PX * scale), -height % (GRID_PX * scale)
+def padded(plane: Tensor, scale: int) -> Tensor:
+    """Return planes ``(B, H, W, ...)`` with their edges repeated up to multiples of 16 ``scale``."""
+    height, width = plane.shape[1:3]
+    below, right = -height % (GRID_PX * scale), -width % (GRID_PX * scale)
+    if not (below or right):
+        return plane
+    rows = torch.arange(height + below, device=plane.device).clamp_(max=height - 1)
+    columns = torch.arange(width + right, device=plane.device).clamp_(max=width - 1)
+    return plane[:, rows][:, :, columns]
 
-    def image(plane: Any) -> Tensor:
-        x = torch.as_tensor(plane[:, 0]).to(device)
-        if right or below:
-            rows = torch.arange(height + below, device=device).clamp_(max=height - 1)
-            columns = torch.arange(width + right, device=device).clamp_(max=width - 1)
-            x = x[:, rows][:, :, columns]
-        return x
 
-    render = image(view.rgb).float().div_(HALF).sub_(1)
-    opacity = (
-        torch.ones_like(render[..., :1]) if view.alpha is None else image(view.alpha)[..., None]
-    )
-    sdmap = (
-        torch.full_like(render, -1.0)
-        if view.maps is None
-        else image(view.maps).float().div_(HALF).sub_(1)
-    )
-    references = None
-    if view.references is not None:
-        padding = (0, 0, 0, right, 0, below)
-        references = F.pad(torch.as_tensor(view.references[:, 0]).to(device), padding)
-    return PixelInputs(render, opacity, sdmap, references, scale)
+def in_range(image: Tensor, scale: int) -> Tensor:
+    """Convert images of bytes to [-1, 1], `padded`."""
+    return padded(image, scale).float().div_(HALF).sub_(1)

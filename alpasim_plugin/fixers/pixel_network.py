@@ -32,6 +32,7 @@ class LoadedGenerator:
     trained: bool
     note: str  # description of the weights, for labels
     device: torch.device
+    captured: bool  # whether a frame is recorded as a graph
 
 
 def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedGenerator:
@@ -58,7 +59,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
         note = f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[settings.precision])
     operations = CPU if device == "cpu" else TORCH
-    return LoadedGenerator(net, operations, trained, note, torch.device(device))
+    captured = operations is TORCH
+    return LoadedGenerator(net, operations, trained, note, torch.device(device), captured)
 
 
 def _untrained(settings: PixelFixerSettings) -> PixelGenerator:

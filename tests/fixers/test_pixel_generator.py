@@ -10,6 +10,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.pixel_generator import (
     PixelGenerator,
     PixelSizes,
+    dense_source,
     pixel_noise,
     pixel_source,
     sparse_source,
@@ -102,11 +103,12 @@ def test_noise_enters_holes_alone():
     kept = pixel_source(torch.ones(5), opacity, torch.zeros(5))
     assert kept.tolist() == [0, 0.5, 1, 1, 1]
     ((render, alpha, _),) = frames(1)
-    keys = [2**63 + 5, 7][: len(render)]
+    keys = torch.tensor([5 - 2**63, 7])[: len(render)]
     everywhere = np.arange(render[0, ..., 0].numel())
-    noise = [pixel_noise(key, everywhere).reshape(render.shape[1:]) for key in keys]
+    noise = [pixel_noise(int(key), everywhere).reshape(render.shape[1:]) for key in keys]
     dense = pixel_source(render, alpha, torch.from_numpy(np.stack(noise)))
     torch.testing.assert_close(sparse_source(render, alpha, keys), dense)
+    torch.testing.assert_close(dense_source(render, alpha, keys), dense, rtol=0, atol=1e-6)
     assert sparse_source(render, torch.ones_like(alpha), keys) is render
 
 

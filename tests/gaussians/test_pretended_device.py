@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.core.devices import CapturedFunction, sizes_of
 from alpasim_plugin.core.types import OPACITY_MEAN, Frame
-from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from tests.examples import first_of
 from tests.gaussians.gaussian_scenes import LSB
@@ -83,20 +84,22 @@ def test_a_frame_stays_on_the_device_between_rasteriser_and_fixer(monkeypatch, c
         assert np.abs(fixed.alpha - due.alpha).max() <= LSB
 
 
-def test_the_fixer_waits_once_a_frame_and_downloads_bytes(monkeypatch):
-    host = make_fixer("onefixer", scene_id="scene")
+@pytest.mark.parametrize("holes", ["render", "noise"])
+def test_the_fixer_waits_once_a_frame_and_replays_its_graph(monkeypatch, holes):
+    settings = fixer_settings("onefixer", [f"holes={holes}"])
+    host = make_fixer("onefixer", settings, scene_id="scene")
     wanted = [host.step([frame], [frame.rgb])[0] for frame in frames()]
     with pretended_device(monkeypatch) as traffic:
-        device = make_fixer("onefixer", scene_id="scene", device="cuda")
+        device = make_fixer("onefixer", settings, scene_id="scene", device="cuda")
         for frame, due in zip(frames(), wanted, strict=True):
             traffic.reset()
             fixed = device.step([frame], [frame.rgb])[0]
             assert np.abs(fixed.rgb.astype(int) - due.rgb).max() <= 1
             assert fixed.facts.keys() == due.facts.keys()
             assert sum(traffic.waits.values()) == 1
-            assert traffic.bytes_up == HEIGHT * WIDTH * (3 + 4 + 3 + 4)
+            assert traffic.bytes_up == HEIGHT * WIDTH * (3 + 4 + 3 + 4) + 8 * (holes == "noise")
             assert traffic.bytes_down < HEIGHT * WIDTH * 3.1
-            assert traffic.launches <= 300
+        assert traffic.launches <= 40
 
 
 def test_tensors_of_two_devices_do_not_mix(monkeypatch):
@@ -107,3 +110,22 @@ def test_tensors_of_two_devices_do_not_mix(monkeypatch):
         with pytest.raises(TypeError):
             ours.numpy()
         assert (ours + 1).cpu().tolist() == [1, 1, 1]
+
+
+def test_what_is_captured_neither_waits_nor_copies(monkeypatch):
+    with pretended_device(monkeypatch):
+        ours = torch.ones(3, device="cuda")
+        sizes = sizes_of({"x": ours})
+        doubled = CapturedFunction(
+            lambda x: (x + torch.ones(3, device="cuda").add_(x),), sizes, ours.device
+        )
+        for value in (2.0, 5.0):
+            (found,) = doubled({"x": ours * value})
+            assert found.cpu().tolist() == [2 * value + 1] * 3
+        for wrong in (
+            lambda x: (x * float(x[0]),),
+            lambda x: (x.cpu(),),
+            lambda x: (x + torch.ones(3).to("cuda"),),
+        ):
+            with pytest.raises(RuntimeError):
+                CapturedFunction(wrong, sizes, ours.device)

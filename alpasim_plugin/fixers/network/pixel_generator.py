@@ -16,9 +16,9 @@ function of rollout, camera, frame, step and pixel.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -56,12 +56,10 @@ GRID_PX = 16  # sides are multiples of it
 IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
 DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
 HOLE = 0.5  # opacity below which noise enters the source
-ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
-MIX = (
-    (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
-    (np.uint64(27), np.uint64(0x94D049BB133111EB)),
-)
-LAST = np.uint64(31)
+# 2^64 over the golden ratio (Steele et al., 2014, SplitMix64); here and below as signed numbers
+ODD = 0x9E3779B97F4A7C15 - 2**64
+MIX = ((30, 0xBF58476D1CE4E5B9 - 2**64), (27, 0x94D049BB133111EB - 2**64))
+LAST = 31
 CHANNELS = 3
 
 
@@ -77,13 +75,13 @@ def pixel_source(render: Tensor, opacity: Tensor, eps: Tensor) -> Tensor:
     return m * render + (1 - m) * eps
 
 
-def sparse_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tensor:
-    """Return `pixel_source` with noise that is drawn only where it has weight.
+def sparse_source(render: Tensor, opacity: Tensor, keys: Tensor) -> Tensor:
+    """Return `pixel_source` with noise that is drawn only where it has weight, on the CPU.
 
     Args:
         render: ``(B, H, W, 3)``.
         opacity: ``(B, H, W, 1)``.
-        keys: `noise_key` of each image.
+        keys: ``(B,)`` int64, `noise_key` of each image.
     """
     source = render
     for b, alpha in enumerate(opacity[..., 0].flatten(1)):
@@ -91,21 +89,33 @@ def sparse_source(render: Tensor, opacity: Tensor, keys: Sequence[int]) -> Tenso
         if not len(holes):
             continue
         source = source.clone() if source is render else source
-        eps = torch.from_numpy(pixel_noise(keys[b], holes.cpu().numpy())).to(render.device)
+        eps = torch.from_numpy(pixel_noise(int(keys[b]), holes.numpy()))
         pixels = source[b].view(-1, render.shape[-1])
         pixels[holes] = pixel_source(pixels[holes], alpha[holes, None], eps)
     return source
 
 
+def dense_source(render: Tensor, opacity: Tensor, keys: Tensor) -> Tensor:
+    """Return the same as `sparse_source`, with all noise drawn by the device of the images."""
+    values = torch.arange(render[0].numel(), device=render.device).view(render.shape[1:])
+    u, v = (
+        (_mixed(counters) + 1).double() * 2.0**-53
+        for counters in _counters(keys[:, None, None, None], values)
+    )
+    normal = torch.sqrt(-2 * torch.log(u)) * torch.cos(2 * torch.pi * v)
+    return pixel_source(render, opacity, normal.float())
+
+
 def noise_key(scene_id: str, seed: int, camera: str, draw: int, frame: int) -> int:
-    """Return the key of a frame's noise.
+    """Return the key of a frame's noise, a signed number of 64 bits.
 
     Args:
         scene_id, seed, camera: Of the stream.
         draw: Flow step.
         frame: Index in the rollout, or `content_key`.
     """
-    return derive_seed(scene_id, seed, f"fixer/{camera}/{draw}", frame)
+    key = derive_seed(scene_id, seed, f"fixer/{camera}/{draw}", frame)
+    return key - 2**64 if key >= 2**63 else key
 
 
 def pixel_noise(key: int, pixels: I64) -> F32:
@@ -126,9 +136,8 @@ def pixel_noise(key: int, pixels: I64) -> F32:
         >>> bool((few[0] == many[1]).all())
         True
     """
-    index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
-    with np.errstate(over="ignore"):  # arithmetic modulo 2^64
-        u, v = (_uniform(np.uint64(key) + (index + np.uint64(i + 1)) * ODD) for i in range(2))
+    values = pixels[:, None] * CHANNELS + np.arange(CHANNELS)
+    u, v = ((_mixed(counters) + 1) * 2.0**-53 for counters in _counters(key, values))
     normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)  # Box and Muller, 1958
     return np.asarray(normal, np.float32)
 
@@ -142,12 +151,21 @@ def content_key(t_us: int, rgb: U8) -> int:
     return int.from_bytes(digest, "little")
 
 
-def _uniform(x: np.ndarray) -> np.ndarray:
-    """Mix 64-bit counters into uniform values in (0, 1]."""
+def _counters(key: Any, values: Any) -> tuple[Any, Any]:
+    """Return the two counters of each value, arrays or tensors of int64, modulo 2^64."""
+    return key + (2 * values + 1) * ODD, key + (2 * values + 2) * ODD
+
+
+def _mixed(x: Any) -> Any:
+    """Mix counters into numbers of 53 bits."""
     for shift, factor in MIX:
-        x = (x ^ (x >> shift)) * factor
-    x = x ^ (x >> LAST)
-    return ((x >> np.uint64(11)).astype(np.float64) + 1) * 2.0**-53
+        x = (x ^ _shifted(x, shift)) * factor
+    return _shifted(x ^ _shifted(x, LAST), 11)
+
+
+def _shifted(x: Any, bits: int) -> Any:
+    """Shift to the right; zeros come in from the left, also where the number is negative."""
+    return (x >> bits) & (2 ** (64 - bits) - 1)
 
 
 @dataclass(frozen=True)
@@ -206,7 +224,7 @@ def gather_cells(
     )
 
 
-TORCH = Operations(gather_references, blend, smaller, larger)
+TORCH = Operations(gather_references, blend, smaller, larger, dense_source)
 
 
 class PixelGenerator(nn.Module):

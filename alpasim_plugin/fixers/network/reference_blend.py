@@ -81,12 +81,14 @@ class Operations:
         blend: See `blend`.
         smaller: Average images ``(B, H, W, C)`` over squares of a number of pixels.
         larger: Enlarge images ``(B, H, W, C)`` bilinearly by a whole number.
+        source: Fill what is transparent with noise; see `pixel_generator.sparse_source`.
     """
 
     gather_references: Callable[[Tensor, Tensor, int], ReferenceCells]
     blend: Callable[[Tensor, Tensor, BlendHeads, int], tuple[Tensor, Tensor]]
     smaller: Callable[[Tensor, int], Tensor]
     larger: Callable[[Tensor, int], Tensor]
+    source: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class ReferenceBlend(nn.Module):
