@@ -68,20 +68,30 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
 
     Args:
         folder: Of the drive, which exists.
-        log: Map, ground, ego, vehicle, cameras, origin and notes; its actors are not read.
+        log: Map, ground, ego, vehicle, actors, cameras, origin and notes.
         obstacles: What stands in the model.
     """
     write_array(folder / GROUND_FILE, log.ground.z)
-    ego, lane_map = log.ego_log, log.lane_map
+    lane_map = log.lane_map
     document = {
         "format": "simrun drive",
         "version": 1,
         "scene_id": log.scene_id,
-        "ego": {"t_us": ego.t_us.tolist(), "xyz": ego.xyz.tolist(), "quat": ego.quat.tolist()},
+        "ego": _track(log.ego_log),
         "vehicle": {
             **vars(log.vehicle.box),
             "rear_axle_to_centre_m": log.vehicle.rear_axle_to_centre_m,
+            "wheelbase_m": log.vehicle.wheelbase_m,
         },
+        "actors": [
+            {
+                "id": one.actor_id,
+                "label": one.label,
+                "box": vars(one.box),
+                "track": _track(one.track),
+            }
+            for one in log.actors
+        ],
         "cameras": [
             {
                 "name": camera.name,
@@ -116,6 +126,10 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
     write_json(folder / DRIVE_FILE, document)
 
 
+def _track(track: Trajectory) -> JsonObject:
+    return {name: values.tolist() for name, values in vars(track).items()}
+
+
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
@@ -135,11 +149,14 @@ def read_drive(folder: Path) -> RecordedLog:
     with parsing(path, DO_THIS, "no drive of simrun"):
         if (document["format"], document["version"]) != ("simrun drive", 1):
             raise ValueError(f"version {document['version']!r}")
-        ego = document["ego"]
-        t_us = np.array(ego["t_us"], np.int64)
-        log = checked_trajectory(path, t_us, _rows(ego["xyz"]), _rows(ego["quat"], 4), least=2)
+        log = _trajectory(path, document["ego"])
         body = document["vehicle"]
         size = body["length_m"], body["width_m"], body["height_m"]
+        wheelbase_m = body.get("wheelbase_m", Vehicle.wheelbase_m)
+        actors = [
+            Actor(one["id"], one["label"], Box(**one["box"]), _trajectory(path, one["track"]))
+            for one in document.get("actors", [])
+        ]
         cameras = [
             CameraSpec(
                 one["name"],
@@ -157,8 +174,8 @@ def read_drive(folder: Path) -> RecordedLog:
             lane_map=_map_of(document["map"]),
             ground=_ground_of(files, folder, document["ground"]),
             ego_log=log,
-            vehicle=Vehicle(Box(*size), body["rear_axle_to_centre_m"]),
-            actors=tuple(_obstacle_actor(one, log) for one in document["obstacles"]),
+            vehicle=Vehicle(Box(*size), body["rear_axle_to_centre_m"], wheelbase_m),
+            actors=(*actors, *(_obstacle_actor(one, log) for one in document["obstacles"])),
             cameras=tuple(cameras),
             world_origin=(x, y, z),
             content_hash=files.content_hash,
@@ -167,6 +184,11 @@ def read_drive(folder: Path) -> RecordedLog:
             model=str(model),
             standing="found",
         )
+
+
+def _trajectory(path: Path, track: JsonObject) -> Trajectory:
+    t_us = np.array(track["t_us"], np.int64)
+    return checked_trajectory(path, t_us, _rows(track["xyz"]), _rows(track["quat"], 4), least=2)
 
 
 def _rows(values: Any, width: int = 3) -> F64:

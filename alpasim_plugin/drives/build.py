@@ -20,7 +20,7 @@ from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
+from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import (
@@ -39,6 +39,7 @@ from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.scene.log_views import actors_at
 from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
 from scenarios.map_lines import corridor
 from scenarios.recorded import RecordedLog
@@ -170,14 +171,17 @@ def _built(
     shown = shown_photographs(drive, placed)
     begin(work, key)
     write_photographs(work, shown, tell)
-    views = {
-        use: [one.view() for one in shown if one.use == use]
-        for use in ("fitted", "held-out", "never-fitted")
-    }
+    actors = _actors(placed)
+    views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
+    for one in shown:
+        present = actors_at(actors, int(one.picture.t_us or 0))
+        views[one.use].append(replace(one.view(), actors=present))
+    seen = {name for view in views["fitted"] for name in _in_view(view)}
     model, exposures = fitted(
         views["fitted"],
         views["held-out"],
         placed.points,
+        {one.actor_id: one.box for one in actors if one.actor_id in seen},
         scene_id_of(drive),
         work / FIT_FOLDER,
         tell,
@@ -217,7 +221,7 @@ def write_folder(
     scene_id = scene_id_of(drive)
     model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
     standing = standing_obstacles(
-        model.background, placed.points, placed.ground, placed.ego, Vehicle()
+        model.background, placed.points, placed.ground, placed.ego, drive.vehicle
     )
     log = _log(drive, placed, roads, scene_id)
     write_points(
@@ -317,7 +321,9 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
             use = (
                 "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
             )
-            ending = one.file.suffix.lower() if not one.lens.bends else ".png"
+            ending = one.file.suffix.lower() if one.data is None else ".jpg"
+            if one.lens.bends:
+                ending = ".png"
             picture = replace(one, t_us=int(one.t_us or 0) - first_us)
             out.append(
                 Shown(
@@ -343,7 +349,7 @@ def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
         data = (
             cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes()
             if bends
-            else read_bytes(one.picture.file)
+            else one.picture.encoded()
         )
         write_bytes(path, data)
 
@@ -393,12 +399,32 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
         roads,
         placed.ground,
         ego,
-        Vehicle(),
-        (),
+        drive.vehicle,
+        _actors(placed),
         tuple(cameras),
         (x, y, z),
         "",
         notes=(*drive.notes, *placed.notes),
+    )
+
+
+def _in_view(view: PosedView) -> list[str]:
+    """Return the road users whose middle lies in an image."""
+    camera, found = view.camera, []
+    for name, T in view.actors.items():
+        x, y, depth = (camera.T_camera_world @ T[:, 3])[:3]
+        column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        if depth > 0 and 0 <= column < camera.width and 0 <= row < camera.height:
+            found.append(name)
+    return found
+
+
+def _actors(placed: PlacedDrive) -> tuple[Actor, ...]:
+    """Return the road users that move, in the scenario's time."""
+    first_us = int(placed.ego.t_us[0])
+    tracks = [replace(one.track, t_us=one.track.t_us - first_us) for one in placed.actors]
+    return tuple(
+        replace(one, track=track) for one, track in zip(placed.actors, tracks, strict=True)
     )
 
 
@@ -439,6 +465,7 @@ def fitted(
     views: Sequence[PosedView],
     kept: Sequence[PosedView],
     points: Points,
+    boxes: Mapping[str, Box],
     scene_id: str,
     folder: Path,
     tell: Report,
@@ -449,6 +476,7 @@ def fitted(
         views: To fit to.
         kept: Held out.
         points: To start from.
+        boxes: Sizes of the road users that move.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
         tell: Called as the fit goes on.
@@ -463,6 +491,7 @@ def fitted(
         views,
         start,
         kept=kept,
+        boxes=boxes,
         scene_id=scene_id,
         folder=folder,
         seed=SEED,

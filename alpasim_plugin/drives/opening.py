@@ -14,6 +14,7 @@ from alpasim_plugin.core.reading import contents, natural_order, parsing, real, 
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
+from alpasim_plugin.drives.py123d import SYNC_FILE, read_py123d
 from alpasim_plugin.drives.source import Points, SourceDrive, in_order, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
@@ -32,7 +33,7 @@ PAIRS, FEWEST, CLEARLY = (
     40,
     1.5,
 )  # pairs that the axes are tried on; matches that tell; by how much one must be better
-FORMS = "a folder with transforms.json, a KITTI odometry folder (not raw, which has no poses), or a COLMAP model"
+FORMS = "a folder with transforms.json, a KITTI odometry folder (not raw, which has no poses), a COLMAP model, or a log of py123d"
 
 
 def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
@@ -55,6 +56,8 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
             return _transforms(folder, photographs)
         if is_kitti(folder):
             return read_kitti(folder)
+        if os.path.isfile(folder / SYNC_FILE):
+            return read_py123d(folder)
         if models_in(folder):
             return read_colmap(folder, photographs=photographs)
     raise InputError(f"{folder}: {contents(folder)}: no known form of a drive", f"give {FORMS}")

@@ -12,10 +12,12 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
+    interpolate,
     inverse,
+    se3,
     trajectory_from_poses,
 )
-from alpasim_plugin.core.types import F64, HeightField, LaneMap, Trajectory
+from alpasim_plugin.core.types import F64, Actor, HeightField, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
@@ -44,6 +46,7 @@ class PlacedDrive:
         ego: Rig poses.
         mounts: Camera to its pose on the rig.
         poses: Camera to its poses ``(N, 4, 4)``, in the order of the drive's images.
+        actors: Road users that move.
         facts: How up, scale and ground were found, for the page of quality.
         notes: What was assumed.
     """
@@ -55,6 +58,7 @@ class PlacedDrive:
     ego: Trajectory
     mounts: Mapping[str, F64]
     poses: Mapping[str, F64]
+    actors: tuple[Actor, ...]
     facts: Mapping[str, object]
     notes: tuple[str, ...]
 
@@ -89,8 +93,11 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     )
     strip = fit_ground(moved, poses[drive.front][:, :3, 3]) if strip else None
     ego, mounts = _rig(drive, poses, field)
-    mount_note = f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"
-    notes = [found_up, scale_note, mount_note]
+    notes = [found_up, scale_note]
+    if drive.front_xy_m is None:
+        notes.append(
+            f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"
+        )
     if strip is None:
         notes.append(
             f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be measured by these "
@@ -104,6 +111,7 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         ego,
         mounts,
         poses,
+        tuple(replace(one, track=_moved_track(T, one.track)) for one in drive.actors),
         {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)},
         tuple(notes),
     )
@@ -216,6 +224,11 @@ def _moved(T: F64, T_world_camera: F64) -> F64:
     return np.asarray(out)
 
 
+def _moved_track(T: F64, track: Trajectory) -> Trajectory:
+    """Return a track under a rigid transform."""
+    return trajectory_from_poses(track.t_us, T @ se3(track.xyz, track.quat))
+
+
 def _below(path: F64, height: float) -> HeightField:
     """Return the ground at a height below a path that saw none: the path's own heights, nearest
     first.
@@ -232,17 +245,19 @@ def _rig(
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
     front, pictures = poses[drive.front], drive.of(drive.front)
     mount = _front_mount(front, field)
+    if drive.front_xy_m is not None:
+        mount[:2, 3] = drive.front_xy_m
     ego = trajectory_from_poses(
         np.array([int(one.t_us or 0) for one in pictures]),
         np.array([pose @ inverse(mount) for pose in front]),
     )
-    times = {one.t_us: i for i, one in enumerate(pictures)}
     mounts = {drive.front: mount}
     for name in drive.cameras[1:]:
-        common = [(times[one.t_us], i) for i, one in enumerate(drive.of(name)) if one.t_us in times]
+        times = [int(one.t_us or 0) for one in drive.of(name)]
+        common = [i for i, t in enumerate(times) if ego.t_us[0] <= t <= ego.t_us[-1]]
         if common:
-            i, j = common[len(common) // 2]
-            mounts[name] = mount @ inverse(front[i]) @ poses[name][j]
+            i = common[len(common) // 2]
+            mounts[name] = inverse(interpolate(ego, times[i])) @ poses[name][i]
     return ego, mounts
 
 

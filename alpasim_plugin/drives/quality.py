@@ -68,7 +68,8 @@ def measure(
 
 
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
-    out = graph.render(view.camera, {})
+    present = {name: T for name, T in view.actors.items() if name in graph.actors}
+    out = graph.render(view.camera, present)
     shown = replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0)).to_uint8()
     return Comparison(view.name, shown, view.rgb, psnr_db(shown, view.rgb), ssim(shown, view.rgb))
 
@@ -162,7 +163,9 @@ def _page(
     covered = "\n".join(
         f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]
     )
-    notes = [*quality["notes"], "no tracks of other road users: nobody moves"]
+    notes = list(quality["notes"])
+    if not drive.actors:
+        notes.append("no tracks of other road users: nobody moves")
     boxes, ground = quality["obstacles"], quality["ground"]
     sides = (
         f", whose sides are known to {boxes['uncertainty_m']} m (median)" if boxes["boxes"] else ""

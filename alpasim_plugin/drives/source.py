@@ -15,8 +15,8 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import Bound
 from alpasim_plugin.core.reading import natural_order
-from alpasim_plugin.core.types import F64, Bool
-from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
+from alpasim_plugin.core.types import F64, Actor, Bool, Vehicle
+from alpasim_plugin.gaussians.fit.photographs import Picture
 
 JUMP = (
     12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
@@ -81,7 +81,7 @@ class SourceDrive:
     """A recorded drive as its files say it.
 
     Attributes:
-        kind: Of the files: ``kitti``, ``transforms`` or ``colmap``.
+        kind: Of the files: ``kitti``, ``transforms``, ``colmap`` or ``py123d``.
         scene_id: A name for the scenario.
         pictures: All photographs, camera by camera in order of time; each has its time and camera.
         front: The camera that looks ahead and is driven by.
@@ -89,6 +89,10 @@ class SourceDrive:
         metric: What makes lengths metres; None where the unit is arbitrary.
         points: Points that come with the poses; None where there are none.
         notes: What was assumed or left out.
+        actors: Road users that move, of a drive in metres.
+        vehicle: The body that carries the cameras.
+        front_xy_m: Where the front camera stands ahead and to the left of the rear axle; None where
+            that is unknown.
     """
 
     kind: str
@@ -99,6 +103,9 @@ class SourceDrive:
     metric: str | None = None
     points: Points | None = None
     notes: tuple[str, ...] = ()
+    actors: tuple[Actor, ...] = ()
+    vehicle: Vehicle = Vehicle()
+    front_xy_m: tuple[float, float] | None = None
 
     def of(self, camera: str) -> list[Picture]:
         """Return a camera's images in order of time."""
@@ -132,7 +139,7 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
     PHOTOGRAPHS.check(len(pictures), camera)
     for one in drive.pictures:
         if photographs:
-            whole_photograph(one.file, one.lens, one.where)
+            one.encoded()
         size, first = (one.lens.width, one.lens.height), drive.of(str(one.camera))[0].lens
         if size != (first.width, first.height):
             raise InputError(

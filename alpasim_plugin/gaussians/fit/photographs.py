@@ -68,6 +68,7 @@ _KEYS = """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y 
     integer_depth_scale enable_depth_loading n_extra_learnable_dims white_transparent
     black_transparent"""
 KNOWN_KEYS = frozenset(_KEYS.split())
+WHOLE = "give a whole PNG or JPEG in grey or RGB"
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
 
@@ -83,6 +84,7 @@ class Picture:
         t_us: When it was taken; None where that is unknown.
         camera: Name of its camera; None where that is unknown.
         more: What its file says besides.
+        data: The encoded image where the file holds more than this one; None reads the file.
     """
 
     file: Path
@@ -92,17 +94,39 @@ class Picture:
     t_us: int | None
     camera: str | None
     more: Mapping[str, Any]
+    data: memoryview | None = None
+
+    def encoded(self) -> bytes:
+        """Return the encoded image after checking that it is whole and what its lens says, without
+        decoding it.
+
+        Raises:
+            InputError: The file is missing, cut off, of another size, too large, or not in grey or
+                RGB.
+        """
+        do = "check the path, which is relative to the folder, and the file"
+        name = f"{self.where}, {self.file}"
+        data = read_bytes(self.file, SOURCE_BYTES, do) if self.data is None else bytes(self.data)
+        width, height = check_image(data, name, do)
+        if (width, height) != (self.lens.width, self.lens.height):
+            raise InputError(
+                f"{name}: {width}x{height} pixels, the file says {self.lens.width}x{self.lens.height}",
+                "give the photographs as they were",
+            )
+        fault = picture_fault(data)
+        if fault:
+            raise InputError(f"{name}: {fault}", WHOLE)
+        return data
 
     def rgb(self) -> U8:
         """Return the photograph without distortion, ``(H, W, 3)`` uint8 sRGB.
 
         Raises:
-            InputError: The file is missing, damaged, of another size, or in other colours than grey
-                or RGB.
+            InputError: See `encoded`.
         """
-        return np.ascontiguousarray(
-            self.lens.straightened(read_photograph(self.file, self.lens, self.where)[..., ::-1])
-        )
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        bgr = decode_image(self.encoded(), f"{self.where}, {self.file}", WHOLE, flags)
+        return np.ascontiguousarray(self.lens.straightened(np.asarray(bgr, np.uint8)[..., ::-1]))
 
     def view(self) -> PosedView:
         """Return it as a view at full size."""
@@ -336,34 +360,3 @@ def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     ):  # NeRF's own scenes leave the ending out
         return folder / f"{name}.png"
     return path
-
-
-def whole_photograph(path: Path, lens: Lens, where: str) -> bytes:
-    """Return a photograph's file after checking that it is whole and what its lens says, without
-    decoding it.
-
-    Raises:
-        InputError: The file is missing, cut off, of another size, too large, or not in grey or RGB.
-    """
-    do = "check the path, which is relative to the folder, and the file"
-    data = read_bytes(path, SOURCE_BYTES, do)
-    width, height = check_image(data, f"{where}, {path}", do)
-    if (width, height) != (lens.width, lens.height):
-        raise InputError(
-            f"{where}, {path}: {width}x{height} pixels, the file says {lens.width}x{lens.height}",
-            "give the photographs as they were",
-        )
-    fault = picture_fault(data)
-    if fault:
-        raise InputError(f"{where}, {path}: {fault}", "give a whole PNG or JPEG in grey or RGB")
-    return data
-
-
-def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_COLOR) -> U8:
-    """Read a photograph as it is, BGR or grey; see `whole_photograph`."""
-    data = whole_photograph(path, lens, where)
-    do = "give a whole PNG or JPEG in grey or RGB"
-    return np.asarray(
-        decode_image(data, f"{where}, {path}", do, flag | cv2.IMREAD_IGNORE_ORIENTATION),
-        dtype=np.uint8,
-    )

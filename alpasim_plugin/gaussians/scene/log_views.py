@@ -16,15 +16,20 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.types import F32, F64, Scenario
+from alpasim_plugin.core.types import F32, F64, Actor, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
 
 def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:
-    """Return the recorded poses of the actors present at a time."""
+    """Return the recorded poses of the scenario's actors present at a time."""
+    return actors_at(scenario.actors, t_us)
+
+
+def actors_at(actors: Sequence[Actor], t_us: int) -> dict[str, F64]:
+    """Return the poses ``(4, 4)`` of the actors present at a time, by id."""
     return {
         a.actor_id: interpolate(a.track, t_us)
-        for a in scenario.actors
+        for a in actors
         if a.track.t_us[0] <= t_us <= a.track.t_us[-1]
     }
 

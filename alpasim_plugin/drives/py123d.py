@@ -1,0 +1,214 @@
+"""Logs that py123d has converted: nuScenes, nuPlan, Waymo, PandaSet, KITTI-360 and others.
+
+A log is a folder with one Arrow IPC file a modality, named by its key; its columns begin with that
+key, and its schema's ``metadata`` is a msgpack document. Poses are x, y, z and ``wxyz``; boxes add
+length, width and height. An image is a JPEG or PNG, the path of one, or the number of a frame of
+the film beside the file. Read are the ego's poses, pinhole cameras and boxes of road users.
+
+Source: the writers of py123d 0.7.0 (github.com/kesai-labs/py123d).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import msgpack
+import numpy as np
+import pyarrow as pa
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse, se3
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
+from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
+from alpasim_plugin.gaussians.fit.lens import Lens
+from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
+from scenarios.recorded import actors_of_track, checked_trajectory
+
+SYNC_FILE = "sync.arrow"
+EGO, BOXES, CAMERA = "ego_state_se3", "box_detections_se3", "camera."
+DO_THIS = "convert the log again with py123d 0.1 or later"
+FRONT = ("pcam_f0", "pcam_stereo_l")  # the first that is there is driven by
+SPARE = "pcam_stereo_r"  # shows what the left one shows: kept for measuring
+FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # intrinsics count pixel centres
+LABELS = {
+    "b": "bus",
+    "c": "car",
+    "m": "motorcycle",
+    "o": "other",
+    "p": "pedestrian",
+    "t": "truck",
+    "y": "cyclist",
+}
+# The labels of each data set's classes, in the order of their numbers.
+CLASSES = {
+    "AV2SensorBoxDetectionLabel": "obyyotboootoommppocboopotttpyy",
+    "DefaultBoxDetectionLabel": "ccoypooooooo",
+    "KITTI360BoxDetectionLabel": "yobctompoyooootooto",
+    "NuPlanBoxDetectionLabel": "cypoooo",
+    "NuScenesBoxDetectionLabel": "ctbbttctympppppppoooooo",
+    "PandasetBoxDetectionLabel": "ooybcoottmmtycpppcoootooooo",
+    "PhysicalAIAVBoxDetectionLabel": "cpbtcoyptoob",
+    "WODPerceptionBoxDetectionLabel": "ocpoy",
+}
+
+
+def read_py123d(folder: Path) -> SourceDrive:
+    """Read a log: the front camera is driven by, all pinhole cameras are fitted.
+
+    Raises:
+        InputError: A file is missing, damaged or of another schema, or a pose is no rigid motion;
+            the message names it.
+    """
+    log, _ = _modality(folder, "sync", ())
+    with parsing(folder / SYNC_FILE, DO_THIS):
+        scene_id = str(log["log_name"])
+    body, (times, poses) = _modality(folder, EGO, ("timestamp_us", "imu_se3"))
+    where = folder / f"{EGO}.arrow"
+    with parsing(where, DO_THIS):
+        table = np.array(poses.to_pylist(), np.float64).reshape(-1, 7)
+        ego = checked_trajectory(where, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
+        T_imu_axle, T_imu_centre = _T(body["rear_axle_to_imu_se3"]), _T(body["center_to_imu_se3"])
+        vehicle = Vehicle(
+            Box(body["length"], body["width"], body["height"]),
+            float(T_imu_centre[0, 3] - T_imu_axle[0, 3]),
+            body["wheel_base"],
+        )
+    notes: list[str] = []
+    keys = sorted(path.stem for path in folder.glob("*.arrow"))
+    cameras: dict[str, list[Picture]] = {}
+    for key in (key for key in keys if key.startswith(CAMERA)):
+        pictures = _camera(folder, key, ego, notes)
+        if pictures:
+            cameras[key.removeprefix(CAMERA)] = pictures
+    if not cameras:
+        raise InputError(f"{folder}: no pinhole camera with images", DO_THIS)
+    front = next((name for name in FRONT if name in cameras), min(cameras))
+    last_us = int(cameras[front][: int(PHOTOGRAPHS.high)][-1].t_us or 0)
+    every = [one for pictures in cameras.values() for one in pictures]
+    chosen = tuple(one for one in every if int(one.t_us or 0) <= last_us)
+    if len(chosen) < len(every):
+        notes.append(f"{len(every) - len(chosen)} photographs after the first of {front} left out")
+    actors = _actors(folder, notes) if BOXES in keys else ()
+    unread = [key for key in keys if key not in ("sync", EGO, BOXES) and not key.startswith(CAMERA)]
+    if unread:
+        notes.append(f"not read: {', '.join(unread)}")
+    T_front = _T(_modality(folder, CAMERA + front, ())[0]["camera_to_imu_se3"])
+    ahead_m, left_m = (inverse(T_imu_axle) @ T_front)[:2, 3].tolist()
+    return SourceDrive(
+        "py123d",
+        scene_id,
+        chosen,
+        front,
+        tuple({SPARE} & set(cameras) - {front}),
+        metric="the poses, metres",
+        notes=tuple(notes),
+        actors=actors,
+        vehicle=vehicle,
+        front_xy_m=(ahead_m, left_m),
+    )
+
+
+def _modality(
+    folder: Path, key: str, columns: Sequence[str]
+) -> tuple[JsonObject, list[pa.ChunkedArray]]:
+    """Return the metadata of a file and columns of it, which stay on the disk until they are used."""
+    path = folder / f"{key}.arrow"
+    with parsing(path, DO_THIS, "no Arrow file of py123d"):
+        table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+        table.validate(full=True)
+        facts = msgpack.unpackb((table.schema.metadata or {})[b"metadata"], strict_map_key=False)
+        return facts, [table.column(f"{key}.{name}") for name in columns]
+
+
+def _T(pose: Sequence[float]) -> F64:
+    """Return the transform ``(4, 4)`` of x, y, z and ``wxyz``."""
+    return se3(pose[:3], pose[3:7])
+
+
+def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[Picture]:
+    """Return the photographs of a camera in order of time; none of a camera that is no pinhole."""
+    path, name = folder / f"{key}.arrow", key.removeprefix(CAMERA)
+    facts, columns = _modality(folder, key, ("timestamp_us", "data", "camera_to_global_se3"))
+    with parsing(path, DO_THIS):
+        model = facts["camera_model"]
+        if model != "pinhole" or facts["intrinsics"] is None:
+            notes.append(f"camera {name} left out: {model} without a pinhole's intrinsics")
+            return []
+        fx, fy, cx, cy, skew = facts["intrinsics"]
+        if skew:
+            raise InputError(f"{path}: a lens with skew {skew:g}", "give images without skew")
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + FROM_CORNER
+        bends = None if facts["is_undistorted"] else facts["distortion"]
+        distortion = np.array(bends or [0.0] * 5)
+        lens = Lens(facts["width"], facts["height"], K, distortion).check(str(path), DO_THIS)
+        times = columns[0].to_numpy()
+        if not (np.diff(times) > 0).all():
+            raise InputError(f"{path}: times that do not increase", DO_THIS)
+        film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(columns[1].type) else []
+        T_imu_camera = _T(facts["camera_to_imu_se3"])
+        pictures = []
+        for i, (data, pose) in enumerate(zip(columns[1], columns[2].to_pylist(), strict=True)):
+            if not data.is_valid:
+                continue
+            where, t_us = f"{path}, row {i}", int(times[i])
+            known_us = min(max(t_us, int(ego.t_us[0])), int(ego.t_us[-1]))
+            T = interpolate(ego, known_us) @ T_imu_camera if pose is None else _T(pose)
+            file, encoded = path, None
+            if pa.types.is_string(columns[1].type):
+                file = folder / data.as_py()
+                if not os.path.isfile(file):
+                    raise InputError(
+                        f"{where}: no photograph {file}",
+                        f"link the data set's folder {Path(data.as_py()).parts[0]} into the log's folder, or convert with camera_store_option: jpeg_binary",
+                    )
+            else:
+                encoded = memoryview(film[data.as_py()] if film else data.as_buffer())
+            T = rigid_pose(T.tolist(), where)
+            pictures.append(Picture(file, lens, T, where, t_us, name, {}, encoded))
+    if len(pictures) < len(times):
+        notes.append(f"camera {name}: {len(times) - len(pictures)} rows without an image left out")
+    return pictures
+
+
+def _film(path: Path) -> list[bytes]:
+    """Return the frames of a film as JPEG."""
+    frames = []
+    film = cv2.VideoCapture(str(path))
+    while True:
+        is_read, image = film.read()
+        if not is_read:
+            return frames
+        frames.append(cv2.imencode(".jpg", image)[1].tobytes())
+
+
+def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
+    """Return the road users that move; what stands is found in the reconstruction."""
+    names = ("timestamp_us", "bounding_box_se3", "track_token", "label")
+    facts, columns = _modality(folder, BOXES, names)
+    path = folder / f"{BOXES}.arrow"
+    tracks: dict[str, list[list[float]]] = {}
+    with parsing(path, DO_THIS):
+        kind = str(facts["box_detection_label_class"]).rpartition(".")[2]
+        for t_us, boxes, tokens, labels in zip(*(one.to_pylist() for one in columns), strict=True):
+            for box, token, label in zip(boxes, tokens, labels, strict=True):
+                tracks.setdefault(str(token), []).append([t_us, *box, label])
+        if kind not in CLASSES:
+            notes.append(f"road users of the unknown classes {kind} are labelled 'other'")
+        found: list[Actor] = []
+        for token in sorted(tracks):
+            table = np.array(tracks[token], np.float64).reshape(-1, 12)
+            letter = CLASSES[kind][int(table[0, 11])] if kind in CLASSES else "o"
+            times = table[:, 0].astype(np.int64)
+            where = f"{path}, track {token}"
+            track = checked_trajectory(where, times, table[:, 1:4], table[:, 4:8])
+            length_m, width_m, height_m = np.median(table[:, 8:11], axis=0).tolist()
+            box = Box(length_m, width_m, height_m)
+            found += actors_of_track(token, LABELS[letter], box, track)
+    moving = tuple(one for one in found if not one.is_static and len(one.track) > 1)
+    notes.append(f"{len(moving)} road users move; boxes of {len(found) - len(moving)} are not used")
+    return moving

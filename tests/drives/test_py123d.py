@@ -1,0 +1,77 @@
+"""Logs of py123d give the same street as every other form, with its road users."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import msgpack
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.drives.build import _actors, import_drive
+from alpasim_plugin.drives.opening import read_source
+from scenarios.load import load_scenario
+from tests.drives.py123d_log import ORIGIN, TYPES, write_py123d
+from tests.drives.street import COUNT
+from tests.drives.test_readers import assert_is_the_street, opened
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return write_py123d(tmp_path_factory.mktemp("py123d") / "log")
+
+
+def test_a_log_is_the_street_with_its_vehicle_and_the_car_that_moves(log):
+    drive, placed = opened(log)
+    assert (drive.kind, drive.scene_id, drive.front) == ("py123d", "street-1", "pcam_f0")
+    assert_is_the_street(placed)
+    assert placed.mounts["pcam_f0"][:2, 3] == pytest.approx([1.2, 0.1])
+    assert (drive.vehicle.box.length_m, drive.vehicle.rear_axle_to_centre_m) == (5.0, 1.5)
+    (car,) = _actors(placed)
+    assert (car.actor_id, car.label, car.box.width_m) == ("a1", "car", 1.8)
+    way = interpolate(car.track, 1_000_000)[:2, 3] - interpolate(car.track, 0)[:2, 3]
+    assert np.linalg.norm(way) == pytest.approx(5.0, rel=0.03)
+    assert any("lidar.lidar_top" in note for note in drive.notes)
+
+
+@pytest.mark.parametrize("codec", sorted(TYPES))
+def test_images_are_read_however_they_are_kept(tmp_path, log, codec):
+    drive = read_source(write_py123d(tmp_path / codec, codec, implicit_poses=True))
+    truth = read_source(log)
+    assert len(drive.pictures) == COUNT
+    one, other = drive.pictures[5], truth.pictures[5]
+    assert np.abs(one.rgb().astype(float) - other.rgb()).mean() < 12
+    assert one.T_world_camera == pytest.approx(other.T_world_camera)
+    assert one.T_world_camera[:2, 3] == pytest.approx(ORIGIN[:2] + np.array([3.0, 0.0]), abs=0.1)
+
+
+def test_an_imported_log_drives_with_its_road_user(log, tmp_path, quick_fit):
+    import_drive(log, tmp_path / "out")
+    scenario = load_scenario(tmp_path / "out/scenario.yaml")
+    car = next(one for one in scenario.actors if one.actor_id == "a1")
+    assert (car.label, car.is_static, len(car.track)) == ("car", False, COUNT)
+    assert scenario.vehicle.wheelbase_m == 3.0
+    assert "nobody moves" not in str(json.loads((tmp_path / "out/quality.json").read_text()))
+
+
+@pytest.mark.parametrize("name", ["sync", "ego_state_se3", "camera.pcam_f0", "box_detections_se3"])
+@pytest.mark.parametrize("fault", ["of another schema", "without metadata", "cut off"])
+def test_a_file_that_is_none_of_py123d_is_named(log, tmp_path, name, fault):
+    folder = shutil.copytree(log, tmp_path / "log")
+    path = folder / f"{name}.arrow"
+    if fault == "cut off":
+        path.write_bytes(path.read_bytes()[:-300])
+    else:
+        facts = {b"metadata": msgpack.packb({"name": 1})} if fault == "of another schema" else {}
+        table = pa.table({"a": [1]}).replace_schema_metadata(facts)
+        with pa.ipc.new_file(str(path), table.schema) as file:
+            file.write_table(table)
+    with pytest.raises(InputError) as caught:
+        read_source(folder)
+    assert f"{name}.arrow" in str(caught.value)
