@@ -295,11 +295,16 @@ ROUTE_LEFT = Situation("the route alone bends left", steps=STEPS, route_1pm=BEND
 NO_ROUTE = Situation("no route", steps=STEPS, has_route=False)
 IMAGE_LEFT = replace(NO_ROUTE, name="no route, the image bends left", image_1pm=BEND)
 IMAGES = (NO_ROUTE, IMAGE_LEFT)
+CAMERAS = (
+    pinhole_camera(),
+    pinhole_camera("left", mount_m=(1.6, 0.5, 1.5), yaw_deg=60.0),
+    pinhole_camera("right", mount_m=(1.6, -0.5, 1.5), yaw_deg=-60.0),
+)
 
 
-def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scenario:
+def canned_scenario(cameras: Sequence[CameraSpec] = CAMERAS) -> Scenario:
     """Return the scenario that `check_policy` plays by default: straight on at 10 m/s, no actors,
-    an empty map.
+    an empty map; cameras to the front and to the sides.
     """
     t_us = START_US - 1_000_000 + STEP_US * np.arange(80)
     poses = [T_WORLD_ROAD @ se2(10.0 * (int(t) - START_US) * 1e-6, 0.0, 0.0) for t in t_us]

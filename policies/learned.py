@@ -1,4 +1,4 @@
-"""Drive by a small network trained by imitation on clean frames: image, speed and a navigation
+"""Drive by a small network trained by imitation on clean frames: images, speed and a navigation
 command in, trajectory out.
 """
 
@@ -15,9 +15,15 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import MIN_CRUISE_MPS, camera_frame, front_camera, plan_times, seconds
+from policies.base import MIN_CRUISE_MPS, camera_frame, plan_times, seconds
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
-from policies.learned_input import COMMANDS, level_view, network_input, route_command
+from policies.learned_input import (
+    COMMANDS,
+    level_view,
+    network_input,
+    route_command,
+    view_camera,
+)
 
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
 EARLIER_US = 500_000  # age of the earlier frame, which shows motion
@@ -29,13 +35,13 @@ STANDS_MPS = 0.3
 class Learned(Policy):
     """Predict a path and a speed profile with a network, and drive a sample of the prediction.
 
-    It reads two frames of one camera, 0.5 s apart, the car's speed, the initial speed of the drive
-    as the desired speed, and one of five commands computed from the route
+    It reads two frames, 0.5 s apart, of each camera that its weights declare, the car's speed, the
+    initial speed of the drive as the desired speed, and one of five commands computed from the route
     (`policies.learned_input`). It gets no other information on the route: the position in the lane
     comes from the image. It was trained on frames of the renderer ``clean`` only.
 
     Args:
-        scenario: Gives the camera, the scene's id for the random streams, and nothing else.
+        scenario: Gives the cameras, the scene's id for the random streams, and nothing else.
         weights: File that ``simrun train policy`` wrote; None takes the class's ``files``. In runs,
             name a subclass whose ``files`` is the file: a rollout's content key holds that file's
             digest.
@@ -43,8 +49,8 @@ class Learned(Policy):
             the mean.
 
     Raises:
-        InputError: No camera looks ahead, the weights are missing or of another network, or the
-            temperature is negative.
+        InputError: No camera for a view of the weights, the weights are missing or of another
+            network, or the temperature is negative.
     """
 
     files: ClassVar[tuple[Path, ...]] = (WEIGHTS,)  # part of a rollout's key
@@ -60,10 +66,10 @@ class Learned(Policy):
                 f"temperature: {temperature}",
                 "give 0 or a positive number",
             )
-        self.camera = front_camera(scenario)
-        self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
         self.net = load_net(type(self).files[0] if weights is None else Path(weights))
+        self.cameras = [view_camera(scenario, view) for view in self.net.views]
+        self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(c.name) for c in self.cameras)
         self.grid_m, self.weights = path_grid(), knot_weights()
         self.reset(0, scenario.route)
 
@@ -72,19 +78,20 @@ class Learned(Policy):
         self.seed, self.step, self.acted_us = seed, 0, 0
         self.noise: F64 | None = None  # errors of the samples, correlated over seconds
         self.desired_mps: float | None = None
-        self.views: deque[tuple[int, U8]] = deque()
+        self.histories: list[deque[tuple[int, U8]]] = [deque() for _ in self.cameras]
 
     def act(self, observation: Observation) -> Plan:
-        """Return a plan sampled from the network's prediction for the newest frame.
+        """Return a plan sampled from the network's prediction for the newest frames.
 
         Raises:
-            PolicyError: The observation has no frame of the camera, or one of another size.
+            PolicyError: The observation has no frame of a camera, or one of another size.
         """
-        frame = camera_frame(observation, self.camera, "learned")
-        if not self.views or frame.t_us > self.views[-1][0]:
-            self.views.append((frame.t_us, level_view(frame.rgb, self.camera)))
-        while self.views[0][0] < frame.t_us - EARLIEST_US:
-            self.views.popleft()
+        for view, camera, history in zip(self.net.views, self.cameras, self.histories, strict=True):
+            frame = camera_frame(observation, camera, "learned")
+            if not history or frame.t_us > history[-1][0]:
+                history.append((frame.t_us, level_view(frame.rgb, camera, view=view)))
+            while history[0][0] < frame.t_us - EARLIEST_US:
+                history.popleft()
         speed = max(observation.ego.speed_mps, 0.0)
         if self.desired_mps is None:
             self.desired_mps = max(speed, MIN_CRUISE_MPS)
@@ -121,9 +128,14 @@ class Learned(Policy):
 
         from policies.learned_net import SPEED_UNIT_MPS
 
-        t_us, now = self.views[-1]
-        earlier = min(self.views, key=lambda view: abs(t_us - EARLIER_US - view[0]))
-        real = t_us - earlier[0] > EARLIER_US // 2
+        images = []
+        real = True  # every camera has an earlier frame
+        for history in self.histories:
+            t_us, now = history[-1]
+            earlier_us, earlier = min(history, key=lambda seen: abs(t_us - EARLIER_US - seen[0]))
+            if t_us - earlier_us <= EARLIER_US // 2:
+                earlier, real = now, False
+            images.append(torch.from_numpy(network_input(now, earlier))[None])
         assert self.desired_mps is not None
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()
@@ -133,9 +145,8 @@ class Learned(Policy):
             )  # the order of summation in a convolution depends on the thread count
         try:
             with torch.inference_mode():
-                image = torch.from_numpy(network_input(now, earlier[1] if real else now))[None]
                 prediction = self.net(
-                    image, torch.tensor([state]), torch.tensor([COMMANDS.index(command)])
+                    images, torch.tensor([state]), torch.tensor([COMMANDS.index(command)])
                 )
         finally:
             if threads != 1:

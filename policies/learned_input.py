@@ -1,16 +1,19 @@
-"""Navigation command of the learned policy: one of five, computed from the shape of the route
-ahead.
+"""What the learned policy's network receives: level views of the world, and one of five navigation
+commands, computed from the shape of the route ahead.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import wrap_angle
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Scenario
+from policies.base import front_camera
 
 Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
 COMMANDS: tuple[Command, ...] = get_args(Command)
@@ -18,12 +21,9 @@ COMMANDS: tuple[Command, ...] = get_args(Command)
 TURN_RADIUS_M = 28.0  # tighter curves are turns and are announced; wider ones belong to the road
 AHEAD_M, NOW_M = 40.0, 6.0
 
-WIDTH, HEIGHT = 192, 80  # pixels
-FOCAL_PX = 125.0  # 75 degrees across
-HORIZON_ROW = 18.0
+SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther apart
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
 MEAN, STD = 115.0, 64.0  # grey levels
-_K = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HORIZON_ROW], [0.0, 0.0, 1.0]])
 _RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
@@ -59,25 +59,81 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     return "right-now" if now else "right-ahead"
 
 
-def view_homography(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
+@dataclass(frozen=True)
+class View:
+    """A level image that is cut from a camera's frame.
+
+    Attributes:
+        name: Of the view.
+        yaw_deg: Direction of its middle column, from the rig's x axis to the left.
+        width, height: Pixels.
+        focal_px: Focal length.
+        horizon_row: Row of the horizon.
+    """
+
+    name: str
+    yaw_deg: float
+    width: int
+    height: int
+    focal_px: float
+    horizon_row: float
+
+    @property
+    def K(self) -> F64:
+        """Intrinsics ``(3, 3)``."""
+        f = self.focal_px
+        return np.array([[f, 0.0, self.width / 2], [0.0, f, self.horizon_row], [0.0, 0.0, 1.0]])
+
+
+FRONT = View("front", 0.0, 192, 80, 125.0, 18.0)  # 75 degrees across
+SIDES = (
+    View("left", 60.0, 128, 32, 83.4, 10.0),
+    View("right", -60.0, 128, 32, 83.4, 10.0),
+)
+
+
+def view_camera(scenario: Scenario, view: View) -> CameraSpec:
+    """Return the camera that a view is cut from: `front_camera`, or for a view to the side the
+    pinhole whose axis is nearest to the view's.
+
+    Raises:
+        InputError: No pinhole looks there.
+    """
+    if view.yaw_deg == 0.0:
+        return front_camera(scenario)
+    yaw_rad = np.deg2rad(view.yaw_deg)
+    middle = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
+    pinholes = [camera for camera in scenario.cameras if camera.lens is None]
+    nearness = {camera.name: float(camera.T_rig_camera[:3, 2] @ middle) for camera in pinholes}
+    for camera in sorted(pinholes, key=lambda one: (-nearness[one.name], one.name)):
+        if nearness[camera.name] > np.cos(np.deg2rad(SIDE_DEG)):
+            return camera
+    raise InputError(
+        f"scene {scenario.scene_id!r}: no pinhole for the view {view.name!r}, {view.yaw_deg:g} degrees from ahead, among its cameras {', '.join(camera.name for camera in scenario.cameras)}",
+        f"Add a camera with `yaw_deg: {view.yaw_deg:g}` to `cameras`, use `cameras: {{rig: surround-6}}`, or choose another policy.",
+    )
+
+
+def view_homography(camera: CameraSpec, yaw_rad: float = 0.0, view: View = FRONT) -> F64:
     """Return the homography ``(3, 3)`` from pixels of the view to pixels of the camera.
 
-    The view is level along the rig's x axis, rotated to the left by ``yaw_rad``, at the camera's
-    position: a pure rotation, so no depth is needed.
+    The view is level, rotated to the left by a further ``yaw_rad``, at the camera's position: a
+    pure rotation, so no depth is needed.
     """
+    yaw_rad = yaw_rad + np.deg2rad(view.yaw_deg)
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     rotation = camera.T_rig_camera[:3, :3].T @ turn @ _RIG_FROM_LEVEL_CAMERA
-    return camera.K @ rotation @ np.linalg.inv(_K)
+    return camera.K @ rotation @ np.linalg.inv(view.K)
 
 
-def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
-    """Return the view ``(80, 192, 3)`` of a frame ``(H, W, 3)``; borders are replicated.
+def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0, view: View = FRONT) -> U8:
+    """Return the view of a frame ``(H, W, 3)``, of the view's size; borders are replicated.
 
     Frames of higher angular resolution are area-averaged first.
     """
-    to_camera = view_homography(camera, yaw_rad)
-    shrink = int(camera.K[0, 0] / FOCAL_PX)
+    to_camera = view_homography(camera, yaw_rad, view)
+    shrink = int(camera.K[0, 0] / view.focal_px)
     if shrink > 1:
         size = (rgb.shape[1] // shrink, rgb.shape[0] // shrink)
         scale = np.diag([size[0] / rgb.shape[1], size[1] / rgb.shape[0], 1.0])
@@ -87,14 +143,13 @@ def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         to_camera = np.linalg.inv(centre) @ scale @ centre @ to_camera
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpPerspective(
-        rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
+    size = (view.width, view.height)
+    return cv2.warpPerspective(rgb, to_camera, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 def network_input(now: U8, before: U8) -> F32:
-    """Return the network's input ``(4, 80, 192)`` from two views ``(80, 192, 3)``."""
-    out = np.empty((CHANNELS, HEIGHT, WIDTH), dtype=np.float32)
+    """Return the network's input ``(4, H, W)`` from a view now and before, ``(H, W, 3)``."""
+    out = np.empty((CHANNELS, *now.shape[:2]), dtype=np.float32)
     out[:3] = now.transpose(2, 0, 1)
     out[3] = before.astype(np.float32) @ _GREY
     return (out - np.float32(MEAN)) / np.float32(STD)

@@ -1,22 +1,26 @@
-"""The learned policy's network: image, two speeds and a command to a path and a speed profile, with
+"""The learned policy's network: views, two speeds and a command to a path and a speed profile, with
 heteroscedastic sigma.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import pydantic
 import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import check_regular, parsing
+from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.core.types import F64
-from policies.learned_input import CHANNELS, COMMANDS, HEIGHT, WIDTH
+from policies.learned_input import CHANNELS, COMMANDS, FRONT, View
 
 KNOTS_M = (
     2.0,
@@ -39,6 +43,8 @@ _SPEED_SCALE = [1.5 * t for t in TIMES_S]  # metres per second
 _PARTS = [len(KNOTS_M), len(TIMES_S), 2, 2]
 _MIN_SIGMA = 0.02
 PROXIMITY_M = 20.0
+VIEWS = "views"  # entry in the header of the weights
+MOST_PIXELS = 512
 
 
 @dataclass(frozen=True)
@@ -55,12 +61,13 @@ class Prediction:
 
 
 class LearnedNet(nn.Module):
-    """Six convolutions over the image, then two fully connected layers with speeds and command;
+    """Six convolutions over each view, then two fully connected layers with speeds and command;
     attribute names are checkpoint keys.
     """
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, views: Sequence[View] = (FRONT,)) -> None:
         super().__init__()
+        self.views = tuple(views)
         self.see = nn.Sequential(
             nn.Conv2d(CHANNELS, 16, 5, 2, 2),
             nn.ReLU(),
@@ -82,7 +89,7 @@ class LearnedNet(nn.Module):
         )
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
-        features = 24 * (HEIGHT // 16) * (WIDTH // 16)
+        features = sum(24 * (view.height // 16) * (view.width // 16) for view in views)
         self.plan = nn.Sequential(
             nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
         )
@@ -103,11 +110,12 @@ class LearnedNet(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, image: Tensor, state: Tensor, command: Tensor) -> Prediction:
-        """Predict from images ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands
-        ``(B,)``.
+    def forward(self, images: Sequence[Tensor], state: Tensor, command: Tensor) -> Prediction:
+        """Predict from an image ``(B, 4, H, W)`` of each view, states ``(B, 3)`` and indices of
+        commands ``(B,)``.
         """
-        features = torch.cat([self.see(image), self.state(state), self.word(command)], dim=1)
+        seen = [self.see(image) for image in images]
+        features = torch.cat([*seen, self.state(state), self.word(command)], dim=1)
         heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
@@ -130,10 +138,30 @@ def knot_weights() -> F64:
 
 
 def save_net(net: LearnedNet, path: Path, metadata: dict[str, str]) -> None:
-    """Write the weights in float16."""
-    write_safetensors(
-        path, {name: value.half() for name, value in net.state_dict().items()}, metadata
-    )
+    """Write the weights in float16, and the views that they read."""
+    weights = {name: value.half() for name, value in net.state_dict().items()}
+    views = json.dumps([asdict(view) for view in net.views])
+    write_safetensors(path, weights, {**metadata, VIEWS: views})
+
+
+def read_views(path: Path) -> tuple[View, ...]:
+    """Return the views that weights read; the front one where they name none.
+
+    Raises:
+        InputError: No such file, or entries that are no views.
+    """
+    text = read_metadata(path, "give weights that 'simrun train policy' wrote").get(VIEWS)
+    if text is None:
+        return (FRONT,)
+    with parsing(path, "train the policy again", f"the entry {VIEWS!r} holds no views"):
+        views = pydantic.TypeAdapter(tuple[View, ...]).validate_json(text)
+    sizes = [size for view in views for size in (view.width, view.height)]
+    if not views or not all(16 <= size <= MOST_PIXELS for size in sizes):
+        raise InputError(
+            f"{path}: views of {sizes} pixels, width and height in turn",
+            f"train it with views of 16 to {MOST_PIXELS} pixels",
+        )
+    return views
 
 
 def load_net(path: Path) -> LearnedNet:
@@ -142,8 +170,7 @@ def load_net(path: Path) -> LearnedNet:
     Raises:
         InputError: No such file, or not weights of this network.
     """
-    check_regular(path, do_this="give weights that 'simrun train policy' wrote")
-    net = LearnedNet()
+    net = LearnedNet(views=read_views(path))
     wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
     with parsing(path, "copy or train it again", "not a complete safetensors file"):
         state = load_file(str(path))

@@ -34,12 +34,17 @@ def pinhole_camera(
     hfov_deg: float = 70.0,
     mount_m: tuple[float, float, float] = (1.6, 0.0, 1.5),
     pitch_deg: float = 0.0,
+    yaw_deg: float = 0.0,
 ) -> CameraSpec:
-    """Return a camera that looks along the rig's x axis; a positive pitch looks down."""
+    """Return a camera that looks along the rig's x axis, turned to the left by ``yaw_deg``; a
+    positive pitch looks down.
+    """
     f = width / 2 / np.tan(np.radians(hfov_deg) / 2)
     K = np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
-    pitch = np.radians(pitch_deg)
-    forward, right = np.array([np.cos(pitch), 0.0, -np.sin(pitch)]), np.array([0.0, -1.0, 0.0])
+    pitch, yaw = np.radians(pitch_deg), np.radians(yaw_deg)
+    c, s = np.cos(yaw), np.sin(yaw)
+    forward = np.array([np.cos(pitch) * c, np.cos(pitch) * s, -np.sin(pitch)])
+    right = np.array([s, -c, 0.0])
     T = np.eye(4)
     T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     T[:3, 3] = mount_m

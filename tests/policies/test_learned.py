@@ -2,23 +2,26 @@
 image.
 """
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import inverse, se2, transform_points
 from alpasim_plugin.core.types import EgoState, Observation
 from policies.base import make_policy
-from policies.conformance import STRAIGHT, check_policy, observations
+from policies.conformance import STRAIGHT, canned_scenario, check_policy, observations
 from policies.learned import Learned
 from policies.learned_input import (
-    FOCAL_PX,
-    HEIGHT,
-    HORIZON_ROW,
-    WIDTH,
+    FRONT,
+    SIDES,
     level_view,
     route_command,
+    view_camera,
     view_homography,
 )
 from policies.learned_net import (
@@ -48,8 +51,8 @@ def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera():
             view = np.linalg.inv(view_homography(camera, turn)) @ pixel
             ahead = se2(0.0, 0.0, turn)[:3, :3].T @ (point - camera.T_rig_camera[:3, 3])
             wanted = [
-                WIDTH / 2 - FOCAL_PX * ahead[1] / ahead[0],
-                HORIZON_ROW - FOCAL_PX * ahead[2] / ahead[0],
+                FRONT.width / 2 - FRONT.focal_px * ahead[1] / ahead[0],
+                FRONT.horizon_row - FRONT.focal_px * ahead[2] / ahead[0],
             ]
             np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
 
@@ -63,10 +66,25 @@ def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view():
     sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
     for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
         views.append(level_view(road.image(camera, pose), camera)[24:60, 10:-10].astype(float))
-        assert level_view(road.image(camera, pose), camera).shape == (HEIGHT, WIDTH, 3)
+        assert level_view(road.image(camera, pose), camera).shape == (80, 192, 3)
     for other in views[1:]:
         assert np.abs(other - views[0]).mean() < 6.0
         assert np.corrcoef(other.ravel(), views[0].ravel())[0, 1] > 0.95
+
+
+def test_views_meet_at_their_edges_and_a_missing_camera_is_named():
+    cameras = [view_camera(canned_scenario(), view) for view in (FRONT, *SIDES)]
+    assert [camera.name for camera in cameras] == ["front", "left", "right"]
+    far = 1e6 * np.array([np.cos(np.deg2rad(30.0)), np.sin(np.deg2rad(30.0)), 0.0])
+    columns = []
+    for view, camera in zip((FRONT, SIDES[0]), cameras, strict=False):
+        pixel = camera.K @ transform_points(inverse(camera.T_rig_camera), far[None])[0]
+        seen = np.linalg.inv(view_homography(camera, 0.0, view)) @ pixel
+        assert seen[1] / seen[2] == pytest.approx(view.horizon_row, abs=1e-3)
+        columns.append((seen[0] / seen[2] - view.width / 2) / view.focal_px)
+    np.testing.assert_allclose(np.degrees(np.arctan(columns)), [-30.0, 30.0], atol=1e-3)
+    with pytest.raises(InputError, match="right"):
+        view_camera(canned_scenario(canned_scenario().cameras[:2]), SIDES[1])
 
 
 # --- the command
@@ -105,20 +123,25 @@ def test_route_that_is_over_or_absent_gives_keep():
 
 
 def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path):
-    net = LearnedNet(3)
+    net = LearnedNet(3, (FRONT, *SIDES))
     path = tmp_path / "net.safetensors"
     save_net(net, path, {})
+    assert load_net(path).views == (FRONT, *SIDES)
     for name, value in load_net(path).state_dict().items():
         torch.testing.assert_close(value, net.state_dict()[name], atol=1e-3, rtol=1e-3)
     with pytest.raises(InputError, match="no such file"):
         Learned(scenario_with(), weights=tmp_path / "absent")
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match="not a complete safetensors file"):
+    with pytest.raises(InputError, match="not safetensors"):
         Learned(scenario_with(), weights=path)
     del net.word
     save_net(net, path, {})
     with pytest.raises(InputError, match=r"first word\.weight"):
         Learned(scenario_with(), weights=path)
+    for views in ('[{"name": "front"}]', "[]", json.dumps([asdict(FRONT) | {"width": 10**9}])):
+        write_safetensors(path, LearnedNet().state_dict(), {"views": views})
+        with pytest.raises(InputError, match="views"):
+            Learned(scenario_with(), weights=path)
 
 
 # --- the policy
@@ -140,6 +163,20 @@ def policy_route():
 def test_it_keeps_the_contract():
     report = check_policy("learned")
     assert report.ok, str(report)
+
+
+def test_shipped_weights_drive_as_they_did():
+    """The plans of the front camera's network, as recorded before it could have other views."""
+    policy = Learned(scenario_with())
+    policy.reset(3, policy_route())
+    plans = [policy.act(observation) for observation in seen()]
+    recorded = [
+        [16.1451, -0.2369, -0.0322],
+        [16.5639, -0.2533, -0.0336],
+        [17.2359, -0.3544, -0.0361],
+    ]
+    for plan, (x, y, yaw) in zip((plans[0], plans[6], plans[13]), recorded, strict=True):
+        np.testing.assert_allclose([*plan.xy[20], plan.yaw[20]], [x, y, yaw], atol=2e-3)
 
 
 def test_seeds_drive_differently_and_a_seed_alike():

@@ -23,13 +23,20 @@ from alpasim_plugin.lab.cli.training_options import (
 )
 from alpasim_plugin.lab.training.demonstrations import (
     DemonstrationRecipe,
+    common_views,
     read_demonstrations,
     write_demonstrations,
 )
 from alpasim_plugin.lab.training.model_card import ModelCard, curves
-from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
+from alpasim_plugin.lab.training.policy import (
+    PolicyRecipe,
+    PolicyTask,
+    measure,
+    start_from_front,
+)
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
-from policies.learned_net import LearnedNet, save_net
+from policies.learned import WEIGHTS
+from policies.learned_net import LearnedNet, load_net, save_net
 from scenarios.load import load_scenario
 
 WEIGHTS_FILE = "learned.safetensors"
@@ -73,6 +80,9 @@ def policy(
     """Train the network of the policy 'learned'; writes OUT/learned.safetensors (averaged, float16)
     and its card, OUT/learned.json.
 
+    The network has the views that all scenes' cameras show: the front one, or also the left and the
+    right one; then it starts from the weights of 'learned'.
+
     Before the first update, perturbed rollouts off the logged paths are rendered into
     OUT/demonstrations, with the path and speeds of a privileged expert as labels.
     """
@@ -80,8 +90,12 @@ def policy(
     torch.set_num_threads(threads)
     data = out / DEMONSTRATIONS
     write_splits(scenes, data, seed)
-    net = LearnedNet(seed).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    task = PolicyTask(net, read_demonstrations(data, "train"), PolicyRecipe(seed=seed))
+    demonstrations = read_demonstrations(data, "train")
+    net = LearnedNet(seed, common_views(demonstrations))
+    if len(net.views) > 1:
+        start_from_front(net, load_net(WEIGHTS))
+    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    task = PolicyTask(net, demonstrations, PolicyRecipe(seed=seed))
     schedule = Schedule(
         steps, peak_lr=1.5e-3, warmup=min(200, steps // 10 + 1), weight_decay=0.02, ema=0.998
     )
@@ -129,7 +143,7 @@ def write_splits(scenes: Path, data: Path, seed: int) -> None:
 def demonstration_facts(task: PolicyTask) -> dict[str, Any]:
     """Return the training data of a policy: frames, samples, scenes by family, and the renderer."""
     return {
-        "frames": sum(len(one.arrays["frames"]) for one in task.demonstrations),
+        "frames": sum(len(frames) for one in task.demonstrations for frames in one.frames),
         "samples": int(task.ends[-1]),
         "scenes": dict(Counter(one.folder.name.rsplit("_", 1)[0] for one in task.demonstrations)),
         "renderer": task.demonstrations[0].info["recipe"]["renderer"],

@@ -21,7 +21,7 @@ from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3
 from alpasim_plugin.core.reading import read_json_as, read_json_object
 from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Route, Scenario
+from alpasim_plugin.core.types import F64, U8, CameraSpec, RenderRequest, Route, Scenario
 from alpasim_plugin.lab.training.perturbed_rollouts import (
     PerturbedRollout,
     RolloutState,
@@ -30,17 +30,13 @@ from alpasim_plugin.lab.training.perturbed_rollouts import (
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M, expert_path, expert_speeds, leader_on
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.world.route import route_in_rig
-from policies.base import front_camera
-from policies.learned_input import COMMANDS, route_command
+from policies.learned_input import COMMANDS, FRONT, SIDES, View, route_command, view_camera
 
 DEMONSTRATIONS_FILE = "demonstrations.json"
-DEMONSTRATIONS_VERSION = 3  # of the format
+DEMONSTRATIONS_VERSION = 4  # of the format
 READING = "reading demonstrations for the learned policy"
 GIVE = "give a folder that 'simrun train policy-data' wrote"
-WIDE_PX, TOP_ROW = (
-    352,
-    30,
-)  # frames are wider than the policy's input, so that it can be rotated; most of the sky is cut
+SKY_SHARE = 0.2  # of a frame's rows: most of the sky, which is cut
 MAX_YAW_RAD = np.deg2rad(8.5)
 
 
@@ -68,14 +64,12 @@ class DemonstrationFacts(TypedDict):
     """What ``demonstrations.json`` holds besides the key that made it."""
 
     samples: int
-    K: list[list[float]]
-    T_rig_camera: list[list[float]]
+    cameras: Mapping[str, Mapping[str, list[list[float]]]]  # of each view: K and T_rig_camera
     recipe: Mapping[str, Any]
 
 
 _FORMS: dict[str, tuple[int, str]] = {
-    "frames": (4, "uint8"),  # (F, 114, 352, 3)
-    "frame": (1, "int32"),  # (N,) row in frames
+    "frame": (1, "int32"),  # (N,) row in the frames
     "before": (
         1,
         "int32",
@@ -93,12 +87,29 @@ _FORMS: dict[str, tuple[int, str]] = {
 }
 
 
-def wide_camera(camera: CameraSpec) -> CameraSpec:
-    """Return the camera with the same focal length and a wider, lower image."""
+def scene_views(scenario: Scenario) -> tuple[View, ...]:
+    """Return the views that a scene's cameras show: the front one, and the sides if both are
+    there.
+    """
+    try:
+        for view in SIDES:
+            view_camera(scenario, view)
+    except InputError:
+        return (FRONT,)
+    return (FRONT, *SIDES)
+
+
+def wide_camera(camera: CameraSpec, view: View) -> CameraSpec:
+    """Return the camera with the same focal length and an image in which the view can be rotated by
+    `MAX_YAW_RAD`; the top rows are cut.
+    """
+    half_rad = np.arctan(view.width / 2 / view.focal_px) + MAX_YAW_RAD
+    half_px = int(np.ceil(camera.K[0, 0] * np.tan(half_rad))) + 1
+    top = round(SKY_SHARE * camera.height)
     K = camera.K.copy()
-    K[0, 2] = WIDE_PX / 2
-    K[1, 2] -= TOP_ROW
-    return replace(camera, width=WIDE_PX, height=camera.height - TOP_ROW, K=K)
+    K[0, 2] = half_px
+    K[1, 2] -= top
+    return replace(camera, width=2 * half_px, height=camera.height - top, K=K)
 
 
 def write_demonstrations(
@@ -126,13 +137,15 @@ def write_demonstrations(
         and {k: v for k, v in read_json_object(path, do_this=GIVE).items() if k in info} == info
     ):
         return False
-    camera = wide_camera(front_camera(scenario))
-    arrays = _demonstrate(scenario, camera, recipe, seed, threads)
-    facts = {
-        "K": camera.K.tolist(),
-        "T_rig_camera": camera.T_rig_camera.tolist(),
-        "samples": len(arrays["frame"]),
+    cameras = {
+        view.name: wide_camera(view_camera(scenario, view), view) for view in scene_views(scenario)
     }
+    arrays = _demonstrate(scenario, cameras, recipe, seed, threads)
+    geometry = {
+        name: {"K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist()}
+        for name, camera in cameras.items()
+    }
+    facts = {"cameras": geometry, "samples": len(arrays["frame"])}
     with atomic_folder(folder) as partial:
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
@@ -141,44 +154,60 @@ def write_demonstrations(
 
 
 def _demonstrate(
-    scenario: Scenario, camera: CameraSpec, recipe: DemonstrationRecipe, seed: int, threads: int
+    scenario: Scenario,
+    cameras: Mapping[str, CameraSpec],
+    recipe: DemonstrationRecipe,
+    seed: int,
+    threads: int,
 ) -> dict[str, Any]:
     random = stream(scenario.scene_id, seed, "training.policy.lessons")
     renderer = make_renderer(recipe.renderer, scenario, seed=seed, threads=threads)
     rows: dict[str, list[Any]] = {name: [] for name in _FORMS}
+    frames: dict[str, list[U8]] = {name: [] for name in cameras}
+    taken = 0
     for rollout in perturbed_rollouts(scenario, recipe.drives, recipe.drive_s, seed):
         last: tuple[int, RolloutState] | None = None
         for state in rollout.states:
             if not state.collision_free:
                 last = None
                 continue
-            T = state.T_world_rig @ camera.T_rig_camera
-            rows["frames"].append(
-                renderer.render(
-                    RenderRequest(state.t_us, camera, np.stack([T, T]), state.actors)
-                ).rgb
-            )
-            now = len(rows["frames"]) - 1
+            for name, camera in cameras.items():
+                T = state.T_world_rig @ camera.T_rig_camera
+                request = RenderRequest(state.t_us, camera, np.stack([T, T]), state.actors)
+                frames[name].append(renderer.render(request).rgb)
+            speeds = _target_speeds(scenario, rollout, state)
             for k in range(recipe.headings):
-                _append_sample(
-                    rows,
-                    scenario,
-                    camera,
-                    rollout,
-                    state,
-                    now,
-                    last,
-                    0.0 if k == 0 else float(random.uniform(-1, 1)),
-                    recipe,
-                    random,
+                yaw = 0.0 if k == 0 else float(random.uniform(-1, 1))
+                sample = _sample(
+                    cameras[FRONT.name], rollout, state, taken, last, yaw, recipe, random
                 )
-            last = now, state
-    return {name: np.array(rows[name], dtype=dtype) for name, (_, dtype) in _FORMS.items()}
+                for key, value in (sample | speeds).items():
+                    rows[key].append(value)
+            last = taken, state
+            taken += 1
+    arrays = {name: np.array(rows[name], dtype=dtype) for name, (_, dtype) in _FORMS.items()}
+    return arrays | {frames_file(name): np.array(images) for name, images in frames.items()}
 
 
-def _append_sample(
-    rows: dict[str, list[Any]],
-    scenario: Scenario,
+def frames_file(view: str) -> str:
+    """Return the name of the array of a view's frames ``(F, H, W, 3)`` uint8."""
+    return f"frames_{view}"
+
+
+def _target_speeds(
+    scenario: Scenario, rollout: PerturbedRollout, state: RolloutState
+) -> dict[str, Any]:
+    """Return the parts of a sample that do not depend on the rig's heading."""
+    half_width_m = scenario.vehicle.box.width_m / 2
+    leader = leader_on(rollout.line, state.s_m, rollout.others.front_m, half_width_m, state.bodies)
+    speeds = expert_speeds(
+        rollout.line, state.s_m, state.speed_mps, leader, rollout.style, rollout.others, state.t_us
+    )
+    gap_m = min(leader.gap_m, SIGHT_M)
+    return {"speeds": speeds, "gap": gap_m, "leader": leader.speed_mps}
+
+
+def _sample(
     camera: CameraSpec,
     rollout: PerturbedRollout,
     state: RolloutState,
@@ -187,21 +216,19 @@ def _append_sample(
     yaw: float,
     recipe: DemonstrationRecipe,
     random: np.random.Generator,
-) -> None:
-    """Append one sample: a state with the rig rotated about its camera."""
+) -> dict[str, Any]:
+    """Return one sample, without its speeds: a state with the rig rotated about its front
+    camera.
+    """
     yaw_rad = MAX_YAW_RAD * yaw
     pose = rotated_about_camera(state.T_world_rig, camera, yaw_rad)
     path = rollout.line.path
     points, headings = expert_path(path, state.s_m, pose, state.speed_mps)
-    box, axle_m = scenario.vehicle.box, scenario.vehicle.rear_axle_to_centre_m
-    leader = leader_on(
-        rollout.line, state.s_m, axle_m + box.length_m / 2, box.width_m / 2, state.bodies
-    )
     route = route_in_rig(Route(path.xyz[::4]), pose)
     earlier = last if last is not None and random.random() > 0.1 else (now, state)
     # The earlier frame has nearly the same yaw perturbation.
     yaw_before = float(np.clip(yaw_rad + random.normal(0.0, 0.02), -MAX_YAW_RAD, MAX_YAW_RAD))
-    sample = {
+    return {
         "frame": now,
         "before": earlier[0],
         "yaw": yaw_rad,
@@ -213,12 +240,7 @@ def _append_sample(
         ),
         "points": points,
         "headings": headings,
-        "speeds": expert_speeds(rollout.line, state.s_m, state.speed_mps, leader, rollout.style),
-        "gap": min(leader.gap_m, SIGHT_M),
-        "leader": leader.speed_mps,
     }
-    for name, value in sample.items():
-        rows[name].append(value)
 
 
 def rotated_about_camera(T_world_rig: F64, camera: CameraSpec, yaw_rad: float) -> F64:
@@ -242,30 +264,39 @@ class Demonstrations:
         return self.info["samples"]
 
     @cached_property
-    def camera(self) -> CameraSpec:
-        """Camera of the frames."""
-        shape = self.arrays["frames"].shape
-        return CameraSpec(
-            "front",
-            shape[2],
-            shape[1],
-            np.array(self.info["K"]),
-            np.array(self.info["T_rig_camera"]),
-        )
+    def views(self) -> tuple[View, ...]:
+        """The views that the frames show."""
+        return tuple(view for view in (FRONT, *SIDES) if view.name in self.info["cameras"])
+
+    @cached_property
+    def cameras(self) -> tuple[CameraSpec, ...]:
+        """The camera of each view's frames."""
+        out = []
+        for view, frames in zip(self.views, self.frames, strict=True):
+            camera = self.info["cameras"][view.name]
+            K, T_rig_camera = np.array(camera["K"]), np.array(camera["T_rig_camera"])
+            out.append(CameraSpec(view.name, frames.shape[2], frames.shape[1], K, T_rig_camera))
+        return tuple(out)
+
+    @cached_property
+    def frames(self) -> tuple[Any, ...]:
+        """Frames ``(F, H, W, 3)`` uint8 of each view."""
+        return tuple(self._array(frames_file(view.name), 4, "uint8") for view in self.views)
 
     @cached_property
     def arrays(self) -> dict[str, Any]:
-        """Arrays by name."""
-        out = {}
-        for name, (axes, dtype) in _FORMS.items():
-            path = self.folder / f"{name}.npy"
-            out[name] = open_npy(path, "write the demonstrations again")
-            if out[name].ndim != axes or out[name].dtype != np.dtype(dtype):
-                raise InputError(
-                    f"{path}: {out[name].dtype} with {out[name].ndim} axes",
-                    f"{dtype} with {axes} axes is needed: write the demonstrations again",
-                )
-        return out
+        """Arrays of the samples by name."""
+        return {name: self._array(name, *form) for name, form in _FORMS.items()}
+
+    def _array(self, name: str, axes: int, dtype: str) -> Any:
+        path = self.folder / f"{name}.npy"
+        array = open_npy(path, "write the demonstrations again")
+        if array.ndim != axes or array.dtype != np.dtype(dtype):
+            raise InputError(
+                f"{path}: {array.dtype} with {array.ndim} axes",
+                f"{dtype} with {axes} axes is needed: write the demonstrations again",
+            )
+        return array
 
 
 def demonstrations_digest(demonstrations: Sequence[Demonstrations]) -> str:
@@ -275,6 +306,23 @@ def demonstrations_digest(demonstrations: Sequence[Demonstrations]) -> str:
     return hashlib.blake2b(
         json.dumps([one.info for one in demonstrations], sort_keys=True).encode(), digest_size=8
     ).hexdigest()
+
+
+def common_views(demonstrations: Sequence[Demonstrations]) -> tuple[View, ...]:
+    """Return the views that all demonstrations have.
+
+    Raises:
+        InputError: Some have other views than the rest.
+    """
+    first = demonstrations[0]
+    for one in demonstrations:
+        if one.views != first.views:
+            have, has = ([view.name for view in each.views] for each in (first, one))
+            raise InputError(
+                f"{first.folder} has the views {have}, and {one.folder} {has}",
+                "train on scenes whose cameras show the same views",
+            )
+    return first.views
 
 
 def read_demonstrations(root: Path, split: str) -> Sequence[Demonstrations]:

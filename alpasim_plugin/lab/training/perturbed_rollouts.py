@@ -20,8 +20,10 @@ from alpasim_plugin.lab.training.policy_expert import (
     STEP_S,
     DrivingStyle,
     ReferenceLine,
+    RightOfWay,
     acceleration,
     advance,
+    following_acceleration,
     leader_on,
 )
 from alpasim_plugin.runs.recorded_state import ego_state_from_log
@@ -36,6 +38,7 @@ MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = (
     1.3,
 )  # with a neighbouring lane the nearest lane must not change
 LEADER_SHARE = 0.55  # share of rollouts with a synthetic leader
+KEPT = ("crosses", "beside")  # actors that drive as recorded: the ego gives way to them
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,13 @@ class RolloutState:
 
 @dataclass(frozen=True)
 class PerturbedRollout:
-    """A rollout: its reference line, the expert's driving style, and its states in order,
-    `FRAME_INTERVAL_S` apart.
+    """A rollout: its reference line, the expert's driving style, the others, and its states in
+    order, `FRAME_INTERVAL_S` apart.
     """
 
     line: ReferenceLine
     style: DrivingStyle
+    others: RightOfWay
     states: tuple[RolloutState, ...]
 
 
@@ -151,6 +155,8 @@ def _drive(
     front = scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
     half = scenario.vehicle.box.width_m / 2
     leader = _SyntheticLeader.draw(scenario, path, s + front, style.desired_mps, random)
+    recorded = [a for a in scenario.actors if leader is None or a is not leader.actor]
+    others = RightOfWay.along(path, scenario.vehicle, recorded, scenario.end_us)
     offset = _lateral_offset(
         random,
         MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M,
@@ -166,14 +172,18 @@ def _drive(
         ahead = leader_on(line, s, front, half, bodies)
         if step % round(FRAME_INTERVAL_S / STEP_S) == 0:
             states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
-        wanted = acceleration(line, s, v, ahead, driven_style)
+        most = min(
+            following_acceleration(v, ahead, driven_style),
+            others.acceleration(t, s, v, driven_style),
+        )
+        wanted = acceleration(line, s, v, most, driven_style)
         accel += (wanted - accel) * (1.0 - 0.8 * lag)
         if ahead.gap_m < 1.5:
             accel = min(wanted, accel)
         s, v = advance(s, v, accel, STEP_S)
         if leader is not None:
             leader.advance(STEP_S)
-    return PerturbedRollout(line, style, tuple(states))
+    return PerturbedRollout(line, style, others, tuple(states))
 
 
 def _start(
@@ -301,7 +311,11 @@ class _SyntheticLeader:
         desired_mps: float,
         random: np.random.Generator,
     ) -> _SyntheticLeader | None:
-        vehicles = [a for a in scenario.actors if a.label in ("car", "truck", "bus", "motorcycle")]
+        vehicles = [
+            actor
+            for actor in scenario.actors
+            if actor.label in ("car", "truck", "bus", "motorcycle") and actor.actor_id not in KEPT
+        ]
         if not vehicles or random.random() > LEADER_SHARE:
             return None
         named = [a for a in vehicles if a.actor_id == "ahead"]

@@ -1,17 +1,19 @@
 """The privileged expert that the learned policy imitates: a recovery path to the lane centre, and a
 speed profile.
 
-The expert knows the exact reference line, its curvature and all actors.
+The expert knows the exact reference line, its curvature, all actors and where they will be: it lets
+pass whoever will come into its way.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, Actor, Box, Vehicle
 from alpasim_plugin.world.idm import (
     Bodies,
     IdmParams,
@@ -23,8 +25,10 @@ from alpasim_plugin.world.idm import (
 from alpasim_plugin.world.path import Lines, Path
 from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
+from scenarios.expert import PredictedBodies, ScriptedTracks, yielding_acceleration
 
 STEP_S = 0.1
+DECISION_STEPS = 4  # between two forecasts of the other road users
 LATERAL_MPS2 = 2.0
 ACCEL_MPS2 = 1.5
 BRAKE_MPS2 = 2.0
@@ -69,19 +73,60 @@ class ReferenceLine:
         return ReferenceLine(path, allowed_speeds(path, fastest_mps, LATERAL_MPS2))
 
 
+@dataclass(frozen=True)
+class RightOfWay:
+    """The other road users of a scene, whom a car on a line lets pass if they come into its way."""
+
+    table: ScriptedTracks
+    line: Lines  # one path
+    box: Box  # of the car
+    front_m: float  # from the rear axle to the front bumper
+
+    @staticmethod
+    def along(path: Path, vehicle: Vehicle, actors: Sequence[Actor], end_us: int) -> RightOfWay:
+        """Return what a car on a path knows until ``end_us``."""
+        front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+        return RightOfWay(ScriptedTracks(actors, end_us), Lines([path]), vehicle.box, front_m)
+
+    def acceleration(self, t_us: int, s_m: float, speed_mps: float, style: DrivingStyle) -> float:
+        """Return the largest acceleration, m/s^2, behind all who are or will be in the way;
+        infinite without such ones.
+        """
+        table = self.table
+        if not table.boxes:
+            return float("inf")
+        rows = table.rows(t_us)
+        ahead = PredictedBodies(
+            table.xy[rows],
+            table.yaw[rows],
+            table.velocity[rows],
+            table.present[rows],
+            tuple(table.boxes),
+            np.zeros(len(table.boxes), dtype=np.bool_),
+        )
+        front_s, half_m = s_m + self.front_m, self.box.width_m / 2
+        most = yielding_acceleration(self.line, front_s, speed_mps, self.box, ahead)
+        leader = find_leader(self.line, front_s, half_m, ahead.now(), horizon_m=SIGHT_M)
+        return min(most, following_acceleration(speed_mps, leader, style))
+
+
+def following_acceleration(speed_mps: float, leader: Leader, style: DrivingStyle) -> float:
+    """Return the acceleration, m/s^2, behind a leader; infinite without one."""
+    if leader.index < 0:
+        return float("inf")
+    return idm_acceleration(speed_mps, leader.gap_m, speed_mps - leader.speed_mps, style.idm)
+
+
 def acceleration(
-    line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle
+    line: ReferenceLine, s_m: float, speed_mps: float, most_mps2: float, style: DrivingStyle
 ) -> float:
-    """Return the acceleration, m/s^2, of a driver at arc length ``s_m`` of the line."""
+    """Return the acceleration, m/s^2, of a driver at arc length ``s_m`` of the line, at most
+    ``most_mps2``.
+    """
     limit = min(
         float(np.interp(s_m + 0.5 * speed_mps, line.path.s, line.limit_mps)), style.desired_mps
     )
-    wanted = min(1.5 * (limit - speed_mps), ACCEL_MPS2)
-    if leader.index >= 0:
-        wanted = min(
-            wanted,
-            idm_acceleration(speed_mps, leader.gap_m, speed_mps - leader.speed_mps, style.idm),
-        )
+    wanted = min(1.5 * (limit - speed_mps), ACCEL_MPS2, most_mps2)
     return max(wanted, -HARD_BRAKE_MPS2)
 
 
@@ -104,23 +149,28 @@ def leader_on(
 
 
 def expert_speeds(
-    line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle
+    line: ReferenceLine,
+    s_m: float,
+    speed_mps: float,
+    leader: Leader,
+    style: DrivingStyle,
+    others: RightOfWay | None = None,
+    t_us: int = 0,
 ) -> F64:
     """Return the changes of speed ``(8,)`` until `TIMES_S`, metres per second; the leader's speed
-    is constant.
+    is constant, and the others move on from ``t_us`` as recorded.
     """
     s = s_m
     v = speed_mps
     gap = leader.gap_m
     speeds = [v]
-    for _ in range(round(TIMES_S[-1] / STEP_S)):
+    yields = float("inf")
+    for step in range(round(TIMES_S[-1] / STEP_S)):
         before = s
-        s, v = advance(
-            s,
-            v,
-            acceleration(line, s, v, Leader(gap, leader.speed_mps, leader.index), style),
-            STEP_S,
-        )
+        most = following_acceleration(v, Leader(gap, leader.speed_mps, leader.index), style)
+        if others is not None and step % DECISION_STEPS == 0:
+            yields = others.acceleration(t_us + round(step * STEP_S * 1e6), s, v, style)
+        s, v = advance(s, v, acceleration(line, s, v, min(most, yields), style), STEP_S)
         gap += leader.speed_mps * STEP_S - (s - before)
         speeds.append(v)
     return np.array([speeds[round(t / STEP_S)] for t in TIMES_S]) - speed_mps

@@ -17,18 +17,23 @@ from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.scene_draws import Spec
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES, Family
+from alpasim_plugin.lab.training.scene_families_three import SIDE_FAMILIES, THREE_FAMILIES
 from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
 from alpasim_plugin.lab.training.scene_looks import (
     KNOWN_DAMAGE,
     UNSEEN_DAMAGE,
     draw_camera,
     draw_damage,
+    draw_rig,
     known_surroundings,
     unseen_surroundings,
 )
 from scenarios.load import load_scenario
 
-Split = Literal["train", "val", "test-known", "test-unseen", "beside-known", "beside-unseen"]
+Split = Literal[
+    "train", "val", "test-known", "test-unseen", "beside-known", "beside-unseen",
+    "three/train", "three/val", "three/test",
+]  # fmt: skip
 TEST_SPLITS: tuple[Split, ...] = ("test-known", "test-unseen")
 BESIDE_SPLITS: tuple[Split, ...] = (
     "beside-known",
@@ -48,6 +53,7 @@ class SplitRecipe:
         duration_s: Length of every drive by default.
         unseen: Whether looks and damage are those that training never sees.
         own_cameras: Whether cameras are drawn; else all scenes have the default camera.
+        three_cameras: Whether front, left and right cameras are drawn.
         cycles: Whether some scenes are cycle renders, which lie on the logged path.
     """
 
@@ -58,6 +64,7 @@ class SplitRecipe:
     unseen: bool = False
     own_cameras: bool = False
     cycles: bool = True
+    three_cameras: bool = False
 
 
 SPLITS: Mapping[Split, SplitRecipe] = {
@@ -67,6 +74,9 @@ SPLITS: Mapping[Split, SplitRecipe] = {
     "test-unseen": SplitRecipe(UNSEEN_FAMILIES, 14_000_000, 30, 19.8, unseen=True),
     "beside-known": SplitRecipe(KNOWN_FAMILIES, 15_000_000, 12, 9.0, cycles=False),
     "beside-unseen": SplitRecipe(UNSEEN_FAMILIES, 16_000_000, 6, 9.0, unseen=True, cycles=False),
+    "three/train": SplitRecipe(THREE_FAMILIES, 17_000_000, 216, 9.0, three_cameras=True),
+    "three/val": SplitRecipe(THREE_FAMILIES, 18_000_000, 18, 9.0, three_cameras=True),
+    "three/test": SplitRecipe(SIDE_FAMILIES, 19_000_000, 30, 9.0, three_cameras=True),
 }
 
 
@@ -89,10 +99,13 @@ def draw_spec(split: Split, family: str, scene_id: str, seed: int, duration_s: f
         for part in (f"scene.{family}", "looks", "damage")
     )
     spec = recipe.families[family](rng, duration_s + 2.0)
-    spec["road"] |= {"heading_deg": round(float(rng.uniform(-180, 180)), 1)}
-    spec["environment"] = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
+    spec["road"].setdefault("heading_deg", round(float(rng.uniform(-180, 180)), 1))
+    drawn = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
+    spec["environment"] = drawn | spec.get("environment", {})
     if recipe.own_cameras:
         spec["cameras"] = [draw_camera(looks)]
+    if recipe.three_cameras:
+        spec["cameras"] = draw_rig(looks)
     kind = None if recipe.cycles else "reconstruction"
     ranges = (
         UNSEEN_DAMAGE[int(damage.integers(len(UNSEEN_DAMAGE)))] if recipe.unseen else KNOWN_DAMAGE
@@ -127,7 +140,7 @@ def write_scenes(folder: Path, split: Split, count: int, duration_s: float) -> I
                 path,
                 split,
                 family,
-                f"{split}-{family}-{i:03d}",
+                f"{split.replace('/', '-')}-{family}-{i:03d}",
                 SPLITS[split].first_seed + i * DRAWS,
                 duration_s,
             )

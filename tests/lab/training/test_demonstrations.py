@@ -41,11 +41,12 @@ def root(scenario, tmp_path_factory):
 
 def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
     folder = root / "train" / "lead_000"
-    before = (folder / "frames.npy").stat().st_mtime_ns
+    before = (folder / "frames_front.npy").stat().st_mtime_ns
     assert not write_demonstrations(scenario, folder, QUICK, 0)
-    assert (folder / "frames.npy").stat().st_mtime_ns == before
+    assert (folder / "frames_front.npy").stat().st_mtime_ns == before
     first, other = Demonstrations(folder), root / "other"
     write_demonstrations(scenario, other, QUICK, 0)
+    np.testing.assert_array_equal(first.frames[0], Demonstrations(other).frames[0])
     for name, array in first.arrays.items():
         np.testing.assert_array_equal(array, Demonstrations(other).arrays[name])
     assert write_demonstrations(scenario, other, QUICK, 1)
@@ -55,8 +56,9 @@ def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
 def test_sample_has_a_frame_a_state_and_a_target(root):
     (demonstrations,) = read_demonstrations(root, "train")
     a = demonstrations.arrays
-    assert len(demonstrations) == len(a["frame"]) == 3 * len(a["frames"]) == 12
-    assert a["frames"].shape[1:] == (114, 352, 3)
+    (frames,) = demonstrations.frames
+    assert len(demonstrations) == len(a["frame"]) == 3 * len(frames) == 12
+    assert frames.shape[1:] == (115, 348, 3)
     assert np.abs(a["yaw"]).max() <= np.deg2rad(8.5) + 1e-6
     assert (a["yaw"][::3] == 0).all()
     assert (a["before"] <= a["frame"]).all()
@@ -77,9 +79,11 @@ def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):
     (broken / DEMONSTRATIONS_FILE).write_text(
         (root / "train" / "lead_000" / DEMONSTRATIONS_FILE).read_text()
     )
-    np.save(broken / "frames.npy", np.zeros((2, 3)))
-    with pytest.raises(InputError):
-        _ = read_demonstrations(tmp_path, "train")[0].arrays
+    np.save(broken / "frames_front.npy", np.zeros((2, 3)))
+    (damaged,) = read_demonstrations(tmp_path, "train")
+    for part in ("frames", "arrays"):
+        with pytest.raises(InputError):
+            getattr(damaged, part)
 
 
 def test_every_turn_of_a_junction_has_a_rollout():

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import Box
+from alpasim_plugin.core.geometry import quat_from_yaw, se2
+from alpasim_plugin.core.types import Actor, Box, Trajectory, Vehicle
 from alpasim_plugin.lab.training.policy import integrate_path
 from alpasim_plugin.lab.training.policy_expert import (
     DrivingStyle,
     ReferenceLine,
+    RightOfWay,
     acceleration,
     advance,
     expert_path,
     expert_speeds,
+    following_acceleration,
     leader_on,
 )
 from alpasim_plugin.world.idm import NO_LEADER, Leader, bodies_from
@@ -60,10 +62,25 @@ def test_car_stops_before_what_stands_and_stays_there():
         line = ReferenceLine.along(STRAIGHT, 20.0)
         wall = 20.0 + gap_m
         for _ in range(150):
-            s, v = advance(s, v, acceleration(line, s, v, Leader(wall - s, 0.0, 0), STYLE), 0.1)
+            most = following_acceleration(v, Leader(wall - s, 0.0, 0), STYLE)
+            s, v = advance(s, v, acceleration(line, s, v, most, STYLE), 0.1)
         assert v < 0.1
         assert 1.0 < wall - s < 4.5
     assert speeds(8.0, Leader(12.0, 0.0, 0))[TIMES_S.index(2.5)] < 2.0
+
+
+@pytest.mark.parametrize("meets", [True, False])
+def test_who_comes_from_the_side_is_let_pass_unless_the_car_is_gone_by_then(meets):
+    """A car crosses 40 m ahead of the rear axle, when the own car would be there or 4 s later."""
+    t_us = np.array([0, 20_000_000])
+    y = 9.0 * (t_us * 1e-6 - (3.8 if meets else 7.8))
+    xyz = np.column_stack([np.full(2, 60.0), y, np.full(2, 0.7)])
+    track = Trajectory(t_us, xyz, quat_from_yaw(np.full(2, np.pi / 2)))
+    crosses = Actor("crosses", "car", Box(4.5, 1.8, 1.5), track)
+    others = RightOfWay.along(STRAIGHT, Vehicle(), [crosses], 20_000_000)
+    line = ReferenceLine.along(STRAIGHT, 20.0)
+    slower = expert_speeds(line, 20.0, 10.0, NO_LEADER, STYLE, others, 0).min()
+    assert slower < -2.0 if meets else slower == pytest.approx(0.0, abs=1e-6)
 
 
 def test_only_bodies_that_reach_into_the_way_are_leaders():
