@@ -263,7 +263,7 @@ def test_shipped_policy_conforms(name, monkeypatch):
             NeedsFreshFrames,
             "in the situation 'old frame' the policy raised in query 1: ValueError: the frame is old",
         ),
-        (OtherCamera, "asks for cameras ['roof']; the scenario has ['front']"),
+        (OtherCamera, "asks for cameras ['roof']; the scenario has ['front', 'left', 'right']"),
     ],
 )
 def test_broken_policy_gets_its_sentence(broken, sentence):
