@@ -30,7 +30,7 @@ from evaluators.statistics.baselines import (
     table_of_run,
     write_baseline,
 )
-from evaluators.statistics.boundary_gate import judge_boundaries
+from evaluators.statistics.boundary_gate import boundary_verdict
 from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.gate import GateVerdict, check_gate, check_number_of_scenes, load_gate
 from scenarios.suite import load_suite
@@ -100,7 +100,7 @@ def gate(
         )
     if spec.boundary_margin is not None:
         earlier = None if baseline_file is None else read_run(baseline_file).summary
-        verdict = judge_boundaries(
+        verdict = boundary_verdict(
             table_of_run(stored_run),
             spec,
             stored_run.summary.get("boundary"),

@@ -121,8 +121,8 @@ GAUSSIANS = Bound(
 
 # Images
 IMAGE_SIDE_PX = Bound("image side", "px", 8, 8192, "no camera of a car is larger")
-PICTURE_SIDE_PX = Bound("side of a stored image", "px", 1, 16_384, "no camera of a car is larger")
-PICTURE_PIXELS = Bound(
+STORED_SIDE_PX = Bound("side of a stored image", "px", 1, 16_384, "no camera of a car is larger")
+STORED_PIXELS = Bound(
     "pixels of a stored image", "", 1, 1 << 26, "67 megapixels take 200 MB decoded"
 )
 

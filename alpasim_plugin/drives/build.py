@@ -35,7 +35,7 @@ from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.drive import fit_drive
-from alpasim_plugin.gaussians.fit.photographs import Picture, resized
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -67,14 +67,14 @@ class Shown:
     """A photograph of the drive in the scenario's world.
 
     Attributes:
-        picture: As it was read.
+        photograph: As it was read.
         camera: Its camera's name in the scenario.
         use: ``fitted``, ``held-out`` or ``never-fitted``.
         T_world_camera: ``(4, 4)``.
         file: Where it lies in the imported folder.
     """
 
-    picture: Picture
+    photograph: PosedPhotograph
     camera: str
     use: str
     T_world_camera: F64
@@ -87,7 +87,7 @@ class Shown:
 
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
-        full = replace(self.picture, T_world_camera=self.T_world_camera).view()
+        full = replace(self.photograph, T_world_camera=self.T_world_camera).view()
         whole = full.camera.width
         width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
@@ -174,7 +174,7 @@ def _built(
     actors = _actors(placed)
     views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
     for one in shown:
-        present = actors_at(actors, int(one.picture.t_us or 0))
+        present = actors_at(actors, int(one.photograph.t_us or 0))
         views[one.use].append(replace(one.view(), actors=present))
     seen = {name for view in views["fitted"] for name in _in_view(view)}
     model, exposures = fitted(
@@ -252,7 +252,7 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
     lenses, and the options.
     """
     facts: list[object] = [drive.kind, camera_height_m, lane_map and read_bytes(lane_map)]
-    for one in drive.pictures:
+    for one in drive.photographs:
         status = one.file.stat() if os.path.isfile(one.file) else None
         changed = status and (status.st_size, status.st_mtime_ns)
         lens = one.lens.K.tolist(), one.lens.distortion.tolist()
@@ -324,10 +324,10 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
             ending = one.file.suffix.lower() if one.data is None else ".jpg"
             if one.lens.bends:
                 ending = ".png"
-            picture = replace(one, t_us=int(one.t_us or 0) - first_us)
+            photograph = replace(one, t_us=int(one.t_us or 0) - first_us)
             out.append(
                 Shown(
-                    picture,
+                    photograph,
                     name,
                     use,
                     placed.poses[camera][i],
@@ -345,11 +345,11 @@ def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
         if os.path.isfile(path):
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        bends = one.picture.lens.bends
+        bends = one.photograph.lens.bends
         data = (
-            cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes()
+            cv2.imencode(".png", one.photograph.rgb()[..., ::-1])[1].tobytes()
             if bends
-            else one.picture.encoded()
+            else one.photograph.encoded()
         )
         write_bytes(path, data)
 
@@ -359,7 +359,7 @@ def _write_transforms(
 ) -> None:
     frames = []
     for one in shown:
-        lens, K = one.picture.lens, one.picture.lens.straight_K()
+        lens, K = one.photograph.lens, one.photograph.lens.straight_K()
         frame = {
             "file_path": one.file,
             "transform_matrix": one.T_world_camera.tolist(),
@@ -369,7 +369,7 @@ def _write_transforms(
             "fl_y": K[1, 1],
             "cx": K[0, 2],
             "cy": K[1, 2],
-            "t_us": one.picture.t_us,
+            "t_us": one.photograph.t_us,
             "camera": one.camera,
             "use": one.use,
         }
@@ -432,8 +432,8 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the
     middle.
     """
-    picture = drive.of(name)[0]
-    lens = picture.lens
+    photograph = drive.of(name)[0]
+    lens = photograph.lens
     width = (
         min(RENDER_PX * lens.width // max(lens.width, lens.height), lens.width) // SIDE_PX * SIDE_PX
     )

@@ -27,12 +27,12 @@ from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.lens import Lens
-from alpasim_plugin.gaussians.fit.photographs import Picture
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph
 
 DO_THIS = "give a whole model: cameras, images and points3D, all .txt or all .bin"
 PLACES = ("", "sparse", "colmap/sparse")  # of models below a folder, or of folders of models
 # Where images lie, from the folder and from the model.
-PICTURES = ("images", "", "../images", "../../images")
+IMAGES = ("images", "", "../images", "../../images")
 CAMERA = 0  # the kind of a sensor that takes images
 T = TypeVar("T")
 SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
@@ -75,13 +75,13 @@ def _ending(model: Path) -> str | None:
     return next((end for end in (".bin", ".txt") if os.path.isfile(model / f"cameras{end}")), None)
 
 
-def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
+def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
     """Read a model. Images in folders of their own are cameras of their own; they are taken in the
     natural order of their names.
 
     Args:
         folder: Holds models, here or in ``sparse``; the one with most images is read.
-        photographs: Whether they must be there.
+        need_files: Whether the photographs must be there.
 
     Raises:
         InputError: A file is missing, damaged or of a lens that OpenCV does not have; or there are
@@ -103,10 +103,10 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
-    root = _images_root(folder, model, images[0].name, photographs)
+    root = _images_root(folder, model, images[0].name, need_files)
     folders = {_folder(one.name) for one in images}
     shared = times_us and len(folders) < len({one.camera for one in images})
-    shots: dict[str, list[Picture]] = {}
+    shots: dict[str, list[PosedPhotograph]] = {}
     front = ""
     for one in images:
         if one.camera not in lenses:
@@ -114,15 +114,15 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         name = f"camera-{one.camera}" if shared else _folder(one.name)
         where = f"{model}, image {one.name}"
         time_us, lens = times_us.get(one.number), lenses[one.camera]
-        shot = Picture(root / one.name, lens, one.T_world_camera, where, time_us, name, {})
+        shot = PosedPhotograph(root / one.name, lens, one.T_world_camera, where, time_us, name, {})
         shots.setdefault(name, []).append(shot)
         if one.camera == reference:
             front = front or name
     names = sorted(shots)
     front = next((name for name in names if "front" in name), front or names[0])
     cameras = [shots[name] for name in names]
-    pictures = [one for camera in cameras for one in camera] if times_us else timed(cameras)
-    centres = np.array([one.T_world_camera[:3, 3] for one in pictures])
+    photographs = [one for camera in cameras for one in camera] if times_us else timed(cameras)
+    centres = np.array([one.T_world_camera[:3, 3] for one in photographs])
     some = centres[:: max(1, len(centres) // 32)]
     near = scipy.spatial.KDTree(some).query(table[:, :3])[0]
     spread = np.eye(3) * ((SPREAD * near) ** 2)[:, None, None]
@@ -132,7 +132,7 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
     )
     return SourceDrive(
-        "colmap", real(folder).name, tuple(pictures), front, points=points, notes=tuple(notes)
+        "colmap", real(folder).name, tuple(photographs), front, points=points, notes=tuple(notes)
     )
 
 
@@ -176,11 +176,11 @@ def _folder(name: str) -> str:
 
 def _images_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     for base in (folder, model):
-        for place in PICTURES:
+        for place in IMAGES:
             if os.path.isfile(base / place / name):
                 return base / place
     if not needed:
-        return folder / PICTURES[0]
+        return folder / IMAGES[0]
     raise InputError(
         f"{folder}: no image {name}", "put the images into a folder 'images' beside the model"
     )

@@ -44,7 +44,7 @@ LOOSE, TIGHT, ROUNDS = (
     0.06,
     10,
 )  # where Tukey's weight ends, in the first round and in the last ones
-WHEELS, ASIDE_WEIGHT = (
+WHEELS, LATERAL_WEIGHT = (
     0.8,
     0.02,
 )  # half the width of what is driven over, and what points beside it count: kerbs come and go
@@ -160,7 +160,7 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     if near.sum() < FEWEST:
         return None
     fitted = _Strip(frame.s / height)
-    weight = np.where(np.abs(left[near]) < WHEELS, 1.0, ASIDE_WEIGHT) / (
+    weight = np.where(np.abs(left[near]) < WHEELS, 1.0, LATERAL_WEIGHT) / (
         spread[near] ** 2 + NOISE**2
     )
     coefficients, kept = fitted.solve(s[near], left[near], h[near], weight)

@@ -29,7 +29,7 @@ from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, SourceDrive, name_numbers
 from alpasim_plugin.gaussians.fit.lens import Lens
-from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 
 # Left and right; the first pair that is there is read.
 PAIRS = (("image_2", "image_3"), ("image_0", "image_1"), ("image_l", "image_r"))
@@ -73,7 +73,7 @@ def read_kitti(folder: Path) -> SourceDrive:
         else:
             notes.append(f"no {right}: no second camera to measure the fit with")
     times = _times(folder / "times.txt", len(poses), notes)
-    pictures = []
+    photographs = []
     for name, rows in _rows_of_poses(folder, files, len(poses)).items():
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")
         spare = []
@@ -84,7 +84,7 @@ def read_kitti(folder: Path) -> SourceDrive:
             lens = Lens(*check_image(read_bytes(path), path), K)
             where, camera = f"{folder}, photograph {i}", "left" if name == left else "right"
             pose = poses[i] @ T_left_camera
-            pictures.append(Picture(path, lens, pose, where, times[i], camera, {}))
+            photographs.append(PosedPhotograph(path, lens, pose, where, times[i], camera, {}))
         if spare:
             notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
         alone = len(poses) - len(rows) + len(spare)
@@ -96,7 +96,7 @@ def read_kitti(folder: Path) -> SourceDrive:
     return SourceDrive(
         "kitti",
         real(folder).name,
-        tuple(pictures),
+        tuple(photographs),
         "left",
         ("right",) if right in files else (),
         metric="the poses, metres",

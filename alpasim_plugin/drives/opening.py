@@ -20,11 +20,11 @@ from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
     KNOWN_KEYS,
-    Picture,
+    PosedPhotograph,
     inside,
     present,
-    read_pictures,
     read_points,
+    read_posed_photographs,
 )
 from alpasim_plugin.gaussians.sh import C0
 
@@ -36,12 +36,12 @@ PAIRS, FEWEST, CLEARLY = (
 FORMS = "a folder with transforms.json, a KITTI odometry folder (not raw, which has no poses), a COLMAP model, or a log of py123d"
 
 
-def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
+def read_source(folder: Path, need_files: bool = True) -> SourceDrive:
     """Read a recorded drive.
 
     Args:
         folder: Holds poses and photographs.
-        photographs: Whether they must be there; poses and lenses alone are enough for a model that
+        need_files: Whether the photographs must be there; poses and lenses alone are enough for a model that
             is trained already.
 
     Raises:
@@ -53,23 +53,23 @@ def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
         folder = folder.parent
     with parsing(folder, f"give {FORMS}"):
         if os.path.isfile(folder / FILE):
-            return _transforms(folder, photographs)
+            return _transforms(folder, need_files)
         if is_kitti(folder):
             return read_kitti(folder)
         if os.path.isfile(folder / SYNC_FILE):
             return read_py123d(folder)
         if models_in(folder):
-            return read_colmap(folder, photographs=photographs)
+            return read_colmap(folder, need_files=need_files)
     raise InputError(f"{folder}: {contents(folder)}: no known form of a drive", f"give {FORMS}")
 
 
-def _transforms(folder: Path, photographs: bool) -> SourceDrive:
+def _transforms(folder: Path, need_files: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
-    document, listed = read_pictures(folder, "opencv")
+    document, listed = read_posed_photographs(folder, "opencv")
     if not listed:
         raise InputError(f"{folder / FILE}: no frames", "list the photographs with their poses")
     notes = []
-    some = photographs or any(os.path.isfile(one.file) for one in listed)
+    some = need_files or any(os.path.isfile(one.file) for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())
     if "axes" not in document:
         if not some:
@@ -106,15 +106,17 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
             f"{without[0].where}: no t_us, which other photographs have",
             "give every photograph its time, or none",
         )
-    pictures = [one for one in every if one.file in files]
-    pictures.sort(key=lambda one: (str(one.camera), int(one.t_us or 0)))
-    kept = tuple({str(one.camera): 0 for one in pictures if one.more.get("use") == "never-fitted"})
+    photographs = [one for one in every if one.file in files]
+    photographs.sort(key=lambda one: (str(one.camera), int(one.t_us or 0)))
+    kept = tuple(
+        {str(one.camera): 0 for one in photographs if one.more.get("use") == "never-fitted"}
+    )
     unit = document.get("unit")
     if unit not in (None, "m"):
         raise InputError(f"{folder / FILE}, unit: {unit!r}", 'give metres, "unit": "m", or no unit')
     metric = "the file's word that its unit is the metre" if unit else None
     points = None
-    if photographs and document.get("ply_file_path") is not None:
+    if need_files and document.get("ply_file_path") is not None:
         path = inside(
             folder, folder / str(document["ply_file_path"]), f"{folder / FILE}, ply_file_path"
         )
@@ -125,7 +127,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     return SourceDrive(
         "transforms",
         real(folder).name,
-        tuple(pictures),
+        tuple(photographs),
         front,
         kept,
         metric,
@@ -134,7 +136,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     )
 
 
-def recognised_axes(folder: Path, pictures: Sequence[Picture]) -> tuple[str, str]:
+def recognised_axes(folder: Path, photographs: Sequence[PosedPhotograph]) -> tuple[str, str]:
     """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs
     fit together, and a note.
 
@@ -142,12 +144,12 @@ def recognised_axes(folder: Path, pictures: Sequence[Picture]) -> tuple[str, str
 
     Args:
         folder: Holds the file.
-        pictures: Read as if it were that of OpenCV.
+        photographs: Read as if it were that of OpenCV.
 
     Raises:
         InputError: Both fit, or neither.
     """
-    there = sorted(pictures, key=lambda one: natural_order(one.file.as_posix()))
+    there = sorted(photographs, key=lambda one: natural_order(one.file.as_posix()))
     chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
     counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
     inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))

@@ -128,8 +128,8 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     if drive.metric is None and placed.strip is None:
         return
     centres = placed.poses[drive.front][:, :3, 3]
-    pictures = drive.of(drive.front)
-    dt_s = np.diff([int(one.t_us or 0) for one in pictures]) * 1e-6
+    photographs = drive.of(drive.front)
+    dt_s = np.diff([int(one.t_us or 0) for one in photographs]) * 1e-6
     velocity = np.diff(centres, axis=0) / dt_s[:, None]
     speed = np.linalg.norm(velocity, axis=1)
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
@@ -138,7 +138,7 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     fast = int(np.argmax(speed))
     if speed[fast] < LEAST_MPS:
         raise InputError(
-            f"{pictures[fast].where}: at most {speed[fast]:.2g} m/s in {dt_s.sum():.4g} s, slower than any car drives",
+            f"{photographs[fast].where}: at most {speed[fast]:.2g} m/s in {dt_s.sum():.4g} s, slower than any car drives",
             "check the unit of the times (t_us: microseconds) and of the poses",
         )
     if speed[fast] > MOST_MPS:
@@ -149,7 +149,7 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     else:
         return
     raise InputError(
-        f"{pictures[at].where}, {pictures[at].file.name}: {found}, which no car does",
+        f"{photographs[at].where}, {photographs[at].file.name}: {found}, which no car does",
         "check the order of the photographs, their times (t_us) and the unit of the poses",
     )
 
@@ -243,12 +243,12 @@ def _rig(
     drive: SourceDrive, poses: Mapping[str, F64], field: HeightField
 ) -> tuple[Trajectory, dict[str, F64]]:
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
-    front, pictures = poses[drive.front], drive.of(drive.front)
+    front, photographs = poses[drive.front], drive.of(drive.front)
     mount = _front_mount(front, field)
     if drive.front_xy_m is not None:
         mount[:2, 3] = drive.front_xy_m
     ego = trajectory_from_poses(
-        np.array([int(one.t_us or 0) for one in pictures]),
+        np.array([int(one.t_us or 0) for one in photographs]),
         np.array([pose @ inverse(mount) for pose in front]),
     )
     mounts = {drive.front: mount}

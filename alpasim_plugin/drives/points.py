@@ -21,7 +21,7 @@ from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.drives.ground import GroundStrip
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.photographs import Picture, resized
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, resized
 from alpasim_plugin.gaussians.fit.start import matches
 from alpasim_plugin.gaussians.fit.tracks import (
     Tracks,
@@ -42,33 +42,33 @@ FEWEST_VIEWS, LEAST_ANGLE_RAD = 3, np.radians(0.7)  # that place a point; betwee
 FEWEST_POINTS = 60
 
 
-def small_view(picture: Picture, width: int = WIDTH_PX) -> PosedView:
+def small_view(photograph: PosedPhotograph, width: int = WIDTH_PX) -> PosedView:
     """Return a photograph without distortion, at most ``width`` pixels wide."""
-    view = picture.view()
+    view = photograph.view()
     return resized(view, width) if view.camera.width > width else view
 
 
-def triangulated(pictures: Sequence[Picture], folder: str) -> Points:
+def triangulated(photographs: Sequence[PosedPhotograph], folder: str) -> Points:
     """Return the points that at least three photographs place alike.
 
     Corners are followed from photograph to photograph; photographs too far apart for that are
     matched.
 
     Args:
-        pictures: Of one camera, in order along the way.
+        photographs: Of one camera, in order along the way.
         folder: For messages.
 
     Raises:
         InputError: Fewer than `FEWEST_POINTS` points: the photographs do not overlap, or their
             poses are not theirs.
     """
-    views = [small_view(picture) for picture in pictures]
+    views = [small_view(photograph) for photograph in photographs]
     points = placed(follow(views), views)
     if len(points) < 4 * FEWEST_POINTS:
         points = max(points, placed(_matched(views), views), key=len)
     if len(points) < FEWEST_POINTS:
         raise InputError(
-            f"{folder}: {len(points)} points that {FEWEST_VIEWS} of {len(pictures)} photographs place alike",
+            f"{folder}: {len(points)} points that {FEWEST_VIEWS} of {len(photographs)} photographs place alike",
             "give photographs that overlap, in order along the way, with their own poses and lens",
         )
     return points
@@ -147,7 +147,7 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     )
 
 
-def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
+def agreeing(one: PosedPhotograph, other: PosedPhotograph, turns: Sequence[F64]) -> list[int]:
     """Return for each turn of the camera's axes how many matches of two photographs lie before
     both, where both see them.
 
@@ -155,7 +155,7 @@ def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
         one, other: Photographs.
         turns: ``(4, 4)`` each, applied to the poses on the camera's side.
     """
-    views = [small_view(picture) for picture in (one, other)]
+    views = [small_view(photograph) for photograph in (one, other)]
     views = [resized(view, 640) if view.camera.width > 640 else view for view in views]
     found = matches(views)
     n = len(found)
@@ -175,7 +175,8 @@ def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
 
 
 NEAR, FAR = 2.0, 9.0  # of the piece of road that is looked at, in camera heights
-ASIDE = (0.75, 1.5)  # to both sides: under the wheels, where there is least to see, and beside them
+# To both sides: under the wheels, where there is least to see, and beside them.
+LATERAL = (0.75, 1.5)
 CORNERS, CORNER_CONTRAST, APART_PX = (
     (250, 60),
     0.01,
@@ -186,11 +187,11 @@ WINDOW_PX, BACK_PX = 21, 0.25  # of the flow; how near it must come back
 MOST_PX = 12.0  # more than this and the plane was no prediction
 
 
-def road_points(pictures: Sequence[Picture], poses: F64, strip: GroundStrip) -> Points:
+def road_points(photographs: Sequence[PosedPhotograph], poses: F64, strip: GroundStrip) -> Points:
     """Return points of the road ahead of each photograph.
 
     Args:
-        pictures: Of the front camera, in order.
+        photographs: Of the front camera, in order.
         poses: ``(N, 4, 4)`` camera to the strip's frame.
         strip: A first idea of the ground.
 
@@ -198,8 +199,8 @@ def road_points(pictures: Sequence[Picture], poses: F64, strip: GroundStrip) -> 
         Points in the strip's frame.
     """
     views = [
-        small_view(replace(picture, T_world_camera=pose))
-        for picture, pose in zip(pictures, poses, strict=True)
+        small_view(replace(photograph, T_world_camera=pose))
+        for photograph, pose in zip(photographs, poses, strict=True)
     ]
     shots = [
         (view.camera, np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
@@ -223,7 +224,7 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
     sorted by track.
     """
     camera, image = shots[i]
-    pieces = [_piece_ahead(strip, camera.centre_world, aside) for aside in ASIDE]
+    pieces = [_piece_ahead(strip, camera.centre_world, lateral) for lateral in LATERAL]
     masks = [_mask(camera, piece) for piece in pieces]
     masks[1] = masks[1] & ~masks[0]
     corners = [
@@ -277,8 +278,8 @@ def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
     return moved, good & (np.linalg.norm(moved - at, axis=1) < MOST_PX)
 
 
-def _piece_ahead(strip: GroundStrip, centre: F64, aside: float) -> F64:
-    """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``aside``
+def _piece_ahead(strip: GroundStrip, centre: F64, lateral: float) -> F64:
+    """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``lateral``
     camera heights of lateral offset.
     """
     here = strip.frame.place(centre[None])[0][0]
@@ -286,7 +287,7 @@ def _piece_ahead(strip: GroundStrip, centre: F64, aside: float) -> F64:
     for ahead in np.linspace(NEAR, FAR, 4) * strip.height:
         k = int(np.clip(np.searchsorted(strip.frame.s, here + ahead), 0, len(strip.frame.s) - 1))
         along = strip.frame.along[k]
-        left = aside * strip.height * np.array([-along[1], along[0]])
+        left = lateral * strip.height * np.array([-along[1], along[0]])
         out += [strip.frame.line[k, :2] + left, strip.frame.line[k, :2] - left]
     xy = np.array(out)
     return np.column_stack([xy, strip.z(xy)])
@@ -330,7 +331,7 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     if drive.metric is None or drive.points is not None or drive.kind == "colmap":
         return drive
     front = drive.of(drive.front)
-    found = corrected([small_view(picture, CORRECTING_PX) for picture in front])
+    found = corrected([small_view(photograph, CORRECTING_PX) for photograph in front])
     if not found.after_px < LEAST_GAIN * found.before_px:  # also where there is nothing to say: NaN
         return drive
     poses = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
@@ -342,13 +343,16 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     ]
     if max(shifted) > FARTHEST_M or max(turned) > FARTHEST_RAD:
         return drive
-    moved = {picture.t_us: move for picture, move in zip(front, moves, strict=True)}
-    pictures = tuple(
-        replace(picture, T_world_camera=moved.get(picture.t_us, np.eye(4)) @ picture.T_world_camera)
-        for picture in drive.pictures
+    moved = {photograph.t_us: move for photograph, move in zip(front, moves, strict=True)}
+    photographs = tuple(
+        replace(
+            photograph,
+            T_world_camera=moved.get(photograph.t_us, np.eye(4)) @ photograph.T_world_camera,
+        )
+        for photograph in drive.photographs
     )
     note = (
         f"poses were corrected by the photographs, by up to {100 * max(shifted):.0f} cm and {np.degrees(max(turned)):.2f} degrees: "
         f"points are met to {found.after_px:.2f} instead of {found.before_px:.2f} pixels"
     )
-    return replace(drive, pictures=pictures, notes=(*drive.notes, note))
+    return replace(drive, photographs=photographs, notes=(*drive.notes, note))

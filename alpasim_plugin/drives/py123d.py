@@ -26,7 +26,7 @@ from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
 from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
 from alpasim_plugin.gaussians.fit.lens import Lens
-from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 from scenarios.recorded import actors_of_track, checked_trajectory
 
 SYNC_FILE = "sync.arrow"
@@ -80,16 +80,16 @@ def read_py123d(folder: Path) -> SourceDrive:
         )
     notes: list[str] = []
     keys = sorted(path.stem for path in folder.glob("*.arrow"))
-    cameras: dict[str, list[Picture]] = {}
+    cameras: dict[str, list[PosedPhotograph]] = {}
     for key in (key for key in keys if key.startswith(CAMERA)):
-        pictures = _camera(folder, key, ego, notes)
-        if pictures:
-            cameras[key.removeprefix(CAMERA)] = pictures
+        photographs = _camera(folder, key, ego, notes)
+        if photographs:
+            cameras[key.removeprefix(CAMERA)] = photographs
     if not cameras:
         raise InputError(f"{folder}: no pinhole camera with images", DO_THIS)
     front = next((name for name in FRONT if name in cameras), min(cameras))
     last_us = int(cameras[front][: int(PHOTOGRAPHS.high)][-1].t_us or 0)
-    every = [one for pictures in cameras.values() for one in pictures]
+    every = [one for photographs in cameras.values() for one in photographs]
     chosen = tuple(one for one in every if int(one.t_us or 0) <= last_us)
     if len(chosen) < len(every):
         notes.append(f"{len(every) - len(chosen)} photographs after the first of {front} left out")
@@ -130,7 +130,7 @@ def _T(pose: Sequence[float]) -> F64:
     return se3(pose[:3], pose[3:7])
 
 
-def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[Picture]:
+def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[PosedPhotograph]:
     """Return the photographs of a camera in order of time; none of a camera that is no pinhole."""
     path, name = folder / f"{key}.arrow", key.removeprefix(CAMERA)
     facts, columns = _modality(folder, key, ("timestamp_us", "data", "camera_to_global_se3"))
@@ -151,7 +151,7 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
             raise InputError(f"{path}: times that do not increase", DO_THIS)
         film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(columns[1].type) else []
         T_imu_camera = _T(facts["camera_to_imu_se3"])
-        pictures = []
+        photographs = []
         for i, (data, pose) in enumerate(zip(columns[1], columns[2].to_pylist(), strict=True)):
             if not data.is_valid:
                 continue
@@ -169,10 +169,12 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
             else:
                 encoded = memoryview(film[data.as_py()] if film else data.as_buffer())
             T = rigid_pose(T.tolist(), where)
-            pictures.append(Picture(file, lens, T, where, t_us, name, {}, encoded))
-    if len(pictures) < len(times):
-        notes.append(f"camera {name}: {len(times) - len(pictures)} rows without an image left out")
-    return pictures
+            photographs.append(PosedPhotograph(file, lens, T, where, t_us, name, {}, encoded))
+    if len(photographs) < len(times):
+        notes.append(
+            f"camera {name}: {len(times) - len(photographs)} rows without an image left out"
+        )
+    return photographs
 
 
 def _film(path: Path) -> list[bytes]:

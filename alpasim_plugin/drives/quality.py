@@ -27,10 +27,10 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
-ASIDE_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
+LATERAL_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
 OPAQUE = 0.5
 SHOWN, COVERED = 3, 8  # photographs of each use on the page; views that measure coverage
-PICTURES = "pictures"
+IMAGES = "images"
 Report = Callable[[str, int, int], None]
 
 
@@ -62,7 +62,8 @@ def measure(
             ]
     some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {
-        aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M
+        lateral_m: float(np.mean([_covered(graph, view, lateral_m) for view in some]))
+        for lateral_m in LATERAL_M
     }
     return rows, coverage
 
@@ -79,13 +80,13 @@ def _spread(count: int, most: int) -> list[int]:
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
 
 
-def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
+def _covered(graph: SceneGraph, view: PosedView, lateral_m: float) -> float:
     """Return the share of the image's lower half that the model covers, seen from beside where a
     view was taken.
     """
     shift = np.eye(4)
     pose = inverse(view.camera.T_camera_world)
-    shift[:3, 3] = -aside_m * pose[:3, 0]  # the camera's own left
+    shift[:3, 3] = -lateral_m * pose[:3, 0]  # the camera's own left
     camera = type(view.camera).from_pose(
         view.camera.width, view.camera.height, view.camera.K, shift @ pose
     )
@@ -114,11 +115,11 @@ def write_page(
     Returns:
         What ``quality.json`` holds.
     """
-    (folder / PICTURES).mkdir(exist_ok=True)
+    (folder / IMAGES).mkdir(exist_ok=True)
     shown = []
     for use, rows in comparisons.items():
         for i in _spread(len(rows), SHOWN):
-            name = f"{PICTURES}/{use}-{rows[i].name}.jpg"
+            name = f"{IMAGES}/{use}-{rows[i].name}.jpg"
             both = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
             data = cv2.imencode(".jpg", np.ascontiguousarray(both[..., ::-1]))[1].tobytes()
             write_bytes(folder / name, data)
@@ -133,7 +134,8 @@ def write_page(
             for use, rows in comparisons.items()
         },
         "coverage": [
-            {"aside_m": aside, "share": round(share, 4)} for aside, share in coverage.items()
+            {"lateral_m": lateral_m, "share": round(share, 4)}
+            for lateral_m, share in coverage.items()
         ],
         "obstacles": {
             "boxes": len(spread),
@@ -161,7 +163,7 @@ def _page(
         for use, count in quality["photographs"].items()
     )
     covered = "\n".join(
-        f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]
+        f"| {row['lateral_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]
     )
     notes = list(quality["notes"])
     if not drive.actors:

@@ -16,7 +16,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import Bound
 from alpasim_plugin.core.reading import natural_order
 from alpasim_plugin.core.types import F64, Actor, Bool, Vehicle
-from alpasim_plugin.gaussians.fit.photographs import Picture
+from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph
 
 JUMP = (
     12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
@@ -83,7 +83,7 @@ class SourceDrive:
     Attributes:
         kind: Of the files: ``kitti``, ``transforms``, ``colmap`` or ``py123d``.
         scene_id: A name for the scenario.
-        pictures: All photographs, camera by camera in order of time; each has its time and camera.
+        photographs: All photographs, camera by camera in order of time; each has its time and camera.
         front: The camera that looks ahead and is driven by.
         never_fitted: Cameras whose photographs are kept for measuring.
         metric: What makes lengths metres; None where the unit is arbitrary.
@@ -97,7 +97,7 @@ class SourceDrive:
 
     kind: str
     scene_id: str
-    pictures: tuple[Picture, ...]
+    photographs: tuple[PosedPhotograph, ...]
     front: str
     never_fitted: tuple[str, ...] = ()
     metric: str | None = None
@@ -107,14 +107,14 @@ class SourceDrive:
     vehicle: Vehicle = Vehicle()
     front_xy_m: tuple[float, float] | None = None
 
-    def of(self, camera: str) -> list[Picture]:
+    def of(self, camera: str) -> list[PosedPhotograph]:
         """Return a camera's images in order of time."""
-        return [picture for picture in self.pictures if picture.camera == camera]
+        return [photograph for photograph in self.photographs if photograph.camera == camera]
 
     @property
     def cameras(self) -> list[str]:
         """Return the cameras, the front one first."""
-        names = {str(picture.camera) for picture in self.pictures}
+        names = {str(photograph.camera) for photograph in self.photographs}
         return sorted(
             names,
             key=lambda name: (name != self.front, name in self.never_fitted, name),
@@ -123,22 +123,22 @@ class SourceDrive:
     @property
     def path(self) -> F64:
         """Return where the front camera was, ``(N, 3)``."""
-        return np.array([picture.T_world_camera[:3, 3] for picture in self.of(self.front)])
+        return np.array([photograph.T_world_camera[:3, 3] for photograph in self.of(self.front)])
 
 
-def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> SourceDrive:
-    """Return a drive whose poses can be those of a moving camera, and, if ``photographs`` are
+def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> SourceDrive:
+    """Return a drive whose poses can be those of a moving camera, and, if their files are
     needed, whose photographs are whole.
 
     Raises:
         InputError: A photograph is cut off, or of another size than its lens or its camera's
             others; too few; two units of length in one file; a camera that stands or only turns.
     """
-    pictures = drive.of(drive.front)
+    photographs = drive.of(drive.front)
     camera = f"{folder}, camera {drive.front!r}"
-    PHOTOGRAPHS.check(len(pictures), camera)
-    for one in drive.pictures:
-        if photographs:
+    PHOTOGRAPHS.check(len(photographs), camera)
+    for one in drive.photographs:
+        if need_files:
             one.encoded()
         size, first = (one.lens.width, one.lens.height), drive.of(str(one.camera))[0].lens
         if size != (first.width, first.height):
@@ -150,13 +150,13 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
     length = float(steps.sum())
     if length == 0 or (drive.metric and length < LEAST_M):
         raise InputError(
-            f"{camera}: it moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns",
+            f"{camera}: it moves {length:.2f} m over {len(photographs)} photographs: it stands, or only turns",
             "give a part of the drive in which the car moves: depth comes from moving",
         )
     usual, far = float(np.median(steps[steps > 0])), int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
         found = f"a step of {steps[far]:.4g}, where the usual step is {usual:.4g}"
-        raise _two_units(pictures[far + 1], found)
+        raise _two_units(photographs[far + 1], found)
     medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, 5), axis=1)
     before, after = medians[:-5], medians[5:]
     changes = np.flatnonzero(
@@ -164,18 +164,18 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
     )
     if len(changes):
         found = f"steps more than {UNITS:.0f} times as long, or as short, from here on"
-        raise _two_units(pictures[int(changes[0]) + 6], found)
+        raise _two_units(photographs[int(changes[0]) + 6], found)
     return drive
 
 
-def _two_units(one: Picture, found: str) -> InputError:
+def _two_units(one: PosedPhotograph, found: str) -> InputError:
     return InputError(
         f"{one.where}, {one.file.name}: {found}",
         "give all poses in one unit, metres, and one drive at a time",
     )
 
 
-def timed(cameras: Sequence[Sequence[Picture]]) -> list[Picture]:
+def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]:
     """Return photographs without times with the times at which they were taken.
 
     The numbers of their names count time, `PERIOD_US` for the usual step: photographs of one number
@@ -219,23 +219,23 @@ def name_numbers(files: Sequence[Path]) -> list[int]:
     return numbers if all(before < after for before, after in pairwise(numbers)) else []
 
 
-def in_order(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
+def in_order(photographs: Sequence[PosedPhotograph]) -> tuple[list[PosedPhotograph], str]:
     """Return a camera's images without times as they were taken, with a note.
 
     The order is that of the file. Some tools list photographs in an order of their own: where the
     path along the names, in natural order, is shorter, the names count.
     """
-    by_name = sorted(pictures, key=lambda one: natural_order(one.file.as_posix()))
-    listed, named = _length(pictures), _length(by_name)
-    name, rate = pictures[0].camera, 1_000_000 // PERIOD_US
+    by_name = sorted(photographs, key=lambda one: natural_order(one.file.as_posix()))
+    listed, named = _length(photographs), _length(by_name)
+    name, rate = photographs[0].camera, 1_000_000 // PERIOD_US
     if named < (1 - SAME_LENGTH) * listed:
         note = f"in the order of their names: in the file's order the path is {listed / max(named, 1e-12):.1f} times as long"
         return by_name, f"no times: photographs of {name} are taken {note}; {rate} a second"
-    return list(pictures), (
+    return list(photographs), (
         f"no times: photographs of {name} are taken in the file's order, {rate} a second"
     )
 
 
-def _length(pictures: Sequence[Picture]) -> float:
-    centres = np.array([one.T_world_camera[:3, 3] for one in pictures])
+def _length(photographs: Sequence[PosedPhotograph]) -> float:
+    centres = np.array([one.T_world_camera[:3, 3] for one in photographs])
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())

@@ -74,8 +74,8 @@ def import_splat(
     """
     tell = report or (lambda stage, done, total: None)
     with working_folder(out) as work:
-        drive = read_source(poses, photographs=False)
-        has_photographs = all(os.path.isfile(picture.file) for picture in drive.pictures)
+        drive = read_source(poses, need_files=False)
+        has_photographs = all(os.path.isfile(photograph.file) for photograph in drive.photographs)
         drive = checked(drive, poses, has_photographs)
         tell("reading the model", 0, 1)
         cloud, kept = read_gaussians(file)
@@ -164,7 +164,7 @@ def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
     ``applied_transform`` and ``applied_scale`` lead from there to its poses. Old files do not state
     that they exchanged axes.
     """
-    more = drive.pictures[0].more
+    more = drive.photographs[0].more
     applied = {"": more.get("applied_transform", np.eye(3, 4))}
     if drive.kind == "transforms" and "applied_transform" not in more:
         applied[" with the axes of an old ns-process-data"] = SWAPPED
@@ -191,10 +191,10 @@ def _covered(cloud: GaussianCloud, drive: SourceDrive) -> float:
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
     unit = 1 / float(np.median(steps[steps > 0]))
     scaled = placed_cloud(cloud, np.diag([unit, unit, unit, 1.0]))
-    pictures = drive.of(drive.front)
+    photographs = drive.of(drive.front)
     shares = []
-    for i in np.unique(np.linspace(0, len(pictures) - 1, VIEWS).astype(int)):
-        lens, pose = pictures[i].lens.resized(VIEW_PX), pictures[i].T_world_camera.copy()
+    for i in np.unique(np.linspace(0, len(photographs) - 1, VIEWS).astype(int)):
+        lens, pose = photographs[i].lens.resized(VIEW_PX), photographs[i].T_world_camera.copy()
         pose[:3, 3] *= unit
         camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose)
         alpha = rasterize(scaled, camera).alpha
@@ -247,9 +247,9 @@ def _check_frame(file: Path, placed: PlacedDrive) -> None:
 def _blank_views(drive: SourceDrive, placed: PlacedDrive) -> list[PosedView]:
     """Return views without an image, for their cameras."""
     views = []
-    for picture, pose in zip(drive.of(drive.front), placed.poses[drive.front], strict=True):
-        lens = picture.lens.resized(VIEW_PX)
+    for photograph, pose in zip(drive.of(drive.front), placed.poses[drive.front], strict=True):
+        lens = photograph.lens.resized(VIEW_PX)
         camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose)
         blank = np.zeros((lens.height, lens.width, 3), np.uint8)
-        views.append(PosedView(camera, blank, picture.file.stem))
+        views.append(PosedView(camera, blank, photograph.file.stem))
     return views

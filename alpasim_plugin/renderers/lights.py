@@ -102,8 +102,8 @@ class SceneLights:
             box, T = self.boxes[name], actors[name]
             for end, rgb in ((1, HEAD_RGB), (-1, TAIL_RGB)):
                 middle = _moved(T, end * box.length_m / 2, LAMP_HEIGHT_M - box.height_m / 2)[:3, 3]
-                for aside_m in (-0.36 * box.width_m, 0.36 * box.width_m):
-                    spots.append(Spot(middle + aside_m * T[:3, 1], end * T[:3, 0], 0.09, rgb))
+                for lateral_m in (-0.36 * box.width_m, 0.36 * box.width_m):
+                    spots.append(Spot(middle + lateral_m * T[:3, 1], end * T[:3, 0], 0.09, rgb))
         return spots
 
 

@@ -56,7 +56,7 @@ def build(
         scene_of(scenario),
         splat.views,
         splat.width,
-        aside_m=recipe.lateral_offset_m,
+        lateral_m=recipe.lateral_offset_m,
         threads=threads,
     )
     model, sky_views = reconstruct(

@@ -95,7 +95,7 @@ def rasteriser(device: str) -> Facts:
         facts[f"{width}x{height}"] = compared(
             partial(_rendered, ours, request), partial(_rendered, theirs, request)
         )
-    return _judged(facts)
+    return _checked(facts)
 
 
 def fixer(device: str) -> Facts:
@@ -104,7 +104,7 @@ def fixer(device: str) -> Facts:
     for width, height in SIZES:
         ours, theirs = _streaming(device, width, height), _streaming("cpu", width, height)
         facts[f"{width}x{height}"] = compared(ours, theirs)
-    return _judged(facts)
+    return _checked(facts)
 
 
 def rollout(device: str) -> Facts:
@@ -137,7 +137,7 @@ def compared(ours: Callable[[], Any], theirs: Callable[[], Any]) -> Facts:
     }
 
 
-def _judged(facts: Facts) -> Facts:
+def _checked(facts: Facts) -> Facts:
     sizes = [value for value in facts.values() if isinstance(value, dict)]
     facts["ok"] = all(size["odd_share"] <= ODD_SHARE for size in sizes)
     if not facts["ok"]:

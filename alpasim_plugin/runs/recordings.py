@@ -28,7 +28,7 @@ from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.opening import Run
 from evaluators.report.rollouts import events_of
 from evaluators.viewer.cells import Logs, WatchedCell
-from evaluators.viewer.pictures import NO_FRAMES, Source, sources
+from evaluators.viewer.images import NO_FRAMES, Source, sources
 
 Rgb = tuple[float, float, float]
 Message = JsonObject

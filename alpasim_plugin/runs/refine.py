@@ -1,4 +1,4 @@
-"""Refine a video file or a folder of pictures: read, fix block by block, write; optionally with
+"""Refine a video file or a folder of images: read, fix block by block, write; optionally with
 opacity and semantic map.
 
 Only the current block is held in memory. The result is renamed to its final name when it is
@@ -37,7 +37,7 @@ PERIOD = Fraction(1, 10)  # seconds from image to image: they have no times of t
 GREY_LEVELS = 40  # channels of an opacity video may differ by this much, because of compression
 
 
-class PictureFolderReader:
+class ImageFolderReader:
     """Iterate over the ``.png`` files of a folder in natural order of their names; like `log.video.VideoReader`.
 
     Args:
@@ -90,7 +90,7 @@ class PictureFolderReader:
         return InputError(f"{self.path}: {found}", do)
 
 
-class PictureFolderWriter:
+class ImageFolderWriter:
     """Take frames one by one; the folder appears once the ``with`` block ends well. Like
     `log.video.VideoWriter`.
 
@@ -136,8 +136,8 @@ class PictureFolderWriter:
         self.count += 1
 
 
-Reader = VideoReader | PictureFolderReader
-Writer = VideoWriter | PictureFolderWriter
+Reader = VideoReader | ImageFolderReader
+Writer = VideoWriter | ImageFolderWriter
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def refine_video(
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
             if os.path.isdir(path):
-                readers[role] = PictureFolderReader(path)
+                readers[role] = ImageFolderReader(path)
             else:
                 readers[role] = stack.enter_context(VideoReader(path))
         check_formats(readers)
@@ -325,8 +325,8 @@ def check_names(files: RefineFiles) -> None:
 
 def _writer(path: Path, source: Reader) -> Writer:
     if not path.suffix:
-        return PictureFolderWriter(
-            path, source.names if isinstance(source, PictureFolderReader) else None
+        return ImageFolderWriter(
+            path, source.names if isinstance(source, ImageFolderReader) else None
         )
     stated = source.format
     return VideoWriter(
@@ -371,7 +371,7 @@ def check_formats(readers: Mapping[str, Reader]) -> None:
 
 
 def _form(reader: Reader) -> str:
-    return "folder" if isinstance(reader, PictureFolderReader) else "video"
+    return "folder" if isinstance(reader, ImageFolderReader) else "video"
 
 
 def _joined(

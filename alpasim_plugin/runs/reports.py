@@ -72,7 +72,7 @@ def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:
 
 
 MAX_FLIPS = 60  # cells whose logs are read
-PICTURE_WIDTH = 560
+IMAGE_WIDTH = 560
 
 
 def write_flips(run_dir: Path | Run) -> Path:
@@ -132,7 +132,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
         "gap_m": round(found.gap_m, 4),
     }
     frames = {
-        side: _picture(root, log, found.t_us, f"{name}-{i}.jpg")
+        side: _image(root, log, found.t_us, f"{name}-{i}.jpg")
         for i, (side, log) in enumerate(logs.items())
     }
     if None in frames.values():
@@ -146,7 +146,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
     }
 
 
-def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
+def _image(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
     """Save the first camera's newest frame at a query and return its path; None where the log has
     none.
     """
@@ -157,5 +157,5 @@ def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
     if not shown:
         return None
     rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
-    write_bytes(root / name, encode_image(smaller(rgb, PICTURE_WIDTH), "jpeg", 85))
+    write_bytes(root / name, encode_image(smaller(rgb, IMAGE_WIDTH), "jpeg", 85))
     return name

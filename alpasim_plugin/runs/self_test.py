@@ -84,8 +84,8 @@ def run_self_test(
     ]
     failed = worst([outcome_of_failures(result.summary["failures"]) for result in results])
     first, again = (table_of_run(read_run(folder)) for folder in (root, root / "control"))
-    trials = [Trial(name, True, judge_against(first, spec, first, name)) for name in broken]
-    trials.append(Trial(CONTROL, False, judge_against(again, spec, first, REFERENCE)))
+    trials = [Trial(name, True, gate_against(first, spec, first, name)) for name in broken]
+    trials.append(Trial(CONTROL, False, gate_against(again, spec, first, REFERENCE)))
     reasons = tuple(
         f"{trial.renderer} is {'not caught' if trial.is_broken else 'wrongly called worse'}"
         for trial in trials
@@ -96,7 +96,7 @@ def run_self_test(
     return trials, Outcome("regression" if reasons else "pass", reasons)
 
 
-def judge_against(
+def gate_against(
     table: RolloutTable, spec: GateSpec, first: RolloutTable, name: str
 ) -> GateVerdict:
     """Decide about one renderer of a table against the reference of the first."""

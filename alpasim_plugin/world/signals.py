@@ -16,7 +16,7 @@ from alpasim_plugin.world.path import Path
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
 SEEN_M = 30.0  # others are looked for from so far before a line to give way at
 CROSSED_M, CROSSED_S = 20.0, np.arange(0.0, 4.1, 0.5)  # behind the line, and so long ahead
-ASIDE_M = 2.5  # who comes nearer to the own way is let pass
+LATERAL_M = 2.5  # who comes nearer to the own way is let pass
 MOVING_MPS = 0.5
 
 
@@ -79,12 +79,12 @@ def give_way_gap_m(
             continue
         crossed, _ = path.at(np.arange(line.s_m + 1.0, line.s_m + CROSSED_M, 1.0))
         s_m, offset_m = path.project(bodies.xy)
-        counts = (s_m > line.s_m) | (np.abs(offset_m) > ASIDE_M)
+        counts = (s_m > line.s_m) | (np.abs(offset_m) > LATERAL_M)
         counts &= np.linalg.norm(bodies.velocity, axis=1) > MOVING_MPS
         counts &= np.arange(len(bodies.xy)) != own
         ahead = bodies.velocity[counts, None] * CROSSED_S[:, None]
         places = bodies.xy[counts, None] + ahead  # (K, T, 2)
         apart = places[:, :, None] - crossed[:, :2]  # (K, T, N, 2)
-        if (np.hypot(apart[..., 0], apart[..., 1]) < ASIDE_M).any():
+        if (np.hypot(apart[..., 0], apart[..., 1]) < LATERAL_M).any():
             return gap_m
     return float("inf")

@@ -37,12 +37,12 @@ class Walker:
         poses = interpolate(track, np.clip(seen_us, track.t_us[0], track.t_us[-1]))
         from_ego = inverse(ego.T_world_rig) @ poses
         ahead_m = from_ego[:, 0, 3] - vehicle.rear_axle_to_centre_m
-        aside_m = np.abs(from_ego[:, 1, 3])
+        lateral_m = np.abs(from_ego[:, 1, 3])
         reach_m = max(self.actor.box.length_m, self.actor.box.width_m) / 2 + MARGIN_M
         half_m = vehicle.box.length_m / 2 + reach_m
         covered_m = half_m + max(ego.speed_mps, 0.0) * COVERED_S
         inside = (ahead_m > -half_m) & (ahead_m < covered_m)
-        inside &= aside_m < vehicle.box.width_m / 2 + reach_m
+        inside &= lateral_m < vehicle.box.width_m / 2 + reach_m
         wanted = 0.0 if inside.any() and not inside[0] else 1.0
         dt_s = (to_us - from_us) * 1e-6
         step = CHANGE_PER_S * dt_s

@@ -29,7 +29,7 @@ from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import handover_us, series, with_preset
 from evaluators.scores import nuplan
-from evaluators.scores.judged import Judged
+from evaluators.scores.scored import ScoredRollout
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"
@@ -121,7 +121,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
 
     at_fault = front | lateral
     if preset.fault == "nuplan" and len(step):
-        guilty = _at_fault(Judged(rollout, scene, preset, rollout.ego), actor, side, step)
+        guilty = _at_fault(ScoredRollout(rollout, scene, preset, rollout.ego), actor, side, step)
         at_fault = np.zeros_like(front)
         at_fault[step[guilty]] = True
 
@@ -156,7 +156,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     ]
 
 
-def _at_fault(drive: Judged, actor: I64, side: I64, step: I64) -> Bool:
+def _at_fault(drive: ScoredRollout, actor: I64, side: I64, step: I64) -> Bool:
     """Return of which contacts ``(M,)`` the ego is at fault by nuPlan's rules: it moves, and it
     touches what stands, or somebody with its front, or at its side while no lane holds it.
     """

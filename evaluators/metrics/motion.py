@@ -14,7 +14,7 @@ from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import handover_us, series, with_preset
 from evaluators.scores import nuplan
-from evaluators.scores.judged import Judged
+from evaluators.scores.scored import ScoredRollout
 from evaluators.scores.states import EgoStates, Tracks
 
 RESPONSE_S = 1.0
@@ -87,7 +87,7 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     if preset.aliases:
         return []
     t_us = rollout.ego.t_us
-    drive = Judged(rollout, scene, preset, rollout.ego)
+    drive = ScoredRollout(rollout, scene, preset, rollout.ego)
     enough = len(t_us) > nuplan.LEAST_INSTANTS
     moves = nuplan.motion(drive.ego) if enough else None
     against = (

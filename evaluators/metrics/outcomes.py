@@ -196,20 +196,20 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     path = recorded_path(rollout, preset)
     ego = ego_footprints(rollout, preset, origin)
     line = path.xyz[:, :2] - origin[:2]
-    aside_m = on_route(line, path.t_us, t_us, ego.xy).aside_m
+    lateral_m = on_route(line, path.t_us, t_us, ego.xy).lateral_m
     s = followed(
         line,
         *to_path(line, ego.xy),
         ego.xy,
         float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
     )
-    has_side = np.isfinite(aside_m)
+    has_side = np.isfinite(lateral_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, path, line, s)
     return [
         series("stalled", t_us, stalled, has_side, why),
         series("braked_without_cause", t_us, braked, has_side, why),
-        series("left_route", t_us, np.nan_to_num(aside_m) >= LEFT_ROUTE_M, has_side, why),
+        series("left_route", t_us, np.nan_to_num(lateral_m) >= LEFT_ROUTE_M, has_side, why),
     ]
 
 

@@ -204,14 +204,14 @@ class OnRoute:
     Attributes:
         length_m: Length of the path.
         along_m: ``(T,)`` how far along it, continuous from step to step.
-        aside_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at
+        lateral_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at
             both ends.
         side: ``(T,)`` as `left_of`.
     """
 
     length_m: float
     along_m: F64
-    aside_m: F64
+    lateral_m: F64
     side: F64
 
 
@@ -255,7 +255,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     no_length = "the recorded path has no length"
     outside = "the recording does not cover this time"
-    aside_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
+    lateral_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
     so_far = progress_so_far(recorded_xy, ego)
     driven_m = arc_lengths(ego)
@@ -267,7 +267,12 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
         traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
         share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
         so_far[:2] = 1.0
-        for column in (distance_m, away_m, traveled_m, *(() if aside_m is None else (aside_m,))):
+        for column in (
+            distance_m,
+            away_m,
+            traveled_m,
+            *(() if lateral_m is None else (lateral_m,)),
+        ):
             column[:2] = 0.0
     out = [
         series("dist_to_gt_trajectory", t_us, distance_m),
@@ -279,19 +284,21 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
         series("eval_relevant", t_us, engaged),
     ]
     if on is None:
-        if aside_m is not None and preset.stop_beyond_gt_m is not None:
-            out.append(series("lateral_dist_to_gt_trajectory", t_us, aside_m))
-            out.append(series("left_corridor_laterally", t_us, aside_m >= preset.stop_beyond_gt_m))
+        if lateral_m is not None and preset.stop_beyond_gt_m is not None:
+            out.append(series("lateral_dist_to_gt_trajectory", t_us, lateral_m))
+            out.append(
+                series("left_corridor_laterally", t_us, lateral_m >= preset.stop_beyond_gt_m)
+            )
         if preset.progress_of == "reachable" and length_m > 0:
             reached_m = float(to_path(path, recorded_xy[-1:])[1][0])
             share = share * (length_m / reached_m if reached_m > 0 else 1.0)
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
-    has_side = np.isfinite(on.aside_m)
+    has_side = np.isfinite(on.lateral_m)
     return [
         *out,
-        series("lateral_distance_m", t_us, on.aside_m, has_side, no_direction),
+        series("lateral_distance_m", t_us, on.lateral_m, has_side, no_direction),
         series("route_distance_m", t_us, distance_m),
-        series("lateral_bias_m", t_us, on.side * on.aside_m, has_side, no_direction),
+        series("lateral_bias_m", t_us, on.side * on.lateral_m, has_side, no_direction),
     ]
 
 

@@ -27,7 +27,7 @@ class Chart:
 
     title: str
     note: str
-    picture: Markup
+    image: Markup
 
 
 def new_axes(x_label: str, y_label: str) -> Axes:

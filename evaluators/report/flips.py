@@ -130,25 +130,25 @@ class FlipRow:
 
     Attributes:
         entry: What ``flips.json`` says of it.
-        pictures: (side, colour, data address) when the plans diverged.
+        images: (side, colour, data address) when the plans diverged.
         why_not: Why there are no images.
         links: (side, colour, clip, folder).
     """
 
     flip: Flip
     entry: JsonView
-    pictures: Sequence[tuple[str, int, str]]
+    images: Sequence[tuple[str, int, str]]
     why_not: str
     links: Sequence[tuple[str, int, str | None, str | None]]
 
 
 def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
-    """Lay out the flips with their pictures, as far as a budget goes.
+    """Lay out the flips with their images, as far as a budget goes.
 
     Args:
         run: The run; ``flips.json`` holds when plans diverged and where the frames of that time
             are.
-        budget_bytes: Most bytes of pictures to inline.
+        budget_bytes: Most bytes of images to inline.
 
     Returns:
         The rows, how many more flips there are, and the number of pairs compared.
@@ -164,16 +164,16 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     for flip in flips[:MAX_FLIP_ROWS]:
         entry: JsonView = known.get(flip.key) or {"t_us": None, "reason": unknown}
         why_not = entry.get("reason") or entry.get("frames_reason") or TOO_MANY
-        pictures, links = [], []
+        images, links = [], []
         for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True):
             colour, _ = colours[rollout.renderer, rollout.policy]
             links.append((name, colour, run.href(rollout, VIDEO_NAME), run.href(rollout)))
             path = inside(run.folder, str((entry.get("frames") or {}).get(name)))
             if spent < budget_bytes and path is not None and os.path.isfile(path):
                 data = base64.b64encode(read_bytes(path, SOURCE_BYTES)).decode()
-                pictures.append((name, colour, f"data:image/jpeg;base64,{data}"))
-        spent += sum(len(src) for _, _, src in pictures)
-        rows.append(FlipRow(flip, entry, pictures, "" if pictures else why_not, links))
+                images.append((name, colour, f"data:image/jpeg;base64,{data}"))
+        spent += sum(len(src) for _, _, src in images)
+        rows.append(FlipRow(flip, entry, images, "" if images else why_not, links))
     return rows, len(flips) - len(rows), compared
 
 

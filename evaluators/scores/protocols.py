@@ -28,7 +28,7 @@ from evaluators.metrics.route import on_route, recorded_path
 from evaluators.metrics.score import relevant, series, with_preset
 from evaluators.metrics.surface import MARGIN_M
 from evaluators.scores import nuplan
-from evaluators.scores.judged import Judged, Part
+from evaluators.scores.scored import Part, ScoredRollout
 from evaluators.scores.states import derivative, ego_states, smooth
 from evaluators.scores.table import PARTS
 
@@ -81,7 +81,7 @@ def ego_progress(ego_m: float, reference_m: float) -> float:
 def _nuplan(
     rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
 ) -> dict[str, Part]:
-    ego = Judged(rollout, scene, preset, centre)
+    ego = ScoredRollout(rollout, scene, preset, centre)
     progress = _progress(rollout, preset, centre, nuplan.progress_ratio)
     is_made: Part = progress
     if not isinstance(progress, str):
@@ -101,7 +101,7 @@ def _nuplan(
 def _navsim(
     rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
 ) -> dict[str, Part]:
-    ego = Judged(rollout, scene, preset, centre)
+    ego = ScoredRollout(rollout, scene, preset, centre)
     return {
         "nc": ego.contact(),
         "dac": ego.drivable(MARGIN_M),

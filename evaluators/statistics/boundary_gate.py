@@ -13,7 +13,7 @@ from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, 
 METRIC = "boundary"
 
 
-def judge_boundaries(
+def boundary_verdict(
     table: RolloutTable,
     spec: GateSpec,
     record: JsonView | None,

@@ -53,8 +53,8 @@ from evaluators.viewer.drive_data import (
     user_data,
 )
 from evaluators.viewer.evidence import plan_facts
+from evaluators.viewer.images import frame_rows, jpeg, seen_before
 from evaluators.viewer.page import as_json, fill
-from evaluators.viewer.pictures import frame_rows, jpeg, seen_before
 
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown

@@ -35,7 +35,7 @@ from evaluators.viewer.drive_data import (
     plans_part,
     scene_of,
 )
-from evaluators.viewer.pictures import (
+from evaluators.viewer.images import (
     NO_FRAMES,
     Rows,
     encoded,

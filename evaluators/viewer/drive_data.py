@@ -21,7 +21,7 @@ from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, drawn_map
 from evaluators.report.rollouts import SERIES, events_of
-from evaluators.viewer.pictures import Rows, seen_before
+from evaluators.viewer.images import Rows, seen_before
 
 METRIC_DIGITS = 5
 PLAN_STEP_US = 500_000

@@ -16,7 +16,7 @@ from evaluators.opening import Run
 from evaluators.report.flips import find_flips
 from evaluators.report.overview import variant_name
 from evaluators.viewer.cells import read_log
-from evaluators.viewer.pictures import Source, jpeg, sources
+from evaluators.viewer.images import Source, jpeg, sources
 
 SHOWN = 3
 WIDTH_PX = 420

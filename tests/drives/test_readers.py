@@ -52,7 +52,7 @@ def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path):
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
 def test_a_colmap_model(tmp_path, binary):
     drive, placed = opened(write_colmap(tmp_path / "a", binary))
-    assert (drive.kind, len(drive.pictures)) == ("colmap", COUNT)
+    assert (drive.kind, len(drive.photographs)) == ("colmap", COUNT)
     assert_is_the_street(placed)
 
 
@@ -67,7 +67,7 @@ def test_a_colmap_model(tmp_path, binary):
 def test_photographs_are_freed_of_every_lens(tmp_path, model, bend):
     drive = read_source(write_colmap(tmp_path / "a", True, model, bend))
     plain = read_source(write_colmap(tmp_path / "b", True))
-    bent, straight = drive.pictures[5], plain.pictures[5]
+    bent, straight = drive.photographs[5], plain.photographs[5]
     K = bent.lens.straight_K()
     H = straight.lens.K @ np.linalg.inv(K)
     back = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
@@ -102,5 +102,5 @@ def test_times_put_photographs_in_order(tmp_path):
     document["frames"].reverse()
     (folder / "transforms.json").write_text(json.dumps(document))
     drive = read_source(folder)
-    assert [one.t_us for one in drive.pictures] == [50_000 * i for i in range(COUNT)]
+    assert [one.t_us for one in drive.photographs] == [50_000 * i for i in range(COUNT)]
     assert drive.metric == "the file's word that its unit is the metre"

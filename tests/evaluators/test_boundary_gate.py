@@ -3,7 +3,7 @@
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.statistics.boundary_gate import judge_boundaries, more_that_fails
+from evaluators.statistics.boundary_gate import boundary_verdict, more_that_fails
 from evaluators.statistics.gate import GateSpec, load_gate
 from tests.evaluators.test_gate import rows, table_of
 
@@ -51,7 +51,7 @@ def record(base, variant, difference=None, **more):
     ],
 )
 def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, difference, code):
-    verdict = judge_boundaries(TABLE, GATE, record(base, variant, difference))
+    verdict = boundary_verdict(TABLE, GATE, record(base, variant, difference))
     assert verdict.exit_code == code
     assert [check.renderer for check in verdict.checks] == ["3dgs"]
 
@@ -59,7 +59,7 @@ def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, 
 def test_an_earlier_run_is_compared_variant_by_variant():
     now = record(found(6.0, 6.2), found(7.0, 7.2), (0.8, 1.2))
     was = record(found(6.0, 6.2), found(6.0, 6.2), (-0.2, 0.2))
-    verdict = judge_boundaries(TABLE, GATE, now, was, "before")
+    verdict = boundary_verdict(TABLE, GATE, now, was, "before")
     assert {check.renderer: check.cause for check in verdict.checks} == {
         "clean": "pass",
         "3dgs": "regression",
@@ -69,12 +69,12 @@ def test_an_earlier_run_is_compared_variant_by_variant():
 
 def test_what_cannot_be_compared_is_bad_input():
     good = record(found(6.0, 6.2), found(6.1, 6.3))
-    assert judge_boundaries(TABLE, GATE, good | {"stopped": "here"}).exit_code == 2
+    assert boundary_verdict(TABLE, GATE, good | {"stopped": "here"}).exit_code == 2
     for now, was in ((None, None), (good, {}), (good, good | {"reachable": [4.0, 12.0]})):
         with pytest.raises(InputError):
-            judge_boundaries(TABLE, GATE, now, was, "before")
+            boundary_verdict(TABLE, GATE, now, was, "before")
     with pytest.raises(InputError):
-        judge_boundaries(table_of(rows("clean", 1)), GATE, good)
+        boundary_verdict(table_of(rows("clean", 1)), GATE, good)
 
 
 @pytest.mark.parametrize(

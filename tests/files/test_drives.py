@@ -91,7 +91,7 @@ STRAIGHT = [round(STEP_M * i, 3) for i in range(13)]
     ],
 )
 def test_photographs_without_times_are_taken_along_the_path(tmp_path, names, order):
-    drive = read_source(transforms(tmp_path / "a", names, order, unit="m"), photographs=False)
+    drive = read_source(transforms(tmp_path / "a", names, order, unit="m"), need_files=False)
     assert along(drive) == STRAIGHT
     assert any("no times" in note for note in drive.notes)
 
@@ -100,16 +100,16 @@ def test_a_colmap_model_is_read_in_natural_order_with_any_line_of_points(tmp_pat
     names = [f"my photo  {i}.png" for i in range(1, 14)]
     for points in (True, False):
         colmap(tmp_path / f"{points}/sparse/0", names, points)
-        drive = read_source(tmp_path / str(points), photographs=False)
+        drive = read_source(tmp_path / str(points), need_files=False)
         assert along(drive) == STRAIGHT
-        assert drive.pictures[2].file.name == "my photo  3.png"
+        assert drive.photographs[2].file.name == "my photo  3.png"
 
 
 def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path):
     colmap(tmp_path / "sparse/0", ["a.png", "b.png"])
     colmap(tmp_path / "sparse/10", [f"{i}.png" for i in range(13)])
-    drive = read_source(tmp_path, photographs=False)
-    assert len(drive.pictures) == 13
+    drive = read_source(tmp_path, need_files=False)
+    assert len(drive.photographs) == 13
     assert any("2 models" in note and "sparse/10" in note for note in drive.notes)
 
 
@@ -117,7 +117,7 @@ def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path):
 def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path, name):
     colmap(tmp_path / "sparse", ["a.png"], camera=f"{name} 320 128 180 180 160 54 0.1")
     with pytest.raises(InputError, match=name):
-        read_source(tmp_path, photographs=False)
+        read_source(tmp_path, need_files=False)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_rows_of_kitti_are_found_by_name(tmp_path, calib, focal):
         with pytest.raises(InputError):
             read_source(folder)
     else:
-        assert read_source(folder).pictures[0].lens.K[0, 0] == focal
+        assert read_source(folder).photographs[0].lens.K[0, 0] == focal
 
 
 def test_unknown_rows_of_kitti_are_said(tmp_path):
@@ -165,13 +165,13 @@ def test_a_header_of_times_is_refused_with_its_line(tmp_path):
 )
 def test_what_transforms_cannot_mean_is_refused_by_name(tmp_path, keys, found):
     with pytest.raises(InputError, match=found):
-        read_source(transforms(tmp_path / "a", ["1.png", "2.png"], **keys), photographs=False)
+        read_source(transforms(tmp_path / "a", ["1.png", "2.png"], **keys), need_files=False)
 
 
 def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"], is_fisheye=True, k1=0.1, wobble=3)
-    drive = read_source(folder, photographs=False)
-    assert drive.pictures[0].lens.model == "fisheye"
+    drive = read_source(folder, need_files=False)
+    assert drive.photographs[0].lens.model == "fisheye"
     assert any("wobble" in note for note in drive.notes)
 
 
@@ -180,12 +180,12 @@ def test_masks_of_frames_are_noted_since_they_are_not_used(tmp_path):
     document = json.loads((folder / "transforms.json").read_text())
     document["frames"][2]["mask_path"] = "masks/2.png"
     (folder / "transforms.json").write_text(json.dumps(document))
-    assert any("mask_path" in note for note in read_source(folder, photographs=False).notes)
+    assert any("mask_path" in note for note in read_source(folder, need_files=False).notes)
 
 
 def test_a_point_file_of_another_place_is_not_needed_for_a_model(tmp_path):
     folder = transforms(tmp_path / "a", ["1.png", "2.png"], ply_file_path="gone.ply")
-    assert read_source(folder, photographs=False).points is None
+    assert read_source(folder, need_files=False).points is None
     with pytest.raises(InputError):
         read_source(folder)
 
@@ -198,7 +198,7 @@ def test_nothing_outside_of_the_folder_is_read_as_a_photograph(tmp_path):
         (folder / "transforms.json").write_text(text.replace("images/", outside))
         with pytest.raises(InputError):
             read_source(folder)
-        read_source(folder, photographs=False)
+        read_source(folder, need_files=False)
 
 
 def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path):
@@ -212,7 +212,7 @@ def test_photographs_of_another_machine_and_axes_without_photographs(tmp_path):
     del document["axes"]
     (folder / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="'axes'"):
-        read_source(folder, photographs=False)
+        read_source(folder, need_files=False)
 
 
 def test_a_pose_of_kitti_belongs_to_the_number_of_a_photograph(tmp_path):
@@ -269,23 +269,23 @@ def two_cameras(folder, names, form):
 @pytest.mark.parametrize("form", ["transforms", "folders", "colmap"])
 def test_photographs_of_one_number_have_one_time(tmp_path, form):
     names = {i: f"{i:04d}" for i in range(13) if i not in (0, 7)}
-    drive = read_source(two_cameras(tmp_path / "a", names, form), photographs=False)
+    drive = read_source(two_cameras(tmp_path / "a", names, form), need_files=False)
     assert [one.t_us for one in drive.of("front")] == [100_000 * i for i in range(13)]
     assert [one.t_us for one in drive.of("side")] == [100_000 * i for i in names]
     if form == "folders":  # no name stands in both: they may be one camera's
         return
     unnumbered = {i: f"x{'abcdefghijklm'[i]}" for i in names}
     with pytest.raises(InputError, match=r"\[13, 11\]"):
-        read_source(two_cameras(tmp_path / "b", unnumbered, form), photographs=False)
+        read_source(two_cameras(tmp_path / "b", unnumbered, form), need_files=False)
     unnumbered = {i: f"x{'abcdefghijklm'[i]}" for i in range(13)}
-    drive = read_source(two_cameras(tmp_path / "c", unnumbered, form), photographs=False)
+    drive = read_source(two_cameras(tmp_path / "c", unnumbered, form), need_files=False)
     assert [one.t_us for one in drive.of("side")] == [100_000 * i for i in range(13)]
 
 
 def test_gaps_in_the_numbers_of_photographs_are_gaps_in_time(tmp_path):
     names = [f"frame_{5 * i + (40 if i > 6 else 0):05d}.png" for i in range(13)]
-    drive = read_source(transforms(tmp_path / "a", names), photographs=False)
-    assert [one.t_us // 100_000 for one in drive.pictures] == [*range(7), *range(15, 21)]
+    drive = read_source(transforms(tmp_path / "a", names), need_files=False)
+    assert [one.t_us // 100_000 for one in drive.photographs] == [*range(7), *range(15, 21)]
 
 
 def test_times_in_nanoseconds_are_refused(tmp_path):
@@ -294,14 +294,14 @@ def test_times_in_nanoseconds_are_refused(tmp_path):
     for i, frame in enumerate(document["frames"]):
         frame["t_us"] = 100_000_000 * i
     (folder / "transforms.json").write_text(json.dumps(document))
-    drive = read_source(folder, photographs=False)
+    drive = read_source(folder, need_files=False)
     with pytest.raises(InputError, match="m/s"):
         check_motion(drive, place(drive, street_points(drive)))
 
 
 def test_the_page_of_a_drive_holds_no_markup_of_its_files(tmp_path):
     folder = transforms(tmp_path / "a\x1b[2J", ["1.png", "2.png"], **{"<img src=x>\u202e": 1})
-    drive = read_source(folder, photographs=False)
+    drive = read_source(folder, need_files=False)
     grey = np.zeros((4, 4, 3), np.uint8)
     shown = [("held-out", Comparison("<b>\x1b", grey, grey, 30.0, 0.9), "pictures/<b>\x1b.jpg")]
     quality = {
@@ -324,7 +324,7 @@ def test_a_drive_that_no_car_can_drive_is_refused_with_the_photograph(tmp_path):
         frame["t_us"] = 100_000 * i if i != 7 else 650_000
     document["frames"][7]["transform_matrix"][0][3] += 2.0
     (folder / "transforms.json").write_text(json.dumps(document))
-    drive = checked(read_source(folder, photographs=False), folder, photographs=False)
+    drive = checked(read_source(folder, need_files=False), folder, need_files=False)
     with pytest.raises(InputError, match=r"7\.png"):
         check_motion(drive, place(drive, street_points(drive)))
 
@@ -352,7 +352,7 @@ def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(tmp_
     more = {"applied_transform": before[:3].tolist(), "applied_scale": 2.0}
     names = [f"{i}.png" for i in range(13)]
     folder = transforms(tmp_path / "a", names, **(more if keys == "stated" else {}))
-    drive = read_source(folder, photographs=False)
+    drive = read_source(folder, need_files=False)
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(np.array([0.7, 0.2, -0.4]))[0]
     T[:3, 3] = -6.9, 0.5, -1.7
@@ -385,7 +385,7 @@ def test_what_a_colmap_model_lacks_is_said(tmp_path, file, text, found):
     colmap(model, [f"{i}.png" for i in range(13)])
     (model / file).write_text(text)
     with pytest.raises(InputError, match=found):
-        read_source(tmp_path, photographs=False)
+        read_source(tmp_path, need_files=False)
 
 
 SIDE = np.eye(4)
@@ -454,7 +454,7 @@ def as_binary(model):
 @pytest.mark.parametrize("folders", [("front/", "left/"), ("a", "b")], ids=["folders", "prefixes"])
 def test_images_of_a_frame_of_a_rig_have_one_time(tmp_path, folders, binary):
     rig(tmp_path / "sparse/0", folders, [0, 1, 4, 12], binary)
-    drive = read_source(tmp_path, photographs=False)
+    drive = read_source(tmp_path, need_files=False)
     names = ["front", "left"] if folders[0] == "front/" else ["camera-7", "camera-9"]
     assert drive.cameras == names
     assert along(drive) == STRAIGHT
@@ -470,12 +470,12 @@ def test_rigs_of_one_camera_change_nothing(tmp_path):
     colmap(model, [f"{i}.png" for i in range(13)])
     (model / "rigs.txt").write_text("1 1 CAMERA 7\n")
     (model / "frames.txt").write_text("4 1 1 0 0 0 0 0 0 1 CAMERA 7 1\n")
-    assert along(read_source(tmp_path, photographs=False)) == STRAIGHT
+    assert along(read_source(tmp_path, need_files=False)) == STRAIGHT
 
 
 def test_a_file_without_frames_is_refused(tmp_path):
     with pytest.raises(InputError, match="no frames"):
-        read_source(transforms(tmp_path / "a", []), photographs=False)
+        read_source(transforms(tmp_path / "a", []), need_files=False)
 
 
 def test_photographs_that_are_missing_leave_their_time(tmp_path):
@@ -483,8 +483,8 @@ def test_photographs_that_are_missing_leave_their_time(tmp_path):
     (folder / "images").mkdir()
     for i in (0, 1, 5, 6, 7, 8, 9, 10, 11, 12):
         (folder / f"images/{i}.png").write_bytes(b"x")
-    drive = read_source(folder, photographs=False)
-    assert [one.t_us for one in drive.pictures][:3] == [0, 100_000, 500_000]
+    drive = read_source(folder, need_files=False)
+    assert [one.t_us for one in drive.photographs][:3] == [0, 100_000, 500_000]
     assert any("3 of 13" in note for note in drive.notes)
 
 
@@ -494,7 +494,7 @@ def test_a_walk_around_an_object_without_metres_has_no_speed(tmp_path):
     for i, frame in enumerate(document["frames"]):
         frame["transform_matrix"][1][3] = 3.0 * (-1) ** i
     (folder / "transforms.json").write_text(json.dumps(document))
-    drive = read_source(folder, photographs=False)
+    drive = read_source(folder, need_files=False)
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     check_motion(drive, place(drive, nothing))
 
@@ -504,9 +504,9 @@ def test_text_of_windows_is_read(tmp_path):
     colmap(model, [f"{i}.png" for i in range(13)])
     for file in model.glob("*.txt"):
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
-    assert along(read_source(tmp_path / "a", photographs=False)) == STRAIGHT
+    assert along(read_source(tmp_path / "a", need_files=False)) == STRAIGHT
     folder = transforms(tmp_path / "b", [f"{i}.png" for i in range(13)])
     file = folder / "transforms.json"
     file.write_text(file.read_text().replace("images/", r".\\images\\"))
-    first = read_source(folder, photographs=False).pictures[0].file
+    first = read_source(folder, need_files=False).photographs[0].file
     assert first == folder / "images/0.png"

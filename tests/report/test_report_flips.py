@@ -65,7 +65,7 @@ def test_rows_show_both_frames_the_time_and_both_clips(usual_run):
         44 + 34,
     )  # 48 pairs of renderers, 36 of policies; two cells failed with both policies
     assert len(rows) > 3
-    assert [name for name, *_ in rows[0].pictures] == list(rows[0].flip.sides)
+    assert [name for name, *_ in rows[0].images] == list(rows[0].flip.sides)
     assert (rows[0].entry["after_us"], rows[0].entry["gap_m"]) == (1_000_000, 0.5)
     assert rows[1].entry["t_us"] is None
     assert rows[1].why_not == "the plans never diverge by more than 0.5 m"
@@ -110,7 +110,7 @@ def test_frames_outside_the_run_folder_are_not_read(usual_run, tmp_path):
     shutil.copy(folder / "flips/000-0.jpg", tmp_path / "secret.jpg")
     told["cells"][0]["frames"] = dict.fromkeys(told["cells"][0]["frames"], "../secret.jpg")
     (folder / "flips.json").write_text(json.dumps(told))
-    assert not flip_rows(read_run(folder), 10**7)[0][0].pictures
+    assert not flip_rows(read_run(folder), 10**7)[0][0].images
 
 
 def test_events_name_the_gravest_word_only():

@@ -9,7 +9,7 @@ from alpasim_plugin.runs.self_test import (
     CONTROL,
     REFERENCE,
     Trial,
-    judge_against,
+    gate_against,
 )
 from evaluators.statistics.gate import GateSpec, MetricRule
 from tests.evaluators.test_gate import add, rows, table_of
@@ -20,7 +20,7 @@ def trial(margin, is_broken, change, limit=None):
     name = "broken-black" if is_broken else CONTROL
     first, again = table_of(rows(REFERENCE)), table_of(add(change)(rows(name)))
     spec = GateSpec(version=1, metrics=rules, min_scenes=100)  # the self-test asks for no more
-    return Trial(name, is_broken, judge_against(again, spec, first, name))
+    return Trial(name, is_broken, gate_against(again, spec, first, name))
 
 
 def test_a_sensitive_gate_is_right_about_both():

@@ -33,7 +33,7 @@ from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, w
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.reading.images import check_image, picture_fault
+from alpasim_plugin.core.reading.images import check_image, image_fault
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -214,7 +214,7 @@ class Driving:
         check_time(image.frame_end_us, "submit_image_observation")
         where = f"camera {image.logical_id!r} at {image.frame_end_us} us"
         size = check_image(image.image_bytes, where)
-        if fault := picture_fault(image.image_bytes):
+        if fault := image_fault(image.image_bytes):
             raise InputError(f"{where}: {fault}", "give a whole PNG or JPEG image")
         with self._lock:
             if (held := self._sizes.setdefault(image.logical_id, size)) != size:

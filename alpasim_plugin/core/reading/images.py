@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import PICTURE_PIXELS, PICTURE_SIDE_PX, SOURCE_BYTES
+from alpasim_plugin.core.limits import SOURCE_BYTES, STORED_PIXELS, STORED_SIDE_PX
 from alpasim_plugin.core.reading.files import parsing, read_bytes
 
 GIVE = "give a whole PNG or JPEG image"
@@ -50,7 +50,7 @@ def _jpeg_frame(data: bytes) -> tuple[int, int, int] | None:
     return None
 
 
-def picture_fault(data: bytes) -> str | None:
+def image_fault(data: bytes) -> str | None:
     """Return what makes an image of a good header useless as a photograph: cut off before its end,
     or printed colours; None if nothing.
 
@@ -79,8 +79,8 @@ def check_image(data: bytes, where: Path | str, do_this: str = GIVE) -> tuple[in
             f"{where}: {len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
         )
     for side in size:
-        PICTURE_SIDE_PX.check(side, where)
-    PICTURE_PIXELS.check(size[0] * size[1], where)
+        STORED_SIDE_PX.check(side, where)
+    STORED_PIXELS.check(size[0] * size[1], where)
     return size
 
 

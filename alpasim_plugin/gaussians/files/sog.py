@@ -20,7 +20,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import GAUSSIANS, PICTURE_PIXELS, SOURCE_BYTES
+from alpasim_plugin.core.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
 from alpasim_plugin.core.reading import parse_json, read_bytes
 from alpasim_plugin.core.reading.files import as_shape, parsing, some_of
 from alpasim_plugin.core.types import F64, U8
@@ -138,7 +138,7 @@ def _plane(data: bytes, where: str) -> U8:
     size = _webp_size(data)
     if size is None:
         raise InputError(f"{where}: {len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
-    PICTURE_PIXELS.check(size[0] * size[1], where)
+    STORED_PIXELS.check(size[0] * size[1], where)
     with parsing(where, DO_THIS, "no readable WebP"):
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3:

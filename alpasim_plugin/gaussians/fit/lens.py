@@ -105,7 +105,7 @@ class Lens:
 
     def _fisheye_K(self) -> F64:
         """Return a pinhole with the lens's middle whose sides look at most `FISHEYE_HALF_VIEW_RAD`
-        aside and stay in the photograph.
+        apart and stay in the photograph.
         """
         middle = np.array([[[self.K[0, 2] - 0.5, self.K[1, 2] - 0.5]]])
         ends = [

@@ -35,7 +35,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes, read_json_object
 from alpasim_plugin.core.reading.files import as_shape
-from alpasim_plugin.core.reading.images import check_image, decode_image, picture_fault
+from alpasim_plugin.core.reading.images import check_image, decode_image, image_fault
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -73,7 +73,7 @@ RIGID = 1e-12  # a rotation this exact is taken as it is written
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PosedPhotograph:
     """A photograph in a file, its lens and where it was taken.
 
     Attributes:
@@ -113,7 +113,7 @@ class Picture:
                 f"{name}: {width}x{height} pixels, the file says {self.lens.width}x{self.lens.height}",
                 "give the photographs as they were",
             )
-        fault = picture_fault(data)
+        fault = image_fault(data)
         if fault:
             raise InputError(f"{name}: {fault}", WHOLE)
         return data
@@ -140,7 +140,9 @@ class Picture:
         )
 
 
-def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, list[Picture]]:
+def read_posed_photographs(
+    folder: Path, axes: str | None = None
+) -> tuple[JsonObject, list[PosedPhotograph]]:
     """Read what a ``transforms.json`` says, without opening its images.
 
     Args:
@@ -164,28 +166,31 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[JsonObject, li
             'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)',
         )
     return document, [
-        _picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)
+        _photograph(folder, frame, f"{path}, frame {i}", AXES[meant])
+        for i, frame in enumerate(frames)
     ]
 
 
-def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
+def present(
+    folder: Path, photographs: Sequence[PosedPhotograph]
+) -> tuple[list[PosedPhotograph], tuple[str, ...]]:
     """Return the images whose files exist, and the names of the others.
 
     Raises:
         InputError: Fewer than two exist, or one lies outside of the folder.
     """
     there = [
-        picture
-        for picture in pictures
-        if os.path.isfile(picture.file) and inside(folder, picture.file, picture.where)
+        photograph
+        for photograph in photographs
+        if os.path.isfile(photograph.file) and inside(folder, photograph.file, photograph.where)
     ]
     missing = tuple(
-        picture.file.as_posix().removeprefix(f"{folder.as_posix()}/")
-        for picture in pictures
-        if not os.path.isfile(picture.file)
+        photograph.file.as_posix().removeprefix(f"{folder.as_posix()}/")
+        for photograph in photographs
+        if not os.path.isfile(photograph.file)
     )
     if len(there) < 2:
-        found = f"{folder}: {len(there)} of {len(pictures)} listed images exist"
+        found = f"{folder}: {len(there)} of {len(photographs)} listed images exist"
         if missing and Path(missing[0]).is_absolute():
             raise InputError(
                 f"{found}: the file names paths of another machine, {missing[0]} the first",
@@ -245,11 +250,11 @@ def _frames(path: Path) -> tuple[JsonObject, list[JsonObject]]:
     return document, [{**document, **frame} for frame in frames]
 
 
-def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> Picture:
+def _photograph(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> PosedPhotograph:
     file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
     t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us")
     pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
-    return Picture(
+    return PosedPhotograph(
         file,
         _lens(frame, file, where),
         pose,

@@ -77,7 +77,7 @@ def logged_views(
     count: int,
     width: int,
     *,
-    aside_m: float = 0.0,
+    lateral_m: float = 0.0,
     threads: int | None = None,
 ) -> list[PosedView]:
     """Render what the scenario's cameras see along its log.
@@ -87,7 +87,7 @@ def logged_views(
         scene: What is there to see: the scene as built, or another model of it.
         count: Views in all; several cameras share them.
         width: Pixels across.
-        aside_m: Moves the rig to its left (paper, App. A, cycle render); 0 stays on the log.
+        lateral_m: Moves the rig to its left (paper, App. A, cycle render); 0 stays on the log.
         threads: Of the rasteriser.
 
     Returns:
@@ -96,7 +96,7 @@ def logged_views(
         that recorded images need.
     """
     shift = np.eye(4)
-    shift[1, 3] = aside_m
+    shift[1, 3] = lateral_m
     views = []
     for t_us in view_times(scenario, count // max(1, len(scenario.cameras))):
         T_world_rig, actors = (

@@ -13,7 +13,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.fit.photographs import present, read_pictures, resized
+from alpasim_plugin.gaussians.fit.photographs import present, read_posed_photographs, resized
 from alpasim_plugin.gaussians.fit.start import Match, cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 
@@ -60,7 +60,7 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
             f"width {width}: not a multiple of {SIDE_PX}",
             f"choose for example {16 * SIDE_PX}",
         )
-    _, pictures = read_pictures(folder, "opengl")
+    _, pictures = read_posed_photographs(folder, "opengl")
     there, missing = present(folder, pictures)
     there = sorted(there, key=lambda one: one.camera or "")  # camera by camera, as files list them
     poses = _scaled(np.array([picture.T_world_camera for picture in there]))

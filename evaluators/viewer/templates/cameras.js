@@ -27,9 +27,9 @@ class Camera {
     this.stale = false;
     if (i < 0) { this.clear(); return; }
     for (let k = i; k < Math.min(i + AHEAD, this.frames.t.length); k += 1) this.decode(k);
-    const picture = await this.decode(i);
+    const image = await this.decode(i);
     if (this.wanted !== i) return; // a newer frame is due by now
-    this.context.drawImage(picture, 0, 0);
+    this.context.drawImage(image, 0, 0);
     this.over(this.context, this.frames.t[i]);
     this.shown = i;
     this.canvas.dataset.shown = String(this.frames.t[i]);
@@ -45,9 +45,9 @@ class Camera {
   }
 
   forget(i) {
-    for (const [k, picture] of this.decoded) {
+    for (const [k, image] of this.decoded) {
       if (this.decoded.size <= KEPT) return;
-      if (k < i || k > i + AHEAD) { this.decoded.delete(k); picture.then((one) => one.close()); }
+      if (k < i || k > i + AHEAD) { this.decoded.delete(k); image.then((one) => one.close()); }
     }
   }
 
@@ -58,12 +58,12 @@ class Camera {
   }
 
   close() {
-    for (const picture of this.decoded.values()) picture.then((one) => one.close());
+    for (const image of this.decoded.values()) image.then((one) => one.close());
     this.decoded.clear();
   }
 }
 
-// Tint every cell of a picture: blue as far as it is recorded frames, orange as far as the fixer made it up. The text is that of fixers/trust.py.
+// Tint every cell of a image: blue as far as it is recorded frames, orange as far as the fixer made it up. The text is that of fixers/trust.py.
 function drawTrust(context, text) {
   if (!text) return;
   const [size, digits] = text.split(":"), [columns, rows] = size.split("x").map(Number), { width, height } = context.canvas;
@@ -91,7 +91,7 @@ class Cameras {
 
   hasTrust() { return this.shown.some((one) => one.camera?.frames.trust); }
 
-  // Draw what belongs over a frame of time t: the plan in force, and on request the map and the road users, or where the picture comes from.
+  // Draw what belongs over a frame of time t: the plan in force, and on request the map and the road users, or where the image comes from.
   over(cell, drive, i, frames, context, t) {
     const { lens } = frames;
     if (this.layers.has("trust")) { drawTrust(context, frames.trust?.[lastAt(frames.t, t)]); return; }
@@ -109,7 +109,7 @@ class Cameras {
     this.root.replaceChildren();
     this.shown = cell.drives.map((drive, i) => this.figure(drive, i, outcomes[drive.renderer] ?? "", cameraName, cell));
     this.root.dataset.count = String(cell.drives.length);
-    this.root.classList.toggle("bare", this.shown.every((one) => !one.camera)); // words alone need no room for pictures
+    this.root.classList.toggle("bare", this.shown.every((one) => !one.camera)); // words alone need no room for images
   }
 
   figure(drive, i, outcome, cameraName, cell) {

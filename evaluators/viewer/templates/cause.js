@@ -1,5 +1,5 @@
 "use strict";
-// The page of a cause: a query of the policy at a time, its picture behind every renderer, and what is drawn over it.
+// The page of a cause: a query of the policy at a time, its image behind every renderer, and what is drawn over it.
 
 const why = {
   data: JSON.parse(byId("cause").textContent), i: 0, wanted: new Set(),
@@ -39,11 +39,11 @@ const why = {
     if (said) said.textContent = seen ? "" : "stored for the last second before the failure";
     canvas.hidden = !seen;
     if (!seen) return;
-    const picture = await load("jpeg", seen.jpeg), heat = name === this.data.own && this.wanted.has("policy") ? await Promise.all(query.said.heat.map(([, png]) => load("png", png))) : [];
+    const image = await load("jpeg", seen.jpeg), heat = name === this.data.own && this.wanted.has("policy") ? await Promise.all(query.said.heat.map(([, png]) => load("png", png))) : [];
     if (this.i !== i) return;
-    Object.assign(canvas, { width: picture.width, height: picture.height });
+    Object.assign(canvas, { width: image.width, height: image.height });
     const context = canvas.getContext("2d");
-    context.drawImage(picture, 0, 0);
+    context.drawImage(image, 0, 0);
     for (const one of heat) context.drawImage(one, 0, 0, canvas.width, canvas.height);
     const overlay = new Overlay(context, this.data.lens, this.data.rear), { wanted } = this;
     overlay.at(heldPose(this.data.ego, seen.t));

@@ -1,10 +1,10 @@
 "use strict";
-// Lines on the road and boxes of road users, projected into a camera picture. The ground is the plane on which the ego stands.
+// Lines on the road and boxes of road users, projected into a camera image. The ground is the plane on which the ego stands.
 
 const NEAR_M = 0.4, REACH_CM = 9000;
 
 class Overlay {
-  // lens: {k: [fx, fy, cx, cy] in pixels of the picture, T: rig from camera, 3 rows of 4}; rear: from the rear axle to the box centre, cm.
+  // lens: {k: [fx, fy, cx, cy] in pixels of the image, T: rig from camera, 3 rows of 4}; rear: from the rear axle to the box centre, cm.
   constructor(context, lens, rear) {
     Object.assign(this, { context, lens, rear });
   }

@@ -73,8 +73,8 @@ const player = {
     const changed = renderer ?? entry.flips[0]?.renderer ?? driven[0]?.renderer;
     const focus = cell.drives.findIndex((drive) => drive.renderer === changed && drive.ego);
     const times = driven.flatMap((drive) => [drive.ego.t[0], ...(drive.cameras ?? []).slice(0, 1).map((one) => one.t[0])]);
-    const pictured = driven.some((drive) => drive.cameras?.length); // before the first frame there is nothing to see
-    Object.assign(this, { cell, from: pictured ? Math.min(...driven.flatMap((drive) => (drive.cameras ?? []).map((one) => one.t[0]))) : Math.min(0, ...times), to: cell.end, hidden: new Set(), focus: Math.max(0, focus) });
+    const imaged = driven.some((drive) => drive.cameras?.length); // before the first frame there is nothing to see
+    Object.assign(this, { cell, from: imaged ? Math.min(...driven.flatMap((drive) => (drive.cameras ?? []).map((one) => one.t[0]))) : Math.min(0, ...times), to: cell.end, hidden: new Set(), focus: Math.max(0, focus) });
     this.step = Math.max(10, Math.round((driven[0]?.ego.t.at(-1) - driven[0]?.ego.t.at(-2)) || 100));
     document.title = `${entry.scene} – ${index.run} – simrun view`;
     this.birdseye.load(cell);
@@ -199,11 +199,11 @@ const player = {
     if (this.cell) this.birdseye.draw(this.t, this.focus, this.hidden);
   },
 
-  // What is drawn over the pictures: the plan, all that is known, nothing.
+  // What is drawn over the images: the plan, all that is known, nothing.
   nextLayers() {
     const there = LAYERS.filter(([, [first]]) => first !== "trust" || this.cameras.hasTrust());
     const [name, layers] = there[(there.findIndex(([name]) => name === byId("over").dataset.name) + 1) % there.length];
-    Object.assign(byId("over"), { textContent: `Over the picture: ${name}` }).dataset.name = name;
+    Object.assign(byId("over"), { textContent: `Over the image: ${name}` }).dataset.name = name;
     this.cameras.setLayers(layers);
     if (this.cell) this.show();
   },

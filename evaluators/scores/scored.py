@@ -27,7 +27,7 @@ RED = ("red", "red_yellow")
 LANE_M, LANE_S = 0.5, 2.0
 
 
-class Judged:
+class ScoredRollout:
     """One trajectory of the ego's box centre, driven or planned, among the road users of a log."""
 
     def __init__(

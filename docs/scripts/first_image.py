@@ -2,7 +2,7 @@
 into each image.
 
 simrun --renderer clean,3dgs,onefixer --policy lane-camera --out RUN suites/first
-python docs/scripts/first_picture.py RUN hard-hard_brake
+python docs/scripts/first_image.py RUN hard-hard_brake
 """
 
 from __future__ import annotations
@@ -77,14 +77,12 @@ def main(run: Path, scene: str) -> None:
         np.concatenate([one, gap, two, gap, three], axis=1)
         for one, two, three in zip(*panels, strict=False)
     ]
-    pictures = [
+    images = [
         Image.fromarray(row).convert("P", palette=Image.Palette.ADAPTIVE, colors=PALETTE)
         for row in rows
     ]
     out = Path(__file__).parents[1] / "img" / "drive.gif"
-    pictures[0].save(
-        out, save_all=True, append_images=pictures[1:], duration=MS, loop=0, optimize=True
-    )
+    images[0].save(out, save_all=True, append_images=images[1:], duration=MS, loop=0, optimize=True)
 
 
 if __name__ == "__main__":
