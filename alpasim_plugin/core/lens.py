@@ -1,8 +1,9 @@
 """Lenses: which ray each pixel of a camera sees, and the pinholes that cover a lens.
 
 Any lens is rendered by ideal pinholes that cover it, then resampled: by one up to
-`WIDEST_OF_ONE_RAD` from the axis, beyond by the sides of a cube. Rays are x right, y down, z forward; the centre of pixel
-(row i, column j) is (j + 0.5, i + 0.5).
+`WIDEST_OF_ONE_RAD` from the axis, up to `WIDEST_OF_PANELS_RAD` by three that stand side by side, and
+beyond by the sides of a cube. Rays are x right, y down, z forward; the centre of pixel (row i,
+column j) is (j + 0.5, i + 0.5).
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from alpasim_plugin.core.shutter import Along
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, LensModel
 
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the image
-WIDEST_OF_ONE_RAD = np.deg2rad(70.0)  # of a plane towards whose sides nothing is smeared
+# Of one plane: twice the pixels of the lens. Wider ones have more, and smear what is near.
+WIDEST_OF_ONE_RAD = np.deg2rad(50.0)
+WIDEST_OF_PANELS_RAD = np.deg2rad(70.0)
 WIDEST_OF_CUBE_RAD = np.deg2rad(110.0)  # of several planes
+BLEND = 0.02  # difference of the cosines to two pinholes' axes within which both are shown
 MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
 CLOSE_PX = 0.05
@@ -49,8 +53,10 @@ class Lens:
         resample: ``(height, width, 2)`` float32 place in the pinhole's image of every pixel; None
             where the lens is that pinhole.
         seen: ``(height, width)`` which pixels of the lens this pinhole shows; None: all.
+        weight: ``(height, width)`` float32, share of this pinhole among those that cover the lens;
+            None: all of it.
         T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
-        side: Of the cube, in `SIDES`; empty where one pinhole covers the lens.
+        side: Its name among those that cover the lens; empty where it is the only one.
     """
 
     width: int
@@ -59,6 +65,7 @@ class Lens:
     cover: tuple[int, int]
     resample: F32 | None = None
     seen: Bool | None = None
+    weight: F32 | None = None
     T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
     side: str = ""
 
@@ -96,12 +103,14 @@ class Lens:
     def _through(self, covering: Any, outside: float) -> Any:
         if self.resample is None:
             return covering
-        out = cv2.remap(
-            covering, self.resample, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        out = _looked_up(covering, self.resample)
         if self.seen is not None:
             out[~self.seen] = outside
         return out
+
+
+def _looked_up(image: Any, place: F32) -> Any:
+    return cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 class Rays(NamedTuple):
@@ -153,21 +162,62 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     rays = rays_of(camera)
     if rays.widest_rad <= WIDEST_OF_ONE_RAD:
         return (_covered(camera, rays, rays.seen, ""),)
-    ahead = np.stack([rays.ray @ np.array(axes[2]) for axes in SIDES.values()])
-    nearest = ahead.argmax(axis=0)
-    shown = [(side, rays.seen & (nearest == i)) for i, side in enumerate(SIDES)]
-    return tuple(_covered(camera, rays, mine, side) for side, mine in shown if mine.any())
+    turns = _panels(rays)
+    if rays.widest_rad > WIDEST_OF_PANELS_RAD:
+        turns = {side: np.array(axes, dtype=np.float64).T for side, axes in SIDES.items()}
+    ahead = np.stack([rays.ray @ turn[:, 2] for turn in turns.values()])
+    behind_most = np.maximum(ahead - ahead.max(axis=0) + BLEND, 0) * rays.seen
+    weights = behind_most / np.maximum(behind_most.sum(axis=0), 1e-12)
+    return tuple(
+        replace(
+            _covered(camera, rays, weight > 0, side, turn),
+            weight=weight.astype(np.float32).reshape(camera.height, camera.width),
+        )
+        for (side, turn), weight in zip(turns.items(), weights, strict=True)
+        if weight.any()
+    )
+
+
+def _panels(rays: Rays) -> dict[str, F64]:
+    """Return by name how three pinholes are turned about the lens's upright axis so that each shows
+    a third of its width: their axes as columns.
+    """
+    ray = rays.ray[rays.seen]
+    azimuth = np.arctan2(ray[:, 0], ray[:, 2])
+    low, high = float(azimuth.min()), float(azimuth.max())
+    middles = low + (high - low) * np.array([1, 3, 5]) / 6
+    return {
+        name: cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+        for name, angle in zip(("left", "ahead", "right"), middles, strict=True)
+    }
 
 
 def joined(sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
     """Return the frame of a lens from those of its pinholes, in order."""
-    whole, *others = (lens.frame(frame) for lens, frame in zip(sides, frames, strict=True))
-    for lens, part in zip(sides[1:], others, strict=True):
-        whole.rgb[lens.seen] = part.rgb[lens.seen]
-        if whole.alpha is not None and part.alpha is not None:
-            whole.alpha[lens.seen] = part.alpha[lens.seen]
+    first = frames[0]
+    if len(sides) == 1:
+        return sides[0].frame(first)
+    shape = sides[0].height, sides[0].width
+    rgb, alpha = np.full((*shape, 3), 0.5, np.float32), np.zeros(shape, np.float32)
+    outside = np.ones(shape, np.float32)
+    for lens, frame in zip(sides, frames, strict=True):
+        assert lens.weight is not None and lens.resample is not None, "one of several pinholes"
+        columns = np.flatnonzero(lens.weight.any(axis=0))
+        part = slice(None), slice(int(columns[0]), int(columns[-1]) + 1)
+        place, weight = lens.resample[part], lens.weight[part]
+        outside[part] -= weight
+        rgb[part] += weight[..., None] * _looked_up(frame.rgb, place)
+        if frame.alpha is not None:
+            alpha[part] += weight * _looked_up(frame.alpha, place)
     events = dict.fromkeys(event for frame in frames for event in frame.events)
-    return replace(whole, events=tuple(events))
+    return replace(
+        first,
+        rgb=rgb.astype(np.uint8),
+        alpha=None if first.alpha is None else alpha + outside,
+        depth=None,
+        references=(),
+        events=tuple(events),
+    )
 
 
 def rays_of(camera: CameraSpec) -> Rays:
@@ -427,9 +477,8 @@ def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tup
     return xy, missed < CLOSE_PX
 
 
-def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str) -> Lens:
-    """Return the pinhole that shows some of a lens's pixels from one side of a cube, or ahead."""
-    turn = np.array(SIDES[side or "ahead"], dtype=np.float64).T  # pinhole's axes as columns
+def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str, turn: F64 = np.eye(3)) -> Lens:
+    """Return the pinhole that shows some of a lens's pixels; ``turn`` has its axes as columns."""
     local = rays.ray @ turn
     xy = np.divide(
         local[:, :2], local[:, 2:], where=local[:, 2:] > 0.05, out=np.zeros_like(local[:, :2])
@@ -446,7 +495,8 @@ def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str) -> Lens:
     T[:3, :3] = turn
     shape = camera.height, camera.width
     seen = None if mine.all() else mine.reshape(shape)
-    return Lens(camera.width, camera.height, K, cover, place.reshape(*shape, 2), seen, T, side)
+    place = place.reshape(*shape, 2)
+    return Lens(camera.width, camera.height, K, cover, place, seen, T_lens_pinhole=T, side=side)
 
 
 def _require(fine: bool, name: str, found: str) -> None:

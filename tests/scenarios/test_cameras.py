@@ -39,13 +39,17 @@ def test_the_order_of_listing_changes_no_scenario(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rig", "count"), [("front", 1), ("alpasim-4", 4), ("alpasim-6", 6), ("surround-6", 6)]
+    ("rig", "count", "pinholes"),
+    [("front", 1, 1), ("alpasim-4", 4, 10), ("alpasim-6", 6, 12), ("surround-6", 6, 6)],
 )
-def test_a_shipped_rig_is_read_and_scaled(tmp_path, rig, count):
+def test_a_shipped_rig_is_read_and_scaled(tmp_path, rig, count, pinholes):
     cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras
     assert [camera.width for camera in cameras] == [192] * count
     assert cameras[0].T_rig_camera[0, 2] > 0.99
-    assert len(sides_of(cameras[0])) == 1
+    sides = [side for camera in cameras for side in sides_of(camera)]
+    assert len(sides) == pinholes
+    pixels = sum(side.cover[0] * side.cover[1] for side in sides)
+    assert pixels < 1.6 * sum(camera.width * camera.height for camera in cameras)
 
 
 def test_cameras_of_a_usdz_have_its_lenses(tmp_path):

@@ -17,7 +17,7 @@ class SplatRecipe:
     Attributes:
         steps: Updates; each sees one view.
         views: Views rendered from a scenario's log.
-        width: Pixels across of rendered views; their height follows from the camera.
+        width: Pixels across of rendered views of 16:9; others have as many pixels.
         points: Gaussians of the background at the start, drawn from the views' depth.
         actor_points: Most Gaussians of an actor at the start.
         start_size: Of the Gaussians at the start, in distances to their neighbours.

@@ -51,8 +51,10 @@ class PosedView:
 
 
 def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeCamera:
-    """Return a rig's camera at a pose with at most ``width`` pixels across, its view unchanged."""
-    scale = min(1.0, width / spec.width)
+    """Return a rig's camera at a pose with at most as many pixels as an image of 16:9 with ``width``
+    pixels across has, its view unchanged.
+    """
+    scale = min(1.0, width / np.sqrt(spec.width * spec.height * 16 / 9))
     w, h = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
     K = spec.K.copy()
     K[0] *= w / spec.width
@@ -86,7 +88,7 @@ def logged_views(
         scenario: The log, the cameras and the actors' tracks.
         scene: What is there to see: the scene as built, or another model of it.
         count: Views in all; several cameras share them.
-        width: Pixels across.
+        width: Pixels across of an image of 16:9; others have as many in all.
         lateral_m: Moves the rig to its left (paper, App. A, cycle render); 0 stays on the log.
         threads: Of the rasteriser.
 
