@@ -201,7 +201,8 @@ def joined(sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
     rgb, alpha = np.full((*shape, 3), 0.5, np.float32), np.zeros(shape, np.float32)
     outside = np.ones(shape, np.float32)
     for lens, frame in zip(sides, frames, strict=True):
-        assert lens.weight is not None and lens.resample is not None, "one of several pinholes"
+        assert lens.weight is not None, "one of several pinholes"
+        assert lens.resample is not None, "one of several pinholes"
         columns = np.flatnonzero(lens.weight.any(axis=0))
         part = slice(None), slice(int(columns[0]), int(columns[-1]) + 1)
         place, weight = lens.resample[part], lens.weight[part]

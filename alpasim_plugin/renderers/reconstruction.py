@@ -172,7 +172,7 @@ def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[Sk
     """
     light = np.array(LIGHT[scenario.environment.sky])
     missing = [
-        lit(build_actor(actor, scenario.scene_id, scenario.seed), light)
+        lit(build_actor(actor, scenario), light)
         for actor in scenario.actors
         if actor.actor_id not in model.actors
     ]
@@ -242,7 +242,7 @@ def graph_of(scenario: Scenario) -> SceneGraph:
     def read() -> SceneGraph:
         model = Reconstruction.load(folder)
         missing = [
-            build_actor(actor, scenario.scene_id, scenario.seed)
+            build_actor(actor, scenario)
             for actor in scenario.actors
             if actor.actor_id not in model.actors and not actor.actor_id.startswith(STANDING_ID)
         ]

@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
 from alpasim_plugin.gaussians.scene.surfels import (
     IDENTITY,
     cloud_of,
+    halvings,
     quad_surfels,
     rods,
     with_sheen,
@@ -62,21 +63,26 @@ SKY_RGB = (0.72, 0.82, 0.92)
 GLASS_RGB = np.array([0.10, 0.12, 0.14])
 TYRE_RGB = np.array([0.07, 0.07, 0.075])
 HUB_RGB = np.array([0.50, 0.51, 0.53])
+RGB = tuple[float, float, float]
+HEAD_RGB, TAIL_RGB, PLATE_RGB = (0.96, 0.96, 0.88), (0.80, 0.06, 0.05), (0.88, 0.88, 0.86)
 
 
 def build_actors(scenario: Scenario) -> list[SceneNode]:
     """Return one node per actor, named by the actor's id."""
-    return [build_actor(actor, scenario.scene_id, scenario.seed) for actor in scenario.actors]
+    return [build_actor(actor, scenario) for actor in scenario.actors]
 
 
-def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
-    """Return the node of one actor at three levels of detail."""
-    rng = stream(scene_id, seed, f"scene/actor/{actor.actor_id}")
+def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
+    """Return the node of one actor of a scenario at three levels of detail, and more for sharp
+    cameras.
+    """
+    rng = stream(scenario.scene_id, scenario.seed, f"scene/actor/{actor.actor_id}")
     draw, noise = rng.random(8), rng.standard_normal(4096)
     shape = _SHAPES.get(actor.label, _other)
     levels = []
     coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
-    for cell_m in np.array(CELLS_M) * coarser:
+    finer = [CELLS_M[0] / 2**n for n in halvings(scenario)]
+    for cell_m in np.array([*finer, *CELLS_M]) * coarser:
         cloud = GaussianCloud.concatenate(
             [shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)]
         )
@@ -145,19 +151,47 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     y = 0.36 * box.width_m
     plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
     end = half + 0.02
+    if cell_m < CELLS_M[0]:
+        return _plates(
+            [
+                (end, y, z, 0.15, 0.08, HEAD_RGB),
+                (end, -y, z, 0.15, 0.08, HEAD_RGB),
+                (-end, y, z, 0.16, 0.09, TAIL_RGB),
+                (-end, -y, z, 0.16, 0.09, TAIL_RGB),
+                (end, 0.0, 1.05 * plate_z, 0.22, 0.06, PLATE_RGB),
+                (-end, 0.0, plate_z, 0.22, 0.06, PLATE_RGB),
+            ],
+            cell_m,
+        )
     parts = [
-        _blobs([[end, y, z], [end, -y, z]], (0.02, 0.10, 0.055), (0.96, 0.96, 0.88)),
-        _blobs([[-end, y, z], [-end, -y, z]], (0.02, 0.11, 0.065), (0.80, 0.06, 0.05)),
+        _blobs([[end, y, z], [end, -y, z]], (0.02, 0.10, 0.055), HEAD_RGB),
+        _blobs([[-end, y, z], [-end, -y, z]], (0.02, 0.11, 0.065), TAIL_RGB),
     ]
     if cell_m < 0.3:
         parts.append(
             _blobs(
                 [[-end, 0, plate_z], [end, 0, 1.05 * plate_z]],
                 (0.02, 0.14, 0.045),
-                (0.88, 0.88, 0.86),
+                PLATE_RGB,
             )
         )
     return GaussianCloud.concatenate(parts)
+
+
+def _plates(
+    plates: list[tuple[float, float, float, float, float, RGB]], cell_m: float
+) -> GaussianCloud:
+    """Draw upright plates that face along x, each by its centre x, y and z, half its width and height,
+    and its colour.
+    """
+    x, y, z, half_width, half_height = np.array([plate[:5] for plate in plates]).T
+    across = np.sign(x) * half_width
+    corners = [
+        np.column_stack([x, y + u * across, z + v * half_height])
+        for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    rgb = np.array([plate[5] for plate in plates])
+    return quad_surfels(np.stack(corners, axis=1), rgb, 0.5 * cell_m)[0]
 
 
 def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> GaussianCloud:

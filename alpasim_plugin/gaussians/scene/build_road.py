@@ -39,6 +39,7 @@ from alpasim_plugin.gaussians.scene.surfels import (
     cell_counts,
     cloud_of,
     grid_cells,
+    halvings,
     quats_along,
     upright_quats,
 )
@@ -430,7 +431,13 @@ def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
     length = np.linalg.norm(strokes.end - strokes.start, axis=1)
     direction = unit(strokes.end - strokes.start)
     levels = []
-    for cell_m, link_m, across_m in ((0.125, 0.19, 0.15), (0.3, 0.75, 0.25), (0.8, 1.5, 0.5)):
+    finer = [(0.125 / 2**n, 0.19 / 2**n, 0.10 / 2**n) for n in halvings(site.scenario)]
+    for cell_m, link_m, across_m in (
+        *finer,
+        (0.125, 0.19, 0.15),
+        (0.3, 0.75, 0.25),
+        (0.8, 1.5, 0.5),
+    ):
         n_u = cell_counts(length, link_m)
         n_v = cell_counts(strokes.width_m, across_m)
         owner, u, v = grid_cells(n_u, n_v)

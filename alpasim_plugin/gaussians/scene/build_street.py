@@ -25,11 +25,13 @@ from alpasim_plugin.gaussians.scene.surfels import (
     SPREAD,
     cell_counts,
     cloud_of,
+    halvings,
     quad_surfels,
     quats_along,
     rods,
 )
 
+KERB_WIDTH_M = 0.16
 KERB_RGB = (0.66, 0.65, 0.62)
 RAIL_RGB = (0.62, 0.64, 0.66)
 POST_RGB = (0.45, 0.46, 0.47)
@@ -73,7 +75,8 @@ def _spots(site: Site, beyond_m: float, step_m: float, shortest_m: float) -> Roa
 def _kerbs(site: Site) -> list[Item]:
     """Place a kerb along the road's edge: a face towards the road and a top."""
     items: list[Item] = []
-    for cell_m, step in ((0.25, 0.5), (0.7, 1.0), (1.6, 2.0)):
+    finer = [(0.25 / 2**n, 0.5 / 2**n, 2**n + 1) for n in halvings(site.scenario)]
+    for cell_m, step, rows in (*finer, (0.25, 0.5, 1), (0.7, 1.0, 1), (1.6, 2.0, 1)):
         spots = _spots(site, 0.0, step, 2 * step)
         if spots is None:
             return []
@@ -90,13 +93,24 @@ def _kerbs(site: Site) -> list[Item]:
                 (SPREAD * step, *size),
                 shade * rgb,
             )
-            for back_m, above_m, size, shade in (
-                (0.0, 0.4 * KERB_M, (0.05, 0.08), 0.80),
-                (0.08, KERB_M, (0.09, 0.015), 1.05),
-            )
+            for back_m, above_m, size, shade in _kerb_rows(rows)
         ]
-        items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (len(clouds), 1))))
     return items
+
+
+def _kerb_rows(count: int) -> list[tuple[float, float, tuple[float, float], float]]:
+    """Return the rows of Gaussians of a kerb's face and top: how far behind the edge and above the
+    road, deviations across, shade.
+    """
+    if count == 1:
+        return [(0.0, 0.4 * KERB_M, (0.05, 0.08), 0.80), (0.08, KERB_M, (0.09, 0.015), 1.05)]
+    middles = (np.arange(count) + 0.5) / count
+    face, top = SPREAD * KERB_M / count, SPREAD * KERB_WIDTH_M / count
+    return [
+        *((0.0, m * KERB_M, (0.01, face), 0.80) for m in middles),
+        *((m * KERB_WIDTH_M, KERB_M, (top, 0.01), 1.05) for m in middles),
+    ]
 
 
 def _rails(site: Site) -> list[Item]:
@@ -283,7 +297,8 @@ def _signs(site: Site) -> list[Item]:
             tops.append(T[:3, 3])
     plan = site.frame.to_ground(np.array(at))
     items: list[Item] = []
-    for cell_m, size in ((0.12, 0.15), (0.4, 0.5)):
+    finer = [(0.12 / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
+    for cell_m, size in (*finer, (0.12, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
         clouds, where = [plates], [plan[owner]]
         if feet:
