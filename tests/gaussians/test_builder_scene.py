@@ -102,6 +102,19 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
         assert np.ptp(lane) < 0.06
 
 
+def test_lines_and_lamps_are_sharper_where_a_camera_has_more_pixels_per_radian(street):
+    scenario, usual = street
+    camera = camera_spec(1280, 720)
+    sharp = built(replace(scenario, cameras=(camera,)))
+
+    def steepest(graph):
+        steps = np.diff(graph.render(view(scenario, 0, 0.0, 1280, 720), {}).rgb[400:], axis=1)
+        return np.quantile(np.abs(steps).max(axis=-1), 0.999)
+
+    assert steepest(sharp) > 1.2 * steepest(usual)
+    assert len(sharp) > 1.1 * len(usual)
+
+
 def test_houses_leave_road_actors_and_each_other_alone():
     scenario = straight(environment=Environment(buildings=1.0))
     site = make_site(scenario, partial(height_at, scenario.ground))
