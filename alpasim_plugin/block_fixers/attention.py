@@ -82,7 +82,7 @@ class Rope3D:
         widths = axis_widths(head_width)
         height_ratio, width_ratio, time_ratio = ratios
         pairs = zip(widths, (time_ratio, height_ratio, width_ratio), strict=True)
-        self.head_width, self.ratios = head_width, ratios
+        self.head_width = head_width
         self.freq_t, self.freq_h, self.freq_w = (
             frequencies(width, ratio) for width, ratio in pairs
         )
@@ -165,15 +165,9 @@ def block_causal_attention(
     for start in range(0, frames, block_latents):
         end = min(start + block_latents, frames)
         first = 0 if window is None else max(0, min(start, end - (window - sink)))
-        keys, values = (part[:, first * tokens : end * tokens] for part in (k, v))
-        kept = (
-            min(sink, first) if window is not None else 0
-        )  # sink latents outside the contiguous range
-        if kept:
-            keys, values = (
-                torch.cat([part[:, : kept * tokens], run], dim=1)
-                for part, run in ((k, keys), (v, values))
-            )
+        sinks = slice(0, min(sink, first) * tokens)  # those before the contiguous range
+        seen = slice(first * tokens, end * tokens)
+        keys, values = (torch.cat([part[:, sinks], part[:, seen]], dim=1) for part in (k, v))
         out.append(attend(q[:, start * tokens : end * tokens], keys, values))
     return torch.cat(out, dim=1)
 
@@ -199,8 +193,7 @@ class Attention(nn.Module):
 
     def queries(self, x: Tensor) -> Tensor:
         """Map tokens ``(B, L, width)`` to queries ``(B, L, heads, head_width)``."""
-        normed: Tensor = self.q_norm(self.q_proj(x).unflatten(-1, (-1, self.head_width)))
-        return normed
+        return self.q_norm(self.q_proj(x).unflatten(-1, (-1, self.head_width)))
 
     def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Map ``(B, L, context_width)`` to keys and values ``(B, L, heads, head_width)``."""
@@ -226,8 +219,7 @@ class SelfAttention(Attention):
         tokens = (x if added is None else x + added).flatten(1, 2)
         keys, values = self.keys_values(tokens)
         attended = attention(rotate(self.queries(tokens), table), rotate(keys, table), values)
-        out: Tensor = self.output_proj(attended)
-        return out.view(x.shape)
+        return self.output_proj(attended).view(x.shape)
 
 
 class CrossAttention(Attention):
@@ -241,7 +233,5 @@ class CrossAttention(Attention):
         """
         k, v = (part.expand(x.shape[0], *part.shape[1:]) for part in keys_values)
         if k.shape[1] == 1:
-            value: Tensor = self.output_proj(v.flatten(2))
-            return value[:, :, None].expand(x.shape)
-        out: Tensor = self.output_proj(attend(self.queries(x.flatten(1, 2)), k, v))
-        return out.view(x.shape)
+            return self.output_proj(v.flatten(2))[:, :, None].expand(x.shape)
+        return self.output_proj(attend(self.queries(x.flatten(1, 2)), k, v)).view(x.shape)

@@ -7,7 +7,6 @@ A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -46,7 +45,7 @@ class LowRankModulation(nn.Sequential):
             emb: ``(B, T, width)``, the normalised sinusoid.
             lora: ``(B, T, 3 * width)``, of which the first ``parts * width`` are added.
         """
-        both: Tensor = self(emb) + lora[..., : self.parts * emb.shape[-1]]
+        both = self(emb) + lora[..., : self.parts * emb.shape[-1]]
         return both[:, :, None].chunk(self.parts, dim=-1)
 
 
@@ -75,8 +74,7 @@ class Mlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(..., width)`` to ``(..., width)``."""
-        out: Tensor = self.layer2(F.gelu(self.layer1(x)))
-        return out
+        return self.layer2(F.gelu(self.layer1(x)))
 
 
 class Block(nn.Module):
@@ -142,4 +140,4 @@ class FinalLayer(nn.Module):
         channel).
         """
         shift, scale = (part.to(x.dtype) for part in self.adaln_modulation.split(*time))
-        return cast(Tensor, self.linear(layer_norm(x) * (1 + scale) + shift))
+        return self.linear(layer_norm(x) * (1 + scale) + shift)

@@ -20,29 +20,30 @@ from alpasim_plugin.core.types import F32, U8
 from alpasim_plugin.fixers.views import HALF, ClipSize, Views
 
 GROUP = 4  # temporal compression: frames of every latent but the first
+DROPPED = GROUP - 1  # frames of the first group that stand for the first frame again
 SIDE = 8  # spatial compression: pixels per latent along a side
 TOKEN_PX = 16  # side of a token
 
 
-def pass_ends(latents: int, size: int | None = 1) -> list[int]:
-    """Return where each pass over ``latents`` ends, ``size`` latents a pass; None: all in one.
+def frame_counts(latents: Sequence[int], first: bool) -> list[int]:
+    """Return how many frames each pass has; the first latent of a video holds one frame.
 
     Example:
-        >>> pass_ends(4), pass_ends(4, 3)
-        ([1, 2, 3, 4], [3, 4])
+        >>> frame_counts([2, 1], first=True), frame_counts([2, 1], first=False)
+        ([5, 4], [8, 4])
     """
-    step = size or latents
-    return [*range(step, latents, step), latents]
+    counts = [GROUP * count for count in latents]
+    counts[0] -= DROPPED * first
+    return counts
 
 
-def frame_ends(latent_ends: Sequence[int], first: bool) -> list[int]:
-    """Return where the frames of each pass end; the first latent of a video holds one frame.
-
-    Example:
-        >>> frame_ends([1, 2, 3], first=True), frame_ends([1, 2, 3], first=False)
-        ([1, 5, 9], [4, 8, 12])
+def whole_groups(video: Tensor, first: bool) -> Tensor:
+    """Repeat the first frame of a video ``(B, C, T, H, W)`` that starts here three times before it,
+    since the first latent covers it alone.
     """
-    return [GROUP * end - (GROUP - 1) * first for end in latent_ends]
+    if not first:
+        return video
+    return torch.cat([video[:, :, :1].expand(-1, -1, DROPPED, -1, -1), video], dim=2)
 
 
 def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tensor, ClipSize]:
@@ -109,7 +110,7 @@ class Clip:
     """One block as the networks take it, padded in time and space."""
 
     rgb: Tensor  # (B, 3, T, H, W) in [-1, 1]
-    alpha: Tensor | None  # (B, 1, T, H, W), 0 to 1; None where every pixel is opaque
+    alpha: Tensor  # (B, 1, T, H, W), 0 to 1
     maps: Tensor | None  # (B, 3, T, H, W) in [-1, 1]
 
 
@@ -127,11 +128,9 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
             x = torch.cat([x, x[:, :, -1:].expand(-1, -1, short, -1, -1)], dim=2)
         return pad_clip(x, group=1, side=TOKEN_PX)[0]
 
-    return Clip(
-        video(views.rgb),
-        None if views.alpha is None else video(views.alpha[..., None]),
-        None if views.maps is None else video(views.maps),
-    )
+    alpha = np.ones(views.rgb.shape[:-1], np.float32) if views.alpha is None else views.alpha
+    maps = None if views.maps is None else video(views.maps)
+    return Clip(video(views.rgb), video(alpha[..., None]), maps)
 
 
 def to_images(video: Tensor, size: ClipSize) -> U8:

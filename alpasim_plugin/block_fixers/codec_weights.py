@@ -7,13 +7,14 @@ and therefore its statistics.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.core import seeding
-from alpasim_plugin.fixers.network.checkpoints import channels_last
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.network.checkpoints import channels_last, listed
 
 WAN_MEAN = (
     -0.7571,
@@ -62,16 +63,29 @@ def fill_random(net: nn.Module, seed: int, component: str) -> None:
     """
     filled = {}
     for key, value in net.state_dict().items():
-        if value.ndim > 1 and not key.endswith("gamma"):
-            numbers = seeding.stream("nets", seed, f"{component}/{key}").standard_normal(
-                tuple(value.shape)
-            )
-            filled[key] = channels_last(torch.from_numpy(numbers / value[0].numel() ** 0.5).float())
+        if key.endswith("gamma"):
+            filled[key] = torch.ones(value.shape)
+        elif value.ndim > 1:
+            rng = seeding.stream("nets", seed, f"{component}/{key}")
+            numbers = rng.standard_normal(tuple(value.shape)) / value[0].numel() ** 0.5
+            filled[key] = channels_last(torch.from_numpy(numbers).float())
         else:
-            filled[key] = (
-                torch.ones(value.shape) if key.endswith("gamma") else torch.zeros(value.shape)
-            )
+            filled[key] = torch.zeros(value.shape)
     net.load_state_dict(filled, assign=True)
+
+
+def first_axes(
+    tensors: Mapping[str, Tensor], keys: Sequence[str], source: str, hint: str
+) -> list[int]:
+    """Return the length of the first axis of tensors that give a network its sizes.
+
+    Raises:
+        InputError: One of them is missing; ``source`` and ``hint`` are for its message.
+    """
+    missing = [key for key in keys if key not in tensors]
+    if missing:
+        raise InputError(f"{source} ({len(tensors)} tensors): {listed('missing', missing)}", hint)
+    return [tensors[key].shape[:1].numel() for key in keys]
 
 
 class LatentStats(nn.Module):
@@ -82,6 +96,8 @@ class LatentStats(nn.Module):
         mean: One value a channel.
         std: One positive value a channel.
         stored: Whether the statistics are in the state dict (they are not in Wan checkpoints).
+
+    They are on the CPU also under a default device of ``meta``.
     """
 
     mean: Tensor
@@ -91,8 +107,9 @@ class LatentStats(nn.Module):
         self, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD, stored: bool = False
     ) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32), persistent=stored)
-        self.register_buffer("std", torch.tensor(std, dtype=torch.float32), persistent=stored)
+        for name, values in (("mean", mean), ("std", std)):
+            numbers = torch.tensor(values, dtype=torch.float32, device="cpu")
+            self.register_buffer(name, numbers, persistent=stored)
 
     def normalise(self, mu: Tensor) -> Tensor:
         """Map encoder means ``(B, C, t, h, w)`` to latents of about unit variance; same dtype."""

@@ -17,7 +17,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Self, cast
 
 import torch
@@ -37,7 +36,6 @@ from alpasim_plugin.block_fixers.layers import (
     PatchEmbed,
     RMSNorm,
     TimeMap,
-    embed_latents,
     sinusoid,
     unpatchify,
 )
@@ -52,23 +50,17 @@ RELEASED_ROPE_RATIOS = (
 )  # height, width, time, as all released single-view experiments set them
 CUT = 3.0  # standard deviations of initial weights
 FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")
-__all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext"]
 
-
-@dataclass(frozen=True)
-class TextContext:
-    """Cross-attention keys and values of a prompt: computed once by `CosmosCausalDiT.encode_text`,
-    passed in place of the text.
-    """
-
-    keys_values: tuple[KeysValues, ...]  # per block: k, v (B or 1, tokens, heads, head_width)
+# Cross-attention keys and values of a prompt for every block (B or 1, tokens, heads, head_width):
+# computed once by `CosmosCausalDiT.encode_text`, passed in place of the text.
+TextContext = tuple[KeysValues, ...]
 
 
 class CosmosCausalDiT(nn.Module):
     """Predict the velocity of latents from their causal history, text and semantic map.
 
     Args:
-        sizes: All sizes; `DiTSizes()` is OmniDreams single view.
+        sizes: All sizes.
         rope_ratios: NTK stretch of the rotary positions: height, width, time.
     """
 
@@ -78,7 +70,7 @@ class CosmosCausalDiT(nn.Module):
         rope_ratios: tuple[float, float, float] = RELEASED_ROPE_RATIOS,
     ) -> None:
         super().__init__()
-        self.sizes, self.rope_ratios = sizes, rope_ratios
+        self.sizes = sizes
         self.rope = Rope3D(sizes.head_width, rope_ratios)
         self.x_embedder = PatchEmbed(sizes.latent_channels + MASK_CHANNELS, sizes.width)
         self.additional_patch_embedding = PatchEmbed(sizes.map_channels, sizes.width)
@@ -148,7 +140,8 @@ class CosmosCausalDiT(nn.Module):
             text: ``(B or 1, tokens, text_width)`` features, or a `TextContext`.
             hdmap: ``(B, condition_channels, T, H, W)`` latents of the semantic map; a network that
                 embeds opacity takes its channels after the map's.
-            condition_mask: ``(B, 1, T, H, W)``, 1 where the latent is given; None is 0 everywhere.
+            condition_mask: ``(B, 1, T, H, W)`` or what broadcasts to it, 1 where the latent is
+                given; None is 0 everywhere.
             block_latents: Latents of a causal block (the last may be shorter); None for
                 bidirectional attention, as in the teacher.
             window, sink: Sliding window and attention sink in latents, as in a cache; None for the
@@ -206,11 +199,15 @@ class CosmosCausalDiT(nn.Module):
             )
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):
             table = cache.begin(x_block.shape[2])
-
-            def attention(layer: int) -> Attend:
-                return functools.partial(cache.attend, layer)
-
-            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, table, attention)
+            v = self._run(
+                x_block,
+                t_block,
+                text,
+                hdmap_block,
+                condition_mask,
+                table,
+                lambda layer: functools.partial(cache.attend, layer),
+            )
         if write:
             cache.commit()
         return v
@@ -231,27 +228,14 @@ class CosmosCausalDiT(nn.Module):
             window: Latents that a token attends to, own block and sink included.
             sink: First latents of the rollout that stay visible (attention sink).
         """
-        return RollingCache(
-            self.rope,
-            self.sizes.blocks,
-            self.sizes.heads,
-            batch,
-            height,
-            width,
-            window,
-            sink,
-            self.device,
-            self.dtype,
-        )
+        return RollingCache(self.rope, batch, height, width, window, sink, self.device)
 
     def encode_text(self, text: Tensor) -> TextContext:
         """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values
         of every block.
         """
         context = self.crossattn_proj(text.to(self.dtype))
-        return TextContext(
-            tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks)
-        )
+        return tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks)
 
     def _run(
         self,
@@ -264,15 +248,18 @@ class CosmosCausalDiT(nn.Module):
         attention: Callable[[int], Attend],
     ) -> Tensor:
         time = self._time(t)
-        text = text if isinstance(text, TextContext) else self.encode_text(text)
-        tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask)
+        text = self.encode_text(text) if isinstance(text, Tensor) else text
+        masks = torch.zeros_like(x[:, :MASK_CHANNELS])  # that of padding is zero
+        if condition_mask is not None:
+            masks[:, :1] = condition_mask
+        tokens = self.x_embedder.linear.embed(torch.cat([x, masks], dim=1).to(self.dtype))
         condition = hdmap.to(self.dtype)
         tokens = tokens + self.additional_patch_embedding.linear.embed(
             condition[:, : self.sizes.map_channels]
         )
         opacity = condition[:, self.sizes.map_channels :] if self.sizes.opacity_channels else None
         for layer, block in enumerate(self.blocks):
-            tokens = block(tokens, time, text.keys_values[layer], table, attention(layer), opacity)
+            tokens = block(tokens, time, text[layer], table, attention(layer), opacity)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal:

@@ -3,7 +3,7 @@
 Every cache has the same visibility rule (see `attention`): the window includes the sink and the own
 block. Keys are stored after the rotary embedding at their absolute positions.
 
-`RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink +
+`RollingCache` allocates once a layer, at its first block. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink +
 (i - sink) % (window - sink)``, so the newest latents overwrite the oldest without moves. Attention
 is invariant to the order of keys, so the buffer is used unsorted.
 
@@ -49,14 +49,14 @@ class BlockCache(ABC):
         self.window, self.sink, self.device = window, sink, device
         self.rows, self.columns = height // 2, width // 2
         self.tokens = self.rows * self.columns
-        self.position = 0  # absolute index of the open block's first latent
-        # latents committed since reset; differs from position in a rollout that does not start at 0
-        self.filled = 0
-        self.open_latents = 0  # length of the open block; 0 between blocks
+        self.reset()
 
     def reset(self, position: int = 0) -> None:
         """Clear the cache and start at an absolute latent index."""
-        self.position, self.filled, self.open_latents = position, 0, 0
+        self.position = position  # of the open block's first latent
+        # latents committed since reset; differs from position in a rollout that does not start at 0
+        self.filled = 0
+        self.open_latents = 0  # length of the open block; 0 between blocks
 
     def begin(self, latents: int) -> RopeTable:
         """Open or reopen the block at the current position, and return the rotary table of its
@@ -84,27 +84,12 @@ class RollingCache(BlockCache):
     Forwards through it run without gradients, since its buffers are overwritten in place.
     """
 
-    def __init__(
-        self,
-        rope: Rope3D,
-        layers: int,
-        heads: int,
-        batch: int,
-        height: int,
-        width: int,
-        window: int,
-        sink: int,
-        device: torch.device,
-        dtype: torch.dtype,
-    ) -> None:
-        super().__init__(rope, batch, height, width, window, sink, device)
-        self.size = window
-        shape = (layers, batch, window * self.tokens, heads, rope.head_width)
-        with torch.inference_mode(False):
-            self.keys = torch.zeros(shape, device=device, dtype=dtype)
-            self.values = torch.zeros(shape, device=device, dtype=dtype)
-        self._rows = self._source = torch.zeros(0, dtype=torch.long, device=device)
-        self._fits = True  # whether the open block fits in the window
+    window: int
+
+    def reset(self, position: int = 0) -> None:
+        """Clear the cache and start at an absolute latent index."""
+        super().reset(position)
+        self.buffers: dict[int, Tensor] = {}  # layer -> (2, B, slots, heads, head_width)
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
@@ -112,10 +97,10 @@ class RollingCache(BlockCache):
         A block that is opened again has its first length: its forwards share slots.
         """
         table = super().begin(latents)
-        ring = self.size - self.sink
+        ring = self.window - self.sink
         own = range(self.filled, self.filled + latents)
         rolling = [i for i in own if i >= self.sink]
-        self._fits = len(rolling) <= ring
+        self._fits = len(rolling) <= ring  # whether the open block fits in the window
         # A block longer than the ring attends to all of itself; only its newest latents are cached.
         kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
@@ -125,19 +110,18 @@ class RollingCache(BlockCache):
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Write the block's keys and values into their slots and attend to the buffer."""
-        keys, values = self.keys[layer], self.values[layer]
-        own_k, own_v = (part.to(keys.dtype) for part in (k, v))
-        for buffer, own in ((keys, own_k), (values, own_v)):
-            buffer.index_copy_(1, self._rows, own[:, self._source])
+        own = torch.stack([k, v])
+        if layer not in self.buffers:
+            with torch.inference_mode(False):
+                slots = self.window * self.tokens
+                self.buffers[layer] = torch.zeros_like(own[:, :, :1]).repeat(1, 1, slots, 1, 1)
+        buffer = self.buffers[layer]
+        buffer.index_copy_(2, self._rows, own[:, :, self._source])
         if self._fits:
-            end = min(self.size, self.filled + self.open_latents) * self.tokens
-            return attend(q, keys[:, :end], values[:, :end])
+            end = min(self.window, self.filled + self.open_latents) * self.tokens
+            return attend(q, *buffer[:, :, :end])
         past = min(self.sink, self.filled) * self.tokens
-        return attend(
-            q,
-            torch.cat([keys[:, :past], own_k], dim=1),
-            torch.cat([values[:, :past], own_v], dim=1),
-        )
+        return attend(q, *torch.cat([buffer[:, :, :past], own], dim=2))
 
     def _token_rows(self, latents: list[int]) -> Tensor:
         first = torch.tensor(latents, dtype=torch.long, device=self.device)[:, None] * self.tokens

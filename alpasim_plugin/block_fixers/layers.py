@@ -16,7 +16,7 @@ term that all modulation layers share.
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -36,12 +36,7 @@ class Float32Linear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
-        kind = input.device.type
-        with (
-            torch.autocast(kind, enabled=False)
-            if torch.amp.is_autocast_available(kind)
-            else nullcontext()
-        ):
+        with torch.autocast(input.device.type, enabled=False):
             return F.linear(input.float(), self.weight.float())
 
 
@@ -99,18 +94,14 @@ def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
 
 
 class PatchLinear(nn.Linear):
-    """Patch embedding that can skip input channels which are zero."""
+    """Patch embedding."""
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__(channels * PATCH * PATCH, width, bias=False)
 
-    def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
-        """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B,
-        T, N, width)``.
-        """
-        patches = patchify(video)
-        start = first_channel * PATCH * PATCH
-        return F.linear(patches, self.weight[:, start : start + patches.shape[-1]])
+    def embed(self, video: Tensor) -> Tensor:
+        """Map ``(B, channels, T, H, W)`` to ``(B, T, N, width)``."""
+        return self(patchify(video))
 
 
 def sinusoid(t: Tensor, width: int) -> Tensor:
@@ -144,8 +135,7 @@ class TimeMap(nn.Module):
 
     def forward(self, s: Tensor) -> Tensor:
         """Map ``(..., width)`` to ``(..., 3 * width)``."""
-        out: Tensor = self.linear_2(F.silu(self.linear_1(s)))
-        return out
+        return self.linear_2(F.silu(self.linear_1(s)))
 
 
 class PatchEmbed(nn.Module):
@@ -158,26 +148,4 @@ class PatchEmbed(nn.Module):
     @property
     def linear(self) -> PatchLinear:
         """The embedding itself."""
-        layer = self.proj[1]
-        assert isinstance(layer, PatchLinear)
-        return layer
-
-
-def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None) -> Tensor:
-    """Embed latents with their condition mask; that of padding is zero, as is the other where it is
-    None, so its columns of the embedding are skipped.
-
-    Args:
-        embed: Embedding of C + 2 channels.
-        x: ``(B, C, T, H, W)``.
-        condition_mask: ``(B, 1, T, H, W)`` or anything that broadcasts to it, 1 where the latent is
-            given.
-
-    Returns:
-        ``(B, T, N, width)``.
-    """
-    b, c, t, h, w = x.shape
-    tokens = embed.embed(x)
-    if condition_mask is not None:
-        tokens = tokens + embed.embed(condition_mask.to(x.dtype).expand(b, 1, t, h, w), c)
-    return tokens
+        return cast(PatchLinear, self.proj[1])

@@ -24,7 +24,7 @@ from alpasim_plugin.block_fixers.dit import (
 from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes
-from alpasim_plugin.block_fixers.streaming import State
+from alpasim_plugin.block_fixers.streaming import State, StreamingCodec, StreamingDecoder
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
@@ -40,7 +40,6 @@ Precision = Literal["fp32", "bf16"]
 Net = TypeVar("Net", bound=nn.Module)
 TAEHV_WIDTHS = (256, 128, 64, 64)
 LATENT = 16
-Codec = TinyVAE | WanVAE
 
 
 def at_precision(net: Net, precision: Precision, float32: Sequence[str] = ()) -> Net:
@@ -58,8 +57,8 @@ class Networks:
     """The networks of a fixer; read-only and stateless, so rollouts share them."""
 
     dit: CosmosCausalDiT
-    vae: Codec
-    decoder: Codec | TinyDecoder
+    vae: StreamingCodec
+    decoder: StreamingDecoder
     text: TextContext
     trained: bool
     note: str  # description of the weights, for labels
@@ -139,12 +138,8 @@ def decode(
     Returns:
         Frames like ``render``, not clipped to [-1, 1], and the decoder's state after them.
     """
-    if not settings.shows_render:
-        return networks.decoder.decode_next(z, state, clamp=False)
-    assert isinstance(networks.decoder, TinyVAE), (
-        "settings allow no other decoder to see the render"
-    )
-    return networks.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
+    seen = {"render": render, "opacity": opacity} if settings.shows_render else {}
+    return networks.decoder.decode_next(z, state, clamp=False, **seen)
 
 
 @lru_cache(maxsize=4)
@@ -154,13 +149,11 @@ def _load(settings: LatentFixerSettings, device: str) -> Networks:
     dtype = DTYPES[settings.precision]
     with torch.no_grad():
         text = plain.encode_text(parts.prompt(plain.sizes))
-    text = TextContext(
-        tuple((k.to(device, dtype), v.to(device, dtype)) for k, v in text.keys_values)
-    )
+    text = tuple((k.to(device, dtype), v.to(device, dtype)) for k, v in text)
     # Cast before it is moved: the device never holds the float32 weights.
     dit = at_precision(plain, settings.precision, FLOAT32_KEYS).to(device)
     vae = at_precision(parts.vae(), settings.codec_precision).to(device)
-    decoder: Codec | TinyDecoder = vae
+    decoder: StreamingDecoder = vae
     if settings.decoder.kind == "taehv":
         decoder = at_precision(parts.decoder(), settings.codec_precision).to(device)
     return Networks(dit, vae, decoder, text, parts.trained, parts.note)
@@ -225,7 +218,7 @@ class Parts:
             )
         return text.float()[None]
 
-    def vae(self) -> Codec:
+    def vae(self) -> StreamingCodec:
         """Build the autoencoder."""
         weights, source = self.tensors("vae")
         is_tiny = self.settings.vae.kind == "tiny"

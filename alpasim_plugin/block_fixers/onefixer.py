@@ -113,11 +113,7 @@ class OneFixer(Fixer):
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
         self.pipeline = BlockPipeline(self.networks, settings)
-        self.blocks = (
-            BlockRule(1, 1)
-            if settings.history == "none"
-            else BlockRule.of_latents(settings.block_latents)
-        )
+        self.blocks = BlockRule.of_latents(settings.block_latents)
         self.trained = self.networks.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
         self.label = f"{settings.name}{at}, {self.networks.note}"
@@ -196,7 +192,7 @@ class OneFixer(Fixer):
     def _fix(self, view: Views, history: ViewsHistory) -> PendingBlock:
         clip = to_clip(view, self.blocks.frames(self._done), self.networks.device)
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
-        first = self._done if self.settings.history == "none" else history.state.latent
+        first = history.state.latent
         latents = range(first, first + self.settings.block_latents)
         drawn = latent_noise(
             self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape
@@ -216,18 +212,11 @@ class OneFixer(Fixer):
     def _keep(self, block: PendingBlock) -> ViewsHistory:
         has_nan = any(guard.NAN in events for events in block.events)
         view = block.views
-        if self.settings.history == "none":
-            state = self._open(view).state
-        else:
-            state = (
-                self.pipeline.drop_history(block.state)
-                if has_nan
-                else self.pipeline.keep(block.state)
-            )
+        keep = self.pipeline.drop_history if has_nan else self.pipeline.keep
         return ViewsHistory(
             view.cameras,
             view.shape,
-            state,
+            keep(block.state),
             tuple(zip(block.images[:, -1], view.rgb[:, -1], strict=True)),
         )
 

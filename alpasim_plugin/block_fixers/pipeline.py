@@ -28,28 +28,21 @@ from alpasim_plugin.fixers.network.schedule import from_names
 
 
 def condition_of(
-    settings: OneFixerSettings, z_map: Tensor, z_render: Tensor, opacity: Tensor | None
+    settings: OneFixerSettings, z_map: Tensor, z_render: Tensor, alpha: Tensor, first: bool
 ) -> Tensor:
     """Return what the transformer sees besides its source ``(B, channels, T, h, w)``.
 
     Args:
         settings: Say which of the inputs it sees.
         z_map, z_render: ``(B, 16, T, h, w)``.
-        opacity: From `opacity_input`.
+        alpha, first: As for `opacity_values`.
     """
-    render = z_render if settings.render_input else None
-    return torch.cat([part for part in (z_map, render, opacity) if part is not None], dim=1)
-
-
-def opacity_input(
-    settings: OneFixerSettings, rgb: Tensor, alpha: Tensor | None, first: bool
-) -> Tensor | None:
-    """Return the opacity for the transformer's blocks, None where they do not embed it; no opacity
-    is an opaque render.
-    """
-    if not settings.opacity_input:
-        return None
-    return opacity_values(torch.ones_like(rgb[:, :1]) if alpha is None else alpha, first)
+    parts = [z_map]
+    if settings.render_input:
+        parts.append(z_render)
+    if settings.opacity_input:
+        parts.append(opacity_values(alpha, first))
+    return torch.cat(parts, dim=1)
 
 
 def map_video(settings: OneFixerSettings, rgb: Tensor, sdmap: Tensor | None) -> Tensor | None:
@@ -108,7 +101,7 @@ class BlockPipeline:
         self,
         state: PipelineState,
         rgb: Tensor,
-        alpha: Tensor | None,
+        alpha: Tensor,
         sdmap: Tensor | None,
         noise: Sequence[Tensor],
     ) -> tuple[Tensor, PipelineState]:
@@ -118,7 +111,7 @@ class BlockPipeline:
             state: From `start` or `keep`; the newest of its rollout.
             rgb: ``(B, 3, T, H, W)`` render in [-1, 1]; T is ``1 + 4 (block_latents - 1)`` in the
                 first block, then ``4 block_latents``.
-            alpha: ``(B, 1, T, H, W)`` opacity, or None where all is opaque.
+            alpha: ``(B, 1, T, H, W)`` opacity.
             sdmap: ``(B, 3, T, H, W)`` semantic map in [-1, 1], or None for the whole rollout; then
                 ``no_map`` says what takes its place.
             noise: `draws` standard normal tensors ``(B, 16, block_latents, H / 8, W / 8)``.
@@ -129,7 +122,6 @@ class BlockPipeline:
         """
         settings, nets = self.settings, self.networks
         is_first = state.latent == 0
-        opacity = opacity_input(settings, rgb, alpha, first=is_first)
         shown = map_video(settings, rgb, sdmap)
         views = rgb if shown is None else torch.cat([rgb, shown])
         latents, encoder = nets.vae.encode_next(views, state.encoder)
@@ -137,13 +129,12 @@ class BlockPipeline:
         if shown is None:
             z_map = torch.zeros_like(z_render)
         sources = list(noise[: len(self.schedule)])
-        if settings.holes == "render" or (alpha is None and settings.holes != "everywhere"):
+        if settings.holes == "render":
             sources = [z_render] * len(sources)
         elif settings.holes == "noise":
-            assert alpha is not None
             mask = opacity_mask(alpha, first=is_first)
             sources = [mixed_source(z_render, mask, eps) for eps in sources]
-        condition = condition_of(settings, z_map, z_render, opacity)
+        condition = condition_of(settings, z_map, z_render, alpha, is_first)
         cache = state.cache
         z_0 = sample_block(nets.dit, sources, nets.text, condition, cache, self.schedule)
         out, decoder = decode(nets, settings, z_0, rgb, alpha, state.decoder)

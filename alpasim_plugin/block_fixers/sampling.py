@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.clips import check_frames
+from alpasim_plugin.block_fixers.clips import check_frames, whole_groups
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.fixers.network.schedule import (
@@ -86,10 +86,7 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
 def _checked_opacity(opacity: Tensor, first: bool) -> Tensor:
     """Return opacity in [0, 1], four frames a latent."""
     check_frames("opacity", opacity, 1, first)
-    video = opacity.clamp(0, 1)
-    if first:
-        video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
-    return video
+    return whole_groups(opacity.clamp(0, 1), first)
 
 
 def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:

@@ -147,10 +147,9 @@ class OneFixerSettings(LatentFixerSettings):
     steps: tuple[float, ...] = Field(
         default=(1000.0,), min_length=1, description="Named time steps, falling from 1000."
     )
-    history: Literal["finalise", "last-forward", "none"] = Field(
+    history: Literal["finalise", "last-forward"] = Field(
         default="last-forward",
-        description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
-        "every frame is fixed by itself.",
+        description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step.",
     )
     holes: Literal["noise", "render", "everywhere"] = Field(
         default="noise",
@@ -182,7 +181,7 @@ class OneFixerSettings(LatentFixerSettings):
     @property
     def unit(self) -> Unit:
         """What a block costs."""
-        frames = 1 if self.history == "none" else 4 * self.block_latents
+        frames = 4 * self.block_latents
         return Unit(frames, len(self.steps) + self.finalises, self.block_latents, frames - 1)
 
     @field_validator("steps", mode="before")
@@ -196,10 +195,6 @@ class OneFixerSettings(LatentFixerSettings):
         if self.sink > self.window:
             raise ValueError(
                 f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger"
-            )
-        if self.history == "none" and self.block_latents != 1:
-            raise ValueError(
-                f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1"
             )
         if self.holes == "everywhere" and not self.render_input:
             raise ValueError(

@@ -18,19 +18,19 @@ HINT = "give the weights of a causal single-view network with a semantic-map emb
 
 @dataclass(frozen=True)
 class DiTSizes:
-    """Every size of a `CosmosCausalDiT`; the defaults are OmniDreams single view (2B).
+    """Every size of a `CosmosCausalDiT`; configs/fixers/onefixer-2b.yaml has OmniDreams'.
 
     ``opacity_channels`` above 0 gives every block an embedding of the render's opacity (ArtiFixer),
     which OmniDreams does not have.
     """
 
-    width: int = 2048
-    blocks: int = 28
-    head_width: int = 128
-    mlp_width: int = 8192
-    adaln_rank: int = 256
-    text_width: int = 100352
-    context_width: int = 1024
+    width: int
+    blocks: int
+    head_width: int
+    mlp_width: int
+    adaln_rank: int
+    text_width: int
+    context_width: int
     latent_channels: int = 16
     map_channels: int = 16
     opacity_channels: int = 0
@@ -39,11 +39,6 @@ class DiTSizes:
     def condition_channels(self) -> int:
         """Channels of the condition: the map's, then the opacity's."""
         return self.map_channels + self.opacity_channels
-
-    @property
-    def heads(self) -> int:
-        """Attention heads."""
-        return self.width // self.head_width
 
 
 def read_sizes(tensors: Mapping[str, Tensor], source: str) -> DiTSizes:

@@ -100,13 +100,9 @@ class SpeculationStats:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and errors, in metres and degrees."""
-        errors = {
-            "forecast_error": _rounded(vars(self.forecast_error))
-            if self.predicted
-            else dict.fromkeys(vars(EXACT)),
-            "shown_error": _rounded(vars(self.shown_error)),
-        }
-        return vars(self) | errors
+        forecast = _rounded(vars(self.forecast_error)) if self.predicted else {}
+        shown = _rounded(vars(self.shown_error))
+        return vars(self) | {"forecast_error": forecast, "shown_error": shown}
 
 
 class SpeculativeRenderer(FixedRenderer):
@@ -222,13 +218,9 @@ class SpeculativeRenderer(FixedRenderer):
 
 def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Frame:
     """Add the pose errors of the frame shown and of the forecast to its facts."""
-    facts = {
-        "pose_error_m": shown.camera_m,
-        "pose_error_deg": shown.camera_deg,
-        "actor_error_m": shown.actor_m,
-    }
+    facts = {"pose_error_m": shown.camera_m}
     if forecast is not None:
-        facts |= {"forecast_error_m": forecast.camera_m, "forecast_error_deg": forecast.camera_deg}
+        facts["forecast_error_m"] = forecast.camera_m
     return replace(frame, facts={**frame.facts, **_rounded(facts)})
 
 

@@ -18,14 +18,14 @@ and `decode_next`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, frame_ends, pass_ends
+from alpasim_plugin.block_fixers.clips import GROUP, frame_counts
 
 State = tuple[Tensor, ...]
 Step = Callable[..., tuple[Tensor, State]]
@@ -81,26 +81,24 @@ class StreamingState:
 
 
 def in_passes(
-    step: Step, x: Tensor, state: State | None, ends: Sequence[int]
+    step: Step, state: State | None, passes: Iterable[tuple[Tensor, ...]]
 ) -> tuple[Tensor, State]:
-    """Apply a pure step to consecutive parts of ``x (B, C, T, H, W)`` along time and join the
-    results.
+    """Apply a pure step to consecutive parts of a video and join the results along time.
 
     One latent a pass bounds memory and makes the result bit-identical for any division of a video
     into calls: the order of summation is the same.
 
     Args:
-        step: ``step(part, state) -> (y, state)``.
-        x: Frames or latents, at least one.
+        step: ``step(state, *parts) -> (y, state)``.
         state: Where the stream stands.
-        ends: Where each part ends, increasing, the last one at T.
+        passes: The parts ``(B, C, T, H, W)`` that each pass takes, at least one pass.
     """
-    parts = []
-    for start, end in zip((0, *ends[:-1]), ends, strict=True):
-        out, state = step(x[:, :, start:end], state)
-        parts.append(out)
+    out = []
+    for parts in passes:
+        made, state = step(state, *parts)
+        out.append(made)
     assert state is not None, "no part at all"
-    return (torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]), state
+    return torch.cat(out, dim=2), state
 
 
 def run_layers(layers: Iterable[nn.Module], x: Tensor, streaming: StreamingState) -> Tensor:
@@ -123,16 +121,11 @@ def channels_first(x: Tensor) -> Tensor:
     return x.permute(0, 4, 1, 2, 3).contiguous()
 
 
-def split_last(x: Tensor, parts: int) -> Tensor:
-    """Map ``(..., parts * C)`` to ``(..., parts, C)``."""
-    return x.view(*x.shape[:-1], parts, x.shape[-1] // parts)
-
-
 def channels_to_frames(x: Tensor, parts: int) -> Tensor:
     """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to
     ``(B, parts * T, H, W, C)``.
     """
-    return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
+    return x.unflatten(-1, (parts, -1)).movedim(-2, 2).flatten(1, 2)
 
 
 def spread(x: Tensor) -> Tensor:
@@ -229,9 +222,15 @@ class StreamingDecoder(nn.Module, ABC):
         (frames, state)``.
         """
 
+    def latents_of_passes(self, latents: int) -> list[int]:
+        """Return how many latents each pass over ``latents`` takes."""
+        size = self.latents_per_pass or latents
+        return [min(size, latents - start) for start in range(0, latents, size)]
+
     def decode_in_passes(self, step: Step, z: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Apply a step of a decoder to ``latents_per_pass`` latents at a time."""
-        return in_passes(step, z, state, pass_ends(z.shape[2], self.latents_per_pass))
+        parts = z.to(self.dtype).split(self.latents_of_passes(z.shape[2]), dim=2)
+        return in_passes(step, state, zip(parts, strict=True))
 
     def decode(self, z: Tensor, **options: Any) -> Tensor:
         """Decode a whole clip.
@@ -263,8 +262,10 @@ class StreamingCodec(StreamingDecoder):
     ) -> tuple[Tensor, State]:
         """Apply a step of an encoder to the frames of ``latents_per_pass`` latents at a time."""
         first = state is None
-        ends = pass_ends(frames.shape[2] // GROUP + first, self.latents_per_pass)
-        return in_passes(step, frames, state, frame_ends(ends, first))
+        latents = self.latents_of_passes(frames.shape[2] // GROUP + first)
+        return in_passes(
+            step, state, zip(frames.split(frame_counts(latents, first), 2), strict=True)
+        )
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode a whole clip.

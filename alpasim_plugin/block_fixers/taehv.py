@@ -19,10 +19,11 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, check_video
+from alpasim_plugin.block_fixers.clips import DROPPED, check_video
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
+    first_axes,
 )
 from alpasim_plugin.block_fixers.streaming import (
     FrameConv,
@@ -36,12 +37,10 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_to_frames,
     run_layers,
 )
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import StateDict, clean, load_checked, unwrap
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3
-DROPPED = GROUP - 1  # frames dropped at the start of a video
 STAGE = 6  # entries of one stage: three memory blocks, upsampling, growth, convolution
 FIRST = 3  # entry of the first stage
 DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*)"
@@ -117,9 +116,8 @@ class TinyDecoder(StreamingDecoder):
     def __init__(self, latent: int, widths: Sequence[int], scaled: bool = False) -> None:
         super().__init__()
         self.latent = latent
-        self.scaled = scaled
         self.decoder = decoder_layers(latent, widths)
-        self.stats: LatentStats | None = None
+        self.stats = LatentStats() if scaled else None
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -151,7 +149,6 @@ class TinyDecoder(StreamingDecoder):
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
         load_checked(net, _last_rows(tensors, widths), source, DO)
-        net.stats = LatentStats() if scaled else None
         return net
 
     @classmethod
@@ -162,7 +159,6 @@ class TinyDecoder(StreamingDecoder):
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
         fill_random(net, seed, "taehv")
-        net.stats = LatentStats() if scaled else None
         return net
 
     def decode_next(
@@ -183,10 +179,10 @@ class TinyDecoder(StreamingDecoder):
             InputError: Another shape.
         """
         check_video("latents", z, self.latent)
-        video, state = self.decode_in_passes(self._pass, z.to(self.dtype), state)
+        video, state = self.decode_in_passes(self._pass, z, state)
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
-    def _pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:
+    def _pass(self, state: State | None, z: Tensor) -> tuple[Tensor, State]:
         streaming = StreamingState(state)
         frames = run_layers(
             self.decoder,
@@ -201,12 +197,9 @@ class TinyDecoder(StreamingDecoder):
 def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple[int, ...]]:
     """Read the latent's channels and the four widths off the kernels' inputs."""
     first_convs = [f"decoder.{FIRST + STAGE * stage}.conv.0.bias" for stage in range(len(GROWTH))]
-    stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) + 1}.weight"
-    missing = [key for key in (stem, *first_convs, last) if key not in tensors]
-    if missing:
-        raise InputError(f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", DO)
-    widths = [tensors[key].numel() for key in first_convs]
-    return tensors[stem].shape[1], (*widths, tensors[last].shape[1])
+    stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) - 1}.weight"
+    *widths, _ = first_axes(tensors, [*first_convs, last, stem], source, DO)
+    return tensors[stem].shape[1], tuple(widths)
 
 
 def _last_rows(tensors: Mapping[str, Tensor], widths: Sequence[int]) -> StateDict:

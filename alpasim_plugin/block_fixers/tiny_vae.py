@@ -32,12 +32,13 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import (
+    DROPPED,
     GROUP,
     SIDE,
     check_frames,
     check_video,
-    frame_ends,
-    pass_ends,
+    frame_counts,
+    whole_groups,
 )
 from alpasim_plugin.block_fixers.codec_weights import LatentStats, fill_random
 from alpasim_plugin.block_fixers.streaming import (
@@ -47,12 +48,10 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_first,
     channels_last,
     channels_to_frames,
-    split_last,
+    in_passes,
 )
 from alpasim_plugin.block_fixers.tiny_vae_nets import (
-    CELL,
     COLOURS,
-    DROPPED,
     LATENT,
     CosineTransform,
     TinySizes,
@@ -63,7 +62,7 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import (
 )
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import load_checked, load_weights, unwrap
+from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
 
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 
@@ -85,7 +84,7 @@ class TinyVAE(StreamingCodec):
         self.sizes = sizes
         self.encoder = TinyVAEEncoder(sizes)
         self.decoder = TinyVAEDecoder(sizes)
-        self.stats = _untrained_stats()
+        self.stats = LatentStats([0.0] * LATENT, [1.0] * LATENT, stored=True)
         self.transform = CosineTransform()
         self.eval()
 
@@ -99,7 +98,6 @@ class TinyVAE(StreamingCodec):
         for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
             fill_random(part, seed, f"tiny_vae.{name}")
             nn.init.zeros_(part.head.weight)
-        vae.stats, vae.transform = _untrained_stats(), CosineTransform()
         return vae
 
     @classmethod
@@ -119,18 +117,8 @@ class TinyVAE(StreamingCodec):
         with torch.device("meta"):
             vae = cls(sizes)
         load_checked(vae, tensors, source, DO)
-        vae.transform = CosineTransform()
         vae.requires_grad_(False)
         return vae
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a safetensors file.
-
-        Raises:
-            InputError: No such file, not safetensors, or other keys.
-        """
-        return cls.from_state_dict(load_weights(path), source=str(path))
 
     def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
         """Write a safetensors file atomically."""
@@ -172,45 +160,30 @@ class TinyVAE(StreamingCodec):
         """
         check_video("latents", z, LATENT)
         b, _, m, h, w = z.shape
-        frames = GROUP * m - (DROPPED if state is None else 0)
-        size = frames, h * SIDE, w * SIDE
-        for given, channels in ((render, COLOURS), (opacity, 1)):
-            if given is not None and given.shape != (b, channels, *size):
-                raise InputError(
-                    f"a render or opacity of shape {list(given.shape)}",
-                    f"give that of the frames that come out, {[b, channels, *size]}",
-                )
-        parts = []
-        start = 0
-        first = 0
-        ends = pass_ends(m, self.latents_per_pass)
-        for end, last in zip(ends, frame_ends(ends, state is None), strict=True):
-            condition = [
-                None if x is None else x[:, :, first:last].float() for x in (render, opacity)
-            ]
-            part, state = self._decode_pass(
-                z[:, :, start:end].float(), condition[0], condition[1], state
-            )
-            parts.append(part)
-            start = end
-            first = last
-        assert state is not None
-        video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+        latents = self.latents_of_passes(m)
+        frames = frame_counts(latents, state is None)
+        parts = [z.float().split(latents, dim=2)]
+        if render is not None:
+            cover = torch.ones_like(render[:, :1]) if opacity is None else opacity
+            for given, channels in ((render, COLOURS), (cover, 1)):
+                expected = [b, channels, sum(frames), h * SIDE, w * SIDE]
+                if list(given.shape) != expected:
+                    raise InputError(
+                        f"a render or opacity of shape {list(given.shape)}",
+                        f"give that of the frames that come out, {expected}",
+                    )
+                parts.append(given.float().split(frames, dim=2))
+        video, state = in_passes(self._decode_pass, state, zip(*parts, strict=True))
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
+    def _encode_pass(self, state: State | None, frames: Tensor) -> tuple[Tensor, State]:
         streaming = StreamingState(state)
-        grid = to_grid(_whole_groups(frames, streaming.first))
+        grid = to_grid(whole_groups(frames, streaming.first))
         mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
         return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
 
-    def _decode_pass(
-        self,
-        z: Tensor,
-        render: Tensor | None,
-        opacity: Tensor | None,
-        state: State | None,
-    ) -> tuple[Tensor, State]:
+    def _decode_pass(self, state: State | None, z: Tensor, *shown: Tensor) -> tuple[Tensor, State]:
+        """Decode latents; ``shown`` is the render and its opacity, or nothing."""
         streaming = StreamingState(state)
         mu = channels_last(self.stats.denormalise(z))
         grid = self.transform.synthesise(mu)
@@ -219,44 +192,19 @@ class TinyVAE(StreamingCodec):
         def as_frames(x: Tensor) -> Tensor:
             return channels_to_frames(x, GROUP)[:, skipped:]
 
-        frames = as_frames(grid)
-        if render is None:
-            correction, _ = self.decoder.next(mu.to(self.dtype), None, streaming)
-            return from_grid(frames + correction).to(self.dtype), streaming.state
-        shown = to_grid(_whole_groups(render, streaming.first))
-        if opacity is None:
-            cover, difference = None, shown  # the synthesised image has no detail to subtract
-        else:
-            cover = to_grid(_whole_groups(opacity, streaming.first))
-            shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
-        condition = (
-            as_frames(shown.to(self.dtype)),
-            None if cover is None else as_frames(cover.to(self.dtype)),
-        )
+        condition = None
+        if shown:
+            render, cover = (to_grid(whole_groups(part, streaming.first)) for part in shown)
+            colours = as_frames(_per_pixel(render, cover).to(self.dtype))
+            condition = colours, as_frames(cover.to(self.dtype))
         correction, gate = self.decoder.next(mu.to(self.dtype), condition, streaming)
-        assert gate is not None
-        detail = split_last(as_frames(self.transform.residue(difference)), CELL)
-        image = torch.addcmul(
-            split_last(frames + correction, CELL), detail, gate.float()[..., None]
-        )
-        return from_grid(image.flatten(-2)).to(self.dtype), streaming.state
-
-
-def _untrained_stats() -> LatentStats:
-    return LatentStats([0.0] * LATENT, [1.0] * LATENT, stored=True)
+        image = as_frames(grid) + correction
+        if shown:
+            detail = as_frames(self.transform.residue(_per_pixel(render - grid, cover)))
+            image = image + _per_pixel(detail, gate.float())
+        return from_grid(image).to(self.dtype), streaming.state
 
 
 def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
     """Multiply ``(..., n * 3)`` by one number a pixel ``(..., n)``."""
-    return (split_last(colours, factor.shape[-1]) * factor[..., None]).flatten(-2)
-
-
-def _whole_groups(frames: Tensor, first: bool) -> Tensor:
-    """Repeat the video's first frame three times before it, so that the first latent has a group of
-    four frames.
-    """
-    return (
-        torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2)
-        if first
-        else frames
-    )
+    return (colours.unflatten(-1, (-1, COLOURS)) * factor[..., None]).flatten(-2)

@@ -25,7 +25,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, SIDE
+from alpasim_plugin.block_fixers.clips import DROPPED, GROUP, SIDE
+from alpasim_plugin.block_fixers.codec_weights import first_axes
 from alpasim_plugin.block_fixers.streaming import (
     FrameConv,
     PointwiseConv,
@@ -35,7 +36,6 @@ from alpasim_plugin.block_fixers.streaming import (
     run_layers,
     spread,
 )
-from alpasim_plugin.core.errors import InputError
 
 COLOURS = 3
 QUARTER = 4  # side of a grid cell, pixels
@@ -63,7 +63,6 @@ BLACK_OFFSET = -6.8  # mean of the first component: driving video is darker than
 SLOPE = 0.1  # of the leaky ReLU
 LATENT = len(COMPONENTS)
 PIXELS = CELL * COLOURS  # values of one grid cell of one frame
-DROPPED = GROUP - 1  # padding frames of the first group
 
 
 def to_grid(video: Tensor) -> Tensor:
@@ -93,7 +92,7 @@ class CosineTransform(nn.Module):
     back.
 
     Both directions use the same fixed orthonormal kernel, computed in code and not stored in
-    weights. Everything here is float32: half precision has an error of one grey level.
+    weights, on the CPU also under a default device of ``meta``. Everything here is float32: half precision has an error of one grey level.
     """
 
     kernel: Tensor
@@ -105,10 +104,10 @@ class CosineTransform(nn.Module):
         self.register_buffer(
             "kernel", _kernel().contiguous(memory_format=torch.channels_last), persistent=False
         )
-        self.register_buffer(
-            "mean", torch.tensor([BLACK_OFFSET] + [0.0] * (len(COMPONENTS) - 1)), persistent=False
-        )
-        self.register_buffer("std", torch.tensor([std for _, std in COMPONENTS]), persistent=False)
+        mean = [BLACK_OFFSET] + [0.0] * (LATENT - 1)
+        std = [std for _, std in COMPONENTS]
+        self.register_buffer("mean", torch.tensor(mean, device="cpu"), persistent=False)
+        self.register_buffer("std", torch.tensor(std, device="cpu"), persistent=False)
 
     def analyse(self, grid: Tensor) -> Tensor:
         """Map ``(B, t, H/4, W/4, 192)`` to normalised components ``(B, t, H/8, W/8, 16)``."""
@@ -192,13 +191,7 @@ class TinySizes:
             "decoder.quarter",
             "decoder.mix.last",
         )
-        keys = [f"{layer}.bias" for layer in layers]
-        missing = [key for key in keys if key not in tensors]
-        if missing:
-            raise InputError(
-                f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", do
-            )
-        return cls(*(tensors[key].numel() for key in keys))
+        return cls(*first_axes(tensors, [f"{layer}.bias" for layer in layers], source, do))
 
 
 def activation() -> nn.LeakyReLU:
@@ -218,9 +211,8 @@ class TemporalResidualBlock(nn.Module):
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, T, H, W, C)`` to the same shape; the first frame's predecessor is zero."""
-        out: Tensor = self.last(
-            F.leaky_relu_(self.first(torch.cat([x, streaming.shift(x)], dim=-1)), SLOPE)
-        )
+        out = self.first(torch.cat([x, streaming.shift(x)], dim=-1))
+        out = self.last(F.leaky_relu_(out, SLOPE))
         return F.leaky_relu_(out.add_(x), SLOPE)
 
 
@@ -277,19 +269,19 @@ class TinyVAEDecoder(nn.Module):
         self.head = FrameConv(frame, PIXELS + CELL)
 
     def next(
-        self, z: Tensor, condition: tuple[Tensor, Tensor | None] | None, streaming: StreamingState
-    ) -> tuple[Tensor, Tensor | None]:
+        self, z: Tensor, condition: tuple[Tensor, Tensor] | None, streaming: StreamingState
+    ) -> tuple[Tensor, Tensor]:
         """Map latents to corrections.
 
         Args:
             z: ``(B, t, H/8, W/8, 16)``.
             condition: Colours of the render times its opacity ``(B, T, H/4, W/4, 48)``, and the
-                opacity ``(B, T, H/4, W/4, 16)`` or None for opaque; None without a render.
+                opacity ``(B, T, H/4, W/4, 16)``; None without a render.
             streaming: Cached frames.
 
         Returns:
             Correction of the frames ``(B, T, H/4, W/4, 48)``, and the gate of the render's detail
-            ``(B, T, H/4, W/4, 16)`` with a render; T is 4t, or 4t - 3 at the start of a video.
+            ``(B, T, H/4, W/4, 16)``; T is 4t, or 4t - 3 at the start of a video.
         """
         latent_rate = (
             self.stem,
@@ -304,17 +296,7 @@ class TinyVAEDecoder(nn.Module):
             :, DROPPED if streaming.first else 0 :
         ]
         if condition is not None:
-            covered = (
-                self.see_opacity.weight.sum(1)
-                if condition[1] is None
-                else self.see_opacity(condition[1])
-            )
-            x = x + self.see_colour(condition[0]) + covered
-        x = self.mix.next(F.leaky_relu_(x, SLOPE), streaming)
-        if condition is None:
-            assert self.head.bias is not None
-            return conv_frames(
-                x, self.head.weight[:PIXELS], self.head.bias[:PIXELS], padding=1
-            ), None
-        out = self.head(x)
+            colours, opacity = condition
+            x = x + self.see_colour(colours) + self.see_opacity(opacity)
+        out = self.head(self.mix.next(F.leaky_relu_(x, SLOPE), streaming))
         return out[..., :PIXELS], 2 * torch.sigmoid(out[..., PIXELS:])

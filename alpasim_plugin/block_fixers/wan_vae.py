@@ -17,6 +17,7 @@ from alpasim_plugin.block_fixers.clips import check_frames, check_video
 from alpasim_plugin.block_fixers.codec_weights import (
     LatentStats,
     fill_random,
+    first_axes,
 )
 from alpasim_plugin.block_fixers.streaming import (
     PointwiseConv,
@@ -38,7 +39,6 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     ResidualBlock,
     Upsample,
 )
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import clean, load_checked, unwrap
 
 COLOURS, LATENT = 3, 16
@@ -115,7 +115,6 @@ class WanVAE(StreamingCodec):
 
     def __init__(self, base: int) -> None:
         super().__init__()
-        self.base = base
         self.encoder = Encoder(base)
         self.conv1 = PointwiseConv(2 * LATENT, 2 * LATENT, axes=3)
         self.conv2 = PointwiseConv(LATENT, LATENT, axes=3)
@@ -142,12 +141,10 @@ class WanVAE(StreamingCodec):
             InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
         tensors = clean(unwrap(sd, source))
-        if STEM not in tensors:
-            raise InputError(f"{source} ({len(tensors)} tensors): missing: {STEM}", DO)
+        (base,) = first_axes(tensors, [STEM], source, DO)
         with torch.device("meta"):
-            vae = cls(tensors[STEM].numel())
+            vae = cls(base)
         load_checked(vae, tensors, source, DO)
-        vae.stats = LatentStats()
         return vae
 
     @classmethod
@@ -156,7 +153,6 @@ class WanVAE(StreamingCodec):
         with torch.device("meta"):
             vae = cls(base)
         fill_random(vae, seed, "wan_vae")
-        vae.stats = LatentStats()
         return vae
 
     def encode_next(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
@@ -194,15 +190,15 @@ class WanVAE(StreamingCodec):
             InputError: Another shape.
         """
         check_video("latents", z, LATENT)
-        video, state = self.decode_in_passes(self._decode_pass, z.to(self.dtype), state)
+        video, state = self.decode_in_passes(self._decode_pass, z, state)
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
+    def _encode_pass(self, state: State | None, frames: Tensor) -> tuple[Tensor, State]:
         streaming = StreamingState(state)
         moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
         return self.stats.normalise(channels_first(moments[..., :LATENT])), streaming.state
 
-    def _decode_pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:
+    def _decode_pass(self, state: State | None, z: Tensor) -> tuple[Tensor, State]:
         streaming = StreamingState(state)
         return channels_first(
             self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)

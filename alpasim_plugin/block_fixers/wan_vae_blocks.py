@@ -111,7 +111,7 @@ class ChannelNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(..., C)`` to the same shape and dtype; a zero vector stays zero."""
         wide = x.float()
-        length: Tensor = torch.linalg.vector_norm(wide, dim=-1, keepdim=True).clamp_min(1e-12)
+        length = torch.linalg.vector_norm(wide, dim=-1, keepdim=True).clamp_min(1e-12)
         gain = self.gamma.flatten().float() * math.sqrt(x.shape[-1])
         return (wide / length * gain).to(x.dtype)
 
@@ -141,8 +141,7 @@ class ResidualBlock(nn.Module):
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
-        skipped: Tensor = self.shortcut(x)
-        return run_layers(self.residual, x, streaming) + skipped
+        return run_layers(self.residual, x, streaming) + self.shortcut(x)
 
 
 class FrameAttention(nn.Module):
@@ -158,8 +157,7 @@ class FrameAttention(nn.Module):
         """Map ``(B, T, H, W, C)`` to the same shape."""
         pixels = self.norm(x).flatten(0, 1).flatten(1, 2)[:, None]  # (B * T, one head, H * W, C)
         q, k, v = self.to_qkv(pixels).chunk(3, dim=-1)
-        attended: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v))
-        return x + attended.view(x.shape)
+        return x + self.proj(F.scaled_dot_product_attention(q, k, v)).view(x.shape)
 
 
 class Downsample(nn.Module):

@@ -65,7 +65,7 @@ def test_a_bundle_is_loaded_whole(bundle):
     session = fixer(at(bundle))
     assert session.trained
     assert session.label == "onefixer-dit-tiny, 500 steps"
-    assert session.networks.text.keys_values[0][0].shape[1] == 2
+    assert session.networks.text[0][0].shape[1] == 2
     out = pixels(run_blocks(session, FRAMES, MAPS))
     assert np.abs(out.astype(int) - pixels(FRAMES)).max() > 2
     spoil(bundle, prompt__text=None)

@@ -15,7 +15,7 @@ import torch
 from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, decode, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
-from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
+from alpasim_plugin.block_fixers.pipeline import condition_of, map_video
 from alpasim_plugin.block_fixers.sampling import (
     context_level,
     flow_step,
@@ -157,15 +157,12 @@ def refine_clip(
     z_render = networks.vae.encode(rgb)
     shown = map_video(settings, rgb, sdmap)
     z_map = torch.zeros_like(z_render) if shown is None else networks.vae.encode(shown)
-    mask = (
-        torch.ones_like(z_render[:, :1])
-        if alpha is None or settings.holes == "render"
-        else opacity_mask(alpha, first=True)
-    )
-    mask = torch.zeros_like(mask) if settings.holes == "everywhere" else mask
-    condition = condition_of(
-        settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True)
-    )
+    mask = {
+        "noise": opacity_mask(alpha, first=True),
+        "render": torch.ones_like(z_render[:, :1]),
+        "everywhere": torch.zeros_like(z_render[:, :1]),
+    }[settings.holes]
+    condition = condition_of(settings, z_map, z_render, alpha, first=True)
     clean = refine_latents(networks, settings, z_render, mask, condition, noise)
     return decode(networks, settings, clean, rgb, alpha)[0]
 

@@ -171,7 +171,7 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road):
     run = drive(straight_road, Zigzag, tolerance_m=0.02, tolerance_deg=0.2)
     errors = [frame.facts["pose_error_m"] for frame in run.frames]
     assert 0.0 < max(errors) <= 0.02
-    assert max(frame.facts["pose_error_deg"] for frame in run.frames) <= 0.2
+    assert run.session.facts()["shown_error"]["camera_deg"] <= 0.2
     assert max(frame.facts.get("forecast_error_m", 0.0) for frame in run.frames) > 0.02
 
 

@@ -179,9 +179,8 @@ class ImageFixer(MaplessFixer):
                 references = (
                     self._references(view, [pasts[b] for b in rows]) if rows is joined else None
                 )
-                alpha = None if clip.alpha is None else clip.alpha[rows]
                 out[rows] = fix_images(
-                    self.networks, self.settings, clip.rgb[rows], alpha, references
+                    self.networks, self.settings, clip.rgb[rows], clip.alpha[rows], references
                 )
         return out
 

@@ -114,7 +114,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     """Return the settings that a bundle was trained for.
 
     Raises:
-        InputError: A bundle without a generator with history, or without a decoder that is
+        InputError: A bundle without a generator of blocks, or without a decoder that is
             conditioned on the render.
     """
     name, overrides = bundle_fixer(bundle)
@@ -127,7 +127,6 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     found = [
         text
         for text, wrong in (
-            ("its generator has no history", settings.history == "none"),
             ("its decoder does not see the render", settings.decoder.kind != "render"),
             (f"its autoencoder is {settings.vae.kind}", settings.vae.kind != "tiny"),
             # Rollouts take one step from the source of Eq. 1, with a finalised history.

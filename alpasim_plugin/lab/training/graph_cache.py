@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.attention import Rope3D, attend
+from alpasim_plugin.block_fixers.attention import attend
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.kv_cache import BlockCache
 from alpasim_plugin.core.errors import InputError
@@ -19,22 +19,6 @@ class GraphCache(BlockCache):
     """Keep every block's keys and values with their gradients; memory grows with the rollout."""
 
     keeps_graph = True
-
-    def __init__(
-        self,
-        rope: Rope3D,
-        batch: int,
-        height: int,
-        width: int,
-        window: int | None,
-        sink: int,
-        device: torch.device,
-    ) -> None:
-        super().__init__(rope, batch, height, width, window, sink, device)
-        self._kept: dict[
-            int, list[tuple[Tensor, Tensor]]
-        ] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
-        self._open: dict[int, tuple[Tensor, Tensor]] = {}
 
     @classmethod
     def of(
@@ -54,7 +38,9 @@ class GraphCache(BlockCache):
     def reset(self, position: int = 0) -> None:
         """Clear the cache and start at an absolute latent index."""
         super().reset(position)
-        self._kept, self._open = {}, {}
+        # layer -> per latent k, v: (B, tokens, heads, head_width)
+        self._kept: dict[int, list[tuple[Tensor, Tensor]]] = {}
+        self._open: dict[int, tuple[Tensor, Tensor]] = {}
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Attend to the concatenation of the visible past and the block."""

@@ -1,4 +1,4 @@
-"""The paper's ablation (Tab. 2a), its common initialisation, and a generator without history.
+"""The paper's ablation (Tab. 2a), its common initialisation.
 
 The paper initialises all variants from one pretrained causal video model. Here ``base`` is that
 initialisation: diffusion forcing on the same clips, with histories of every noise level.
@@ -14,14 +14,12 @@ from alpasim_plugin.lab.training.recipes.recipe import (
     INIT_BI,
     Recipe,
     Stage,
-    frame_by_frame,
     whole_clip,
 )
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 
 BASE = "base"
 BASE_BI = "base-bi"
-IMAGE = "image"
 BASE_FORCING = FlowMatching(
     "latent", window=True, source_share=0.35, context_share=0.2, noise_share=0.25
 )
@@ -52,15 +50,6 @@ ABLATION = (
                 FlowMatching("clip", noise_share=0.25),
                 attention=whole_clip,
                 start={"dit": f"{INIT_BI}.dit"},
-            ),
-        ),
-    ),
-    Recipe(
-        IMAGE,
-        "one frame at a time, no history",
-        (
-            Stage(
-                IMAGE, SharedRollout((Objectives("clean", 1),)), attention=frame_by_frame, latents=1
             ),
         ),
     ),

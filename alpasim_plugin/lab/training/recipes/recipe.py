@@ -41,13 +41,13 @@ class Attention:
         window: Latents in sight, the own block and the sink included.
         sink: First latents of the rollout that stay in sight.
         history: Keys and values of a finished block: of an extra forward over its clean latents, or
-            of its last step; or none.
+            of its last step.
     """
 
     block_latents: int = 2
     window: int = 6
     sink: int = 0
-    history: Literal["finalise", "last-forward", "none"] = "finalise"
+    history: Literal["finalise", "last-forward"] = "finalise"
 
 
 def whole_clip(latents: int) -> Attention:
@@ -62,7 +62,7 @@ def causal(latents: int) -> Attention:
 
 def frame_by_frame(latents: int) -> Attention:
     """Return the attention of a generator that takes every frame by itself."""
-    return Attention(1, 6, 0, "none")
+    return Attention(1, 1, 0)
 
 
 class Task(Protocol):
