@@ -1,7 +1,7 @@
 """Measure how often the rules of docs/statistics.md are wrong and how often they decide, beside
-classical tests, and write the tables into that page.
+classical tests, and write the tables into docs/experiments/verdict-error.md.
 
-    python docs/scripts/calibration.py [--repeats N] [--part NAME]
+    python docs/scripts/calibration.py [REPEATS [PART...]]
 
 Differences are drawn scene by scene. "Wrong" is how often a rule answers although its answer is
 false, with the truth as near to it as it can be; "right" is how often it answers where that is
@@ -10,14 +10,14 @@ true. A classical test stands beside a rule where it keeps its level for that ki
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-import scipy
+from scipy.stats import ttest_1samp
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, MetricInfo
@@ -29,8 +29,7 @@ from evaluators.statistics.intervals import TAIL, exact_rate, t_interval
 from evaluators.statistics.paired import compare, flag_interval, reach_of
 from evaluators.statistics.verdicts import ALPHA, sign_flip, sign_test
 
-DOCS = Path(__file__).resolve().parents[1]
-PAGES = (DOCS / "statistics.md", DOCS / "experiments" / "verdict-error.md")
+PAGE = Path(__file__).resolve().parents[1] / "experiments" / "verdict-error.md"
 METRES, RATE, PROGRESS = (METRICS[n] for n in ("lateral_distance_m", "offroad", "progress"))
 Draw = Callable[[np.random.Generator, int], F64]  # generator, scenes -> differences
 
@@ -62,17 +61,14 @@ def seeds(gained: float, of: int) -> Draw:
     return draw
 
 
-def t_test(x: F64) -> float:
-    """Return the two-sided p of the paired t test."""
-    if np.ptp(x) == 0.0:
-        return 1.0
-    t = float(np.mean(x) / (np.std(x, ddof=1) / np.sqrt(len(x))))
-    return 2.0 * float(scipy.special.stdtr(len(x) - 1, -abs(t)))
-
-
 def signs(x: F64) -> float:
     """Return the exact p of the sign test on scenes; McNemar's of one seed."""
     return sign_test(int(np.sum(x > 0)), int(np.sum(x < 0)))
+
+
+def t_test(x: F64) -> float:
+    """Return the two-sided p of the paired t test."""
+    return float(ttest_1samp(x, 0.0).pvalue)
 
 
 def classical_bounds(x: F64, reach: float) -> list[float]:
@@ -85,72 +81,67 @@ def classical_bounds(x: F64, reach: float) -> list[float]:
     log += math.log(2.0)
     spread = math.sqrt(2 * float(np.var(x, ddof=1)) * log / n)
     bernstein = np.mean(x) + spread + 14 * reach * log / (3 * (n - 1))
-    worse = reach * exact_rate(float(np.sum(x > 0)), n)[1]
-    return [float(hoeffding), float(bernstein), worse]
+    return [hoeffding, bernstein, reach * exact_rate(float(np.sum(x > 0)), n)[1]]
 
 
 def verdict_on(x: F64, metric: MetricInfo, margin: float) -> str:
     """Return what `compare` says of scene differences, positive is worse; a scene that is worse by
     what counts of it at most has left the route.
     """
-    cells = [("p", f"s{i:04d}", 0) for i in range(len(x))]
-    nothing = np.full(len(x), np.nan)
-
-    def side(values: F64, left: F64) -> Side:
-        columns = {metric.name: values, "left_route": left}
-        ok = np.ones(len(x), dtype=np.bool_)
-        return Side.laid_out(
-            cells,
-            ok,
-            lambda name: columns.get(name, nothing),
-            lambda row, name: "",
-            lambda row: "",
-        )
-
     worse = -x if metric.direction == "higher" else x
     base = np.maximum(-worse, 0.0)
-    left = (x >= reach_of(metric, margin)).astype(np.float64)
-    pair = side(base + worse, left), side(base, np.zeros(len(x)))
-    return str(compare(*pair, metric, "base", margin)["verdict"])
+    left = (x >= reach_of(metric, margin)).astype(float)
+    sides = [
+        Side.of([{"policy": "p", "scene": f"s{i:04d}", "seed": 0, metric.name: a, "left_route": b}
+                 for i, (a, b) in enumerate(zip(values, of, strict=True))])
+        for values, of in ((base + worse, left), (base, np.zeros(len(x))))
+    ]  # fmt: skip
+    return str(compare(sides[0], sides[1], metric, "base", margin)["verdict"])
 
 
-def share(hits: Sequence[bool]) -> str:
+def share(hits: Iterable[bool]) -> str:
     """Print a share in percent."""
-    return f"{100 * float(np.mean(hits)):.1f}"
+    return f"{100 * float(np.mean(list(hits))):.1f}"
+
+
+def row(words: str, cells: Iterable[str]) -> str:
+    """Return a row of a table."""
+    return f"| {words} | " + " | ".join(cells) + " |"
+
+
+def head(words: str, scenes: Sequence[int]) -> list[str]:
+    """Return the head of a table with a column for each number of scenes."""
+    return [row(words, (f"{n} scenes" for n in scenes)), "|---|" + "---:|" * len(scenes)]
 
 
 def differs(repeats: int) -> list[str]:
     """Measure "differs on these scenes"."""
-    lines = ["| differences | " + " | ".join(f"{n} scenes" for n in (6, 14, 42, 100)) + " |"]
-    lines.append("|---|" + "---:|" * 4)
-    rows: list[tuple[str, Callable[[float], Draw], float, Callable[[F64], float]]] = [
+    scenes = (6, 14, 42, 100)
+    lines = head("differences", scenes)
+    for words, family, effect, classical in (
         ("0.1 m, spread 0.2 m; t test", normal, 0.1, t_test),
         ("0.1 m, tails of t(2); t test", heavy, 0.1, t_test),
         ("rate +10 points, 1 seed; McNemar", lambda m: seeds(m, 1), 0.1, signs),
         ("rate +10 points, 5 seeds; sign test", lambda m: seeds(m, 5), 0.1, signs),
-    ]
-    for words, family, effect, classical in rows:
+    ):
         cells = []
-        for n in (6, 14, 42, 100):
+        for n in scenes:
             g = stream(words, n, "docs/calibration")
             null = [sign_flip(family(0.0)(g, n))[0] <= ALPHA for _ in range(repeats)]
             drawn = [family(effect)(g, n) for _ in range(repeats // 2)]
             own = [sign_flip(x)[0] <= ALPHA for x in drawn]
-            cells.append(
-                f"{share(null)} / {share(own)} / {share([classical(x) <= ALPHA for x in drawn])}"
-            )
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+            other = [classical(x) <= ALPHA for x in drawn]
+            cells.append(" / ".join(map(share, (null, own, other))))
+        lines.append(row(words, cells))
     return lines
 
 
 def verdicts(repeats: int) -> list[str]:
     """Measure `non-inferior` and `worse`."""
     scenes = (42, 100, 400)
-    lines = ["| verdict, margin, differences | " + " | ".join(f"{n} scenes" for n in scenes) + " |"]
-    lines.append("|---|" + "---:|" * len(scenes))
-    quiet = rare(0.0, 1.0)
-    noise = normal(0.0)
-    rows: list[tuple[str, str, MetricInfo, float, Draw, Draw]] = [
+    lines = head("verdict, margin, differences", scenes)
+    quiet, noise = rare(0.0, 1.0), normal(0.0)
+    for words, answer, metric, margin, at_margin, truth in (
         ("0.1 m: all alike, spread 0.2 m", "non-inferior", METRES, 0.1, normal(0.1), noise),
         ("0.1 m: 2.5 % of scenes by 4 m", "non-inferior", METRES, 0.1, rare(0.1, 4.0), quiet),
         ("0.1 m: 1 % of scenes by 15 m", "non-inferior", METRES, 0.1, rare(0.15, 15.0), quiet),
@@ -159,84 +150,74 @@ def verdicts(repeats: int) -> list[str]:
         ("0.05 of progress: 10 % by half", "non-inferior", PROGRESS, 0.05, rare(0.05, 0.5), quiet),
         ("0.1 m: 1 m, spread 0.2 m", "worse", METRES, 0.1, normal(0.1), normal(1.0)),
         ("5 points: 30 % of scenes", "worse", RATE, 0.05, rare(0.05, 1.0), rare(0.3, 1.0)),
-    ]
-    for words, answer, metric, margin, at_margin, truth in rows:
+    ):
+        sign = -1 if answer == "worse" else 1
+        reach = reach_of(metric, margin)
         cells = []
         for n in scenes:
             g = stream(words, n, "docs/calibration")
             false = [at_margin(g, n) for _ in range(repeats)]
             true = [truth(g, n) for _ in range(repeats // 4)]
-            wrong, right = (
-                [verdict_on(x, metric, margin) == answer for x in drawn] for drawn in (false, true)
-            )
-            reach = reach_of(metric, margin)
-            bounds = [classical_bounds(x if answer != "worse" else -x, reach) for x in true]
-            accepted = margin if answer != "worse" else -margin
-            best = 100 * np.mean(np.array(bounds) < accepted, axis=0).max()
-            cells.append(f"{share(wrong)} / {share(right)} / {best:.1f}")
-        lines.append(f"| `{answer}`, {words} | " + " | ".join(cells) + " |")
+            given = [
+                [verdict_on(x, metric, margin) == answer for x in some] for some in (false, true)
+            ]
+            bounds = np.array([classical_bounds(sign * x, reach) for x in true])
+            best = 100 * (bounds < sign * margin).mean(axis=0).max()
+            cells.append(f"{share(given[0])} / {share(given[1])} / {best:.1f}")
+        lines.append(row(f"`{answer}`, {words}", cells))
     return lines
+
+
+def stops(g: np.random.Generator, n: int) -> F64:
+    """Draw progress of which one in ten stops early."""
+    return np.where(g.random(n) < 0.1, g.uniform(0.0, 0.8, n), 1.0)
+
+
+def jumps(g: np.random.Generator, n: int) -> F64:
+    """Draw distances of which 2 % are longer by 3 m."""
+    return 0.1 + 0.02 * g.random(n) + np.where(g.random(n) < 0.02, 3.0, 0.0)
+
+
+def always(g: np.random.Generator, n: int) -> F64:
+    """Draw events of ten seeds: always in 10 % of scenes, in 5 % of seeds in others."""
+    chance = np.where(g.random(n) < 0.1, 1.0, 0.05)
+    return (g.random((n, 10)) < chance[:, None]).astype(float)
 
 
 def intervals(repeats: int) -> list[str]:
     """Measure the intervals of a mean."""
     scenes = (3, 6, 12, 20, 60)
-    lines = ["| scene means | " + " | ".join(f"{n} scenes" for n in scenes) + " |"]
-    lines.append("|---|" + "---:|" * len(scenes))
-
-    def stops(g: np.random.Generator, n: int) -> F64:
-        return np.where(g.random(n) < 0.1, g.uniform(0.0, 0.8, n), 1.0)
-
-    def jumps(g: np.random.Generator, n: int) -> F64:
-        return 0.1 + 0.02 * g.random(n) + np.where(g.random(n) < 0.02, 3.0, 0.0)
-
-    def rate(g: np.random.Generator, n: int) -> F64:
-        return g.binomial(5, g.beta(0.3, 2.7, n)) / 5.0
-
-    def once(g: np.random.Generator, n: int) -> F64:
-        return (g.random(n) < 0.1).astype(np.float64)
-
-    def always(g: np.random.Generator, n: int) -> F64:
-        chance = np.where(g.random(n) < 0.1, 1.0, 0.05)
-        return (g.random((n, 10)) < chance[:, None]).astype(np.float64)
-
+    lines = head("scene means", scenes)
     for words, metric, truth, draw in (
         ("progress, one drive in ten stops early", PROGRESS, 0.94, stops),
         ("metres, 2 % of scenes by 3 m", METRES, 0.17, jumps),
-        ("rate of 10 %, 1 seed", RATE, 0.1, once),
-        ("rate of 10 %, 5 seeds, correlated", RATE, 0.1, rate),
+        ("rate of 10 %, 1 seed", RATE, 0.1, lambda g, n: (g.random(n) < 0.1).astype(float)),
+        ("rate of 10 %, 5 seeds, correlated", RATE, 0.1,
+         lambda g, n: g.binomial(5, g.beta(0.3, 2.7, n)) / 5.0),
         ("rate, 10 seeds, always in 10 % of scenes, 5 % in others", RATE, 0.145, always),
         ("difference of that rate from 0", None, 0.145, always),
-    ):
+    ):  # fmt: skip
         cells = []
         for n in scenes:
             g = stream(words, n, "docs/calibration")
-            drawn = [draw(g, n) for _ in range(repeats)]
-            held = []
-            for x in drawn:
-                if metric is None:
-                    of_cells = np.repeat(np.arange(n), x.shape[1])
-                    found = flag_interval(x.ravel(), of_cells)
-                else:
-                    found = mean_interval(x.reshape(n, -1).mean(axis=1), metric)
-                low, high = found.bounds or (0.0, 0.0)
-                held.append(low <= truth <= high)
-            by_t = []
-            for x in drawn:
+            held, by_t = [], []
+            for x in (draw(g, n) for _ in range(repeats)):
                 means = x.reshape(n, -1).mean(axis=1)
-                low, high = t_interval(means).bounds or (float(means[0]),) * 2
+                own = mean_interval(means, metric) if metric else flag_interval(
+                    x.ravel(), np.repeat(np.arange(n), x.shape[1]))  # fmt: skip
+                low, high = own.bounds or (0.0, 0.0)
+                held.append(low <= truth <= high)
+                low, high = t_interval(means).bounds or (means[0], means[0])
                 by_t.append(low <= truth <= high)
             cells.append(f"{share(held)} / {share(by_t)}")
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+        lines.append(row(words, cells))
     return lines
 
 
 def betting(repeats: int) -> list[str]:
     """Measure ``--until-decided`` with a ceiling of 400 scenes."""
-    lines = [
-        "| margin, differences | wrong | right | a fixed number of scenes |",
-        "|---|" + "---:|" * 3,
-    ]
+    columns = ("wrong", "right", "a fixed number of scenes")
+    lines = [row("margin, differences", columns), "|---|" + "---:|" * 3]
     for words, reach, margin, at_margin, truth in (
         ("0.1 m: spread 0.2 m", 4.0, 0.1, normal(0.1), normal(0.0)),
         ("0.1 m: 2.5 % of scenes by 4 m", 4.0, 0.1, rare(0.1, 4.0), rare(0.0, 1.0)),
@@ -251,29 +232,16 @@ def betting(repeats: int) -> list[str]:
             draws = Draws(-x, reach)
             capital = log_capital(draws, -margin, bet_sizes(draws, -margin, plan))
             answers.append(capital.max(axis=-1) >= plan.log_bar)
-        fixed = [
-            any(bound < margin for bound in classical_bounds(draw_x, reach)) for draw_x in x[:200]
-        ]
-        lines.append(f"| {words} | {share(answers[0])} | {share(answers[1])} | {share(fixed)} |")
+        answers.append(np.array([min(classical_bounds(one, reach)) < margin for one in x[:200]]))
+        lines.append(row(words, map(share, answers)))
     return lines
 
 
-def main() -> None:
-    """Write the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parts = {part.__name__: part for part in (differs, verdicts, intervals, betting)}
-    parser.add_argument("--repeats", type=int, default=2000)
-    parser.add_argument("--part", choices=list(parts), action="append", help="default: all")
-    arguments = parser.parse_args()
-    repeats = arguments.repeats
-    for part in [parts[name] for name in arguments.part or parts]:
-        table = "\n".join(part(repeats))
-        begin, end = f"<!-- begin {part.__name__} -->", f"<!-- end {part.__name__} -->"
-        for page in PAGES:
-            text = page.read_text(encoding="utf-8")
-            text = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
-            page.write_text(text, encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    parts = {part.__name__: part for part in (differs, verdicts, intervals, betting)}
+    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
+    for name in sys.argv[2:] or parts:
+        table = "\n".join(parts[name](repeats))
+        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+        text = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", PAGE.read_text(), flags=re.S)
+        PAGE.write_text(text)

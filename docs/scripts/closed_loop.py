@@ -1,137 +1,180 @@
-"""Drive the held-out scenes and put the tables into docs/experiments/fixer-closed-loop.md.
+"""Write the tables of docs/experiments/fixer-closed-loop.md, and what README.md and
+docs/experiments/index.md say of them.
 
-    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:5]
+    python docs/scripts/closed_loop.py [--check] [RUN...]
 
-Then ``python docs/scripts/headline.py`` writes what README.md and docs/experiments/index.md say of it. SCENES
-is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen
-ones; RUNS (default: runs/closed-loop) keeps the run folders, so a second call continues an
-interrupted first one. Behind a policy's name stands its number of seeds.
+Each RUN is a run of one policy over the frozen scenes. Its numbers go into the record beside that
+page, from which the pages are made. With ``--check`` nothing is written, and the exit code is 1
+where a page is stale.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import subprocess
+import re
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
-import yaml
-from headline import BARE, BASELINE, DISTANCE, EVENT, FIXED, RECORD, TRUE, replace
+from scipy.special import stdtrit
 
-from alpasim_plugin.lab.training.frozen_scenes import check_scenes
-
-VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
-RENDERERS = (TRUE, BASELINE, FIXED, BARE)
-SHOWN = (
-    "collision_at_fault",
-    "offroad",
-    EVENT,
-    DISTANCE,
-    "progress",
-    "min_distance_to_obstacle_m",
-)
+REPO = Path(__file__).resolve().parents[2]
+EXPERIMENTS = REPO / "docs" / "experiments"
+RECORD = EXPERIMENTS / "closed-loop.json"
+TRUE, BASELINE, FIXED, BARE = RENDERERS = ("clean", "3dgs", "onefixer", "onefixer[references=0]")
+OTHERS = (TRUE, FIXED, BARE)
+EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
+UNITS = {"collision_at_fault": "%", "offroad": "%", EVENT: "%", DISTANCE: "m", "progress": "%",
+         "min_distance_to_obstacle_m": "m"}  # fmt: skip
+SAFER, KEEPS = "| Does it make driving safer? ", "| Does it keep the car on its path? "
+Entry = dict[str, Any]
 
 
-def drive(out: Path, arguments: list[str]) -> None:
-    """Run simrun; a verdict, whatever it is, is a result."""
-    command = [sys.executable, "-m", "alpasim_plugin.cli.main", *arguments, "--out", str(out)]
-    code = subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode
-    if code not in (0, *VERDICTS):
-        sys.exit(f"exit code {code}; see {out}")
+def read_run(run: Path) -> tuple[str, Entry]:
+    """Return the policy of a run, and its numbers: means with half width and bounds, differences
+    with bounds and p-value, and for each family of scenes the rollouts with the event.
+    """
+    summary = json.loads((run / "summary.json").read_text())
+    rows = pq.read_table(run / "rollouts.parquet").to_pylist()
+    entry: Entry = {"scenes": len({row["scene"] for row in rows}),
+                    "seeds": len({row["seed"] for row in rows}), "means": {}, "minus": {}}  # fmt: skip
+    for metric, unit in UNITS.items():
+        scale = 100 if unit == "%" else 1
+        means = {name: summary["metrics"][name][metric] for name in RENDERERS}
+        pairs = {name: summary["paired"][name][metric] for name in OTHERS}
+        entry["means"][metric] = {
+            name: [scale * one["mean"], scale * one["ci95"], *_scaled(one["ci95_clustered"], scale)]
+            for name, one in means.items()
+        }
+        entry["minus"][metric] = {
+            name: [scale * one["diff"], *_scaled(one["ci95"], scale), one["p_value"]]
+            for name, one in pairs.items()
+        }
+    events: Counter[tuple[str, str]] = Counter()
+    rollouts: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        if row[EVENT] is not None:
+            key = row["scene"].split("-")[-2].replace("_", " "), row["renderer"]
+            events[key] += int(row[EVENT])
+            rollouts[key] += 1
+    entry["events"] = {
+        family: {name: [events[family, name], rollouts[family, name]] for name in RENDERERS}
+        for family in sorted({family for family, _ in rollouts})
+    }
+    return rows[0]["policy"], entry
 
 
-def mean_cell(entry: dict[str, Any], scale: float, digits: int) -> str:
-    """Return a mean with the paper's half width and the interval over scenes."""
-    low, high = entry["ci95_clustered"]
-    return (
-        f"{scale * entry['mean']:.{digits}f} ± {scale * entry['ci95']:.{digits}f} "
-        f"[{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+def _scaled(bounds: list[float], scale: float) -> list[float]:
+    return [scale * bound for bound in bounds]
+
+
+def tables(policy: str, entry: Entry) -> str:
+    """Return a policy's three tables."""
+    means = [f"| metric | {' | '.join(RENDERERS)} |", "|---" * 5 + "|"]
+    minus = [f"| minus {BASELINE} | {' | '.join(OTHERS)} |", "|---" * 4 + "|"]
+    for metric, unit in UNITS.items():
+        n = 1 if unit == "%" else 3
+        cells = [f"{mean:.{n}f} ± {half:.{n}f} [{low:.{n}f}, {high:.{n}f}]"
+                 for mean, half, low, high in entry["means"][metric].values()]  # fmt: skip
+        means.append(f"| `{metric}` ({unit}) | {' | '.join(cells)} |")
+        cells = [f"{diff:+.{n}f} [{low:+.{n}f}, {high:+.{n}f}], p {p:.3f}"
+                 for diff, low, high, p in entry["minus"][metric].values()]  # fmt: skip
+        minus.append(f"| `{metric}` ({unit}) | {' | '.join(cells)} |")
+    events = [f"| left the road or at fault, rollouts | {' | '.join(RENDERERS)} |", means[1]]
+    for family, counts in entry["events"].items():
+        cells = [f"{number} of {rollouts}" for number, rollouts in counts.values()]
+        events.append(f"| {family} | {' | '.join(cells)} |")
+    head = f"**{policy}**: {entry['scenes']} scenes x {entry['seeds']} seeds"
+    return "\n\n".join((head, *("\n".join(lines) for lines in (means, minus, events))))
+
+
+def over_families(events: Entry) -> tuple[float, float, str, float]:
+    """Return the bounds of the difference in points with families as the unit, the family that moves
+    the difference most, and the difference without it.
+
+    The variance of the mean is that of the sums of families' residuals (Liang and Zeger,
+    Biometrika 73, 1986), times F / (F - 1), which needs a family's sum and not its scenes.
+    """
+    change = np.array([counts[FIXED][0] - counts[BASELINE][0] for counts in events.values()])
+    rollouts = np.array([counts[BASELINE][1] for counts in events.values()])
+    mean = change.sum() / rollouts.sum()
+    n = len(change)
+    variance = n / (n - 1) * np.sum((change - mean * rollouts) ** 2) / rollouts.sum() ** 2
+    half = stdtrit(n - 1, 0.975) * np.sqrt(variance)
+    rest = (change.sum() - change) / (rollouts.sum() - rollouts)
+    most = int(np.argmax(np.abs(rest - mean)))
+    return 100 * (mean - half), 100 * (mean + half), list(events)[most], 100 * rest[most]
+
+
+def statements(entry: Entry, length: str) -> tuple[str, dict[str, str]]:
+    """Return README's sentence, and the rows of docs/experiments/index.md by how they begin."""
+    share = {name: f"{cell[0]:.1f} %" for name, cell in entry["means"][EVENT].items()}
+    metres = {name: f"{cell[0]:.2f} m" for name, cell in entry["means"][DISTANCE].items()}
+    scenes, seeds, count = entry["scenes"], entry["seeds"], len(entry["events"])
+    diff, low, high = (f"{bound:+.1f}" for bound in entry["minus"][EVENT][FIXED][:3])
+    lowest, highest, family, rest = over_families(entry["events"])
+    wide = f"{lowest:+.1f} to {highest:+.1f}"
+    link = "[closed loop](fixer-closed-loop.md)"
+    sentence = (
+        f"In {scenes * seeds} rollouts of the policy `learned`, {length} ({scenes} scenes of the "
+        f"two frozen test sets, {count} families, {seeds} seeds), the share that\nleaves the road "
+        f"or is at fault in a contact is {share[BASELINE]} behind `{BASELINE}`, {share[FIXED]} "
+        f"behind `{FIXED}` and {share[TRUE]} behind `{TRUE}`. `{FIXED}` minus `{BASELINE}`: {diff} "
+        f"points, 95 % interval {low} to {high} over scenes and {wide}\nover families; {rest:+.1f} "
+        f"points without the family that moves it most, {family} "
+        "([closed loop](docs/experiments/fixer-closed-loop.md))."
     )
-
-
-def paired_cell(entry: dict[str, Any], scale: float, digits: int) -> str:
-    """Return a paired difference with its interval over scenes and its p-value."""
-    low, high = entry["ci95"]
-    return (
-        f"{scale * entry['diff']:+.{digits}f} [{scale * low:+.{digits}f}, "
-        f"{scale * high:+.{digits}f}], p {entry['p_value']:.3f}"
+    safer = (
+        f"{SAFER}`learned`, {scenes} test scenes x {seeds} seeds, {length}: off-road or at-fault "
+        f"contact, `{TRUE}` {share[TRUE]}, `{BASELINE}` {share[BASELINE]} | {share[FIXED]}; minus "
+        f"`{BASELINE}` {diff} points ({low} to {high}; {wide} over {count} families; {rest:+.1f} "
+        f"without {family}); without references {share[BARE]} | {link} |"
     )
-
-
-def metric_tables(summary: dict[str, Any]) -> str:
-    """Return metrics x renderers, and below it the paired differences from the baseline."""
-    others = [name for name in RENDERERS if name != BASELINE]
-    means = [f"| metric | {' | '.join(RENDERERS)} |", "|---" * (len(RENDERERS) + 1) + "|"]
-    pairs = [f"| minus {BASELINE} | {' | '.join(others)} |", "|---" * (len(others) + 1) + "|"]
-    for metric in SHOWN:
-        unit = summary["metrics"][TRUE][metric]["unit"] or "%"
-        scale, digits = (1.0, 3) if unit != "%" else (100.0, 1)
-        of = [mean_cell(summary["metrics"][name][metric], scale, digits) for name in RENDERERS]
-        minus = [paired_cell(summary["paired"][name][metric], scale, digits) for name in others]
-        means.append(f"| `{metric}` ({unit}) | {' | '.join(of)} |")
-        pairs.append(f"| `{metric}` ({unit}) | {' | '.join(minus)} |")
-    return "\n".join(means) + "\n\n" + "\n".join(pairs)
-
-
-def family(row: dict[str, Any]) -> str:
-    """Return the family in a scene's name: SPLIT-FAMILY-NUMBER."""
-    return str(row["scene"]).split("-")[-2].replace("_", " ")
-
-
-def family_table(rows: list[dict[str, Any]]) -> str:
-    """Return how many rollouts of each family of scenes had the event, by renderer."""
-    lines = [
-        f"| left the road or at fault, rollouts | {' | '.join(RENDERERS)} |",
-        "|---" * (len(RENDERERS) + 1) + "|",
-    ]
-    for name in sorted({family(row) for row in rows}):
-        cells = []
-        for renderer in RENDERERS:
-            events = [
-                row[EVENT] for row in rows if family(row) == name and row["renderer"] == renderer
-            ]
-            known = [event for event in events if event is not None]
-            cells.append(f"{int(sum(known))} of {len(known)}")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Run what is missing and fill in the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    keeps = (
+        f"{KEEPS}The same rollouts: mean distance, `{TRUE}` {metres[TRUE]}, `{BASELINE}` "
+        f"{metres[BASELINE]} | {metres[FIXED]} | {link} |"
     )
-    parser.add_argument("scenes", type=Path)
-    parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
-    parser.add_argument("--policies", default="learned:5,lane-camera:5")
-    given = parser.parse_args()
-    scenes = [
-        given.scenes / split / f"{name}.yaml"
-        for split, frozen in check_scenes(given.scenes).items()
-        for name in frozen.scenes
-    ]
-    suite = given.runs / "suite.yaml"
-    given.runs.mkdir(parents=True, exist_ok=True)
-    suite.write_text(
-        yaml.safe_dump({"version": 1, "scenarios": [str(path.resolve()) for path in scenes]})
+    return sentence, {SAFER: safer, KEEPS: keeps}
+
+
+def written(record: Entry) -> dict[Path, str]:
+    """Return the pages as they should be."""
+    page, readme, index = (
+        EXPERIMENTS / "fixer-closed-loop.md",
+        REPO / "README.md",
+        EXPERIMENTS / "index.md",
     )
-    duration_us = int(yaml.safe_load(scenes[0].read_text())["timing"]["duration_us"])
-    parts = [f"{duration_us / 1e6:g} s each."]
-    for name in given.policies.split(","):
-        policy, seeds = name.split(":")
-        run = given.runs / f"{policy}-{seeds}"
-        options = ["--renderer", ",".join(RENDERERS), "--baseline", BASELINE]
-        options += ["--policy", policy, "--seeds", seeds, "--images", "none", "--resume"]
-        drive(run, [*options, str(suite)])
-        summary = json.loads((run / "summary.json").read_text())
-        rows = pq.read_table(run / "rollouts.parquet").to_pylist()
-        head = f"**{policy}**: {len(scenes)} scenes x {seeds} seeds"
-        parts.append("\n\n".join((head, metric_tables(summary), family_table(rows))))
-    RECORD.write_text(replace(RECORD.read_text(), "closed-loop", "\n\n".join(parts)))
+    length, policies = record["length"], record["policies"]
+    sentence, rows = statements(policies["learned"], length)
+    parts = "\n\n\n".join(tables(policy, entry) for policy, entry in policies.items())
+    text = index.read_text()
+    for begins, row in rows.items():
+        text = re.sub(rf"^{re.escape(begins)}.*$", row.replace("\\", r"\\"), text, flags=re.M)
+    return {
+        page: replaced(page.read_text(), "closed-loop", f"{length}.\n\n{parts}"),
+        readme: replaced(readme.read_text(), "headline", sentence),
+        index: text,
+    }
+
+
+def replaced(text: str, marker: str, content: str) -> str:
+    """Replace what stands between a marker's two comments."""
+    begin, end = f"<!-- begin {marker} -->\n", f"\n<!-- end {marker} -->"
+    before, _, rest = text.partition(begin)
+    return before + begin + content + end + rest.partition(end)[2]
 
 
 if __name__ == "__main__":
-    main()
+    record = json.loads(RECORD.read_text())
+    runs = [Path(word) for word in sys.argv[1:] if word != "--check"]
+    record["policies"] |= dict(map(read_run, runs))
+    if runs:
+        RECORD.write_text(json.dumps(record, indent=1) + "\n")
+    stale = [path for path, text in written(record).items() if path.read_text() != text]
+    if "--check" in sys.argv:
+        sys.exit("stale: " + ", ".join(map(str, stale)) if stale else 0)
+    for path in stale:
+        path.write_text(written(record)[path])
