@@ -11,12 +11,12 @@ true. A classical test stands beside a rule where it keeps its level for that ki
 from __future__ import annotations
 
 import math
-import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
+from pages import DOCS, replaced, table
 from scipy.stats import ttest_1samp
 
 from alpasim_plugin.core.seeding import stream
@@ -29,7 +29,7 @@ from evaluators.statistics.intervals import TAIL, exact_rate, t_interval
 from evaluators.statistics.paired import compare, flag_interval, reach_of
 from evaluators.statistics.verdicts import ALPHA, sign_flip, sign_test
 
-PAGE = Path(__file__).resolve().parents[1] / "experiments" / "verdict-error.md"
+PAGE = DOCS / "experiments" / "verdict-error.md"
 METRES, RATE, PROGRESS = (METRICS[n] for n in ("lateral_distance_m", "offroad", "progress"))
 Draw = Callable[[np.random.Generator, int], F64]  # generator, scenes -> differences
 
@@ -104,78 +104,54 @@ def share(hits: Iterable[bool]) -> str:
     return f"{100 * float(np.mean(list(hits))):.1f}"
 
 
-def row(words: str, cells: Iterable[str]) -> str:
-    """Return a row of a table."""
-    return f"| {words} | " + " | ".join(cells) + " |"
-
-
-def head(words: str, scenes: Sequence[int]) -> list[str]:
-    """Return the head of a table with a column for each number of scenes."""
-    return [row(words, (f"{n} scenes" for n in scenes)), "|---|" + "---:|" * len(scenes)]
-
-
-def differs(repeats: int) -> list[str]:
+def differs(g: np.random.Generator, n: int, repeats: int, *case: Any) -> str:
     """Measure "differs on these scenes"."""
-    scenes = (6, 14, 42, 100)
-    lines = head("differences", scenes)
-    for words, family, effect, classical in (
-        ("0.1 m, spread 0.2 m; t test", normal, 0.1, t_test),
-        ("0.1 m, tails of t(2); t test", heavy, 0.1, t_test),
-        ("rate +10 points, 1 seed; McNemar", lambda m: seeds(m, 1), 0.1, signs),
-        ("rate +10 points, 5 seeds; sign test", lambda m: seeds(m, 5), 0.1, signs),
-    ):
-        cells = []
-        for n in scenes:
-            g = stream(words, n, "docs/calibration")
-            null = [sign_flip(family(0.0)(g, n))[0] <= ALPHA for _ in range(repeats)]
-            drawn = [family(effect)(g, n) for _ in range(repeats // 2)]
-            own = [sign_flip(x)[0] <= ALPHA for x in drawn]
-            other = [classical(x) <= ALPHA for x in drawn]
-            cells.append(" / ".join(map(share, (null, own, other))))
-        lines.append(row(words, cells))
-    return lines
+    null, effect, classical = case
+    alike = [sign_flip(null(g, n))[0] <= ALPHA for _ in range(repeats)]
+    drawn = [effect(g, n) for _ in range(repeats // 2)]
+    own = [sign_flip(x)[0] <= ALPHA for x in drawn]
+    return " / ".join(map(share, (alike, own, [classical(x) <= ALPHA for x in drawn])))
 
 
-def verdicts(repeats: int) -> list[str]:
+def verdicts(g: np.random.Generator, n: int, repeats: int, *case: Any) -> str:
     """Measure `non-inferior` and `worse`."""
-    scenes = (42, 100, 400)
-    lines = head("verdict, margin, differences", scenes)
-    quiet, noise = rare(0.0, 1.0), normal(0.0)
-    for words, answer, metric, margin, at_margin, truth in (
-        ("0.1 m: all alike, spread 0.2 m", "non-inferior", METRES, 0.1, normal(0.1), noise),
-        ("0.1 m: 2.5 % of scenes by 4 m", "non-inferior", METRES, 0.1, rare(0.1, 4.0), quiet),
-        ("0.1 m: 1 % of scenes by 15 m", "non-inferior", METRES, 0.1, rare(0.15, 15.0), quiet),
-        ("5 points: 5 % of scenes", "non-inferior", RATE, 0.05, rare(0.05, 1.0), quiet),
-        ("5 points, 5 seeds", "non-inferior", RATE, 0.05, seeds(0.083, 5), quiet),
-        ("0.05 of progress: 10 % by half", "non-inferior", PROGRESS, 0.05, rare(0.05, 0.5), quiet),
-        ("0.1 m: 1 m, spread 0.2 m", "worse", METRES, 0.1, normal(0.1), normal(1.0)),
-        ("5 points: 30 % of scenes", "worse", RATE, 0.05, rare(0.05, 1.0), rare(0.3, 1.0)),
-    ):
-        sign = -1 if answer == "worse" else 1
-        reach = reach_of(metric, margin)
-        cells = []
-        for n in scenes:
-            g = stream(words, n, "docs/calibration")
-            false = [at_margin(g, n) for _ in range(repeats)]
-            true = [truth(g, n) for _ in range(repeats // 4)]
-            given = [
-                [verdict_on(x, metric, margin) == answer for x in some] for some in (false, true)
-            ]
-            bounds = np.array([classical_bounds(sign * x, reach) for x in true])
-            best = 100 * (bounds < sign * margin).mean(axis=0).max()
-            cells.append(f"{share(given[0])} / {share(given[1])} / {best:.1f}")
-        lines.append(row(f"`{answer}`, {words}", cells))
-    return lines
+    answer, metric, margin, at_margin, truth = case
+    sign = -1 if answer == "worse" else 1
+    false = [at_margin(g, n) for _ in range(repeats)]
+    true = [truth(g, n) for _ in range(repeats // 4)]
+    given = [share(verdict_on(x, metric, margin) == answer for x in some) for some in (false, true)]
+    bounds = np.array([classical_bounds(sign * x, reach_of(metric, margin)) for x in true])
+    best = 100 * (bounds < sign * margin).mean(axis=0).max()
+    return f"{given[0]} / {given[1]} / {best:.1f}"
 
 
-def stops(g: np.random.Generator, n: int) -> F64:
-    """Draw progress of which one in ten stops early."""
-    return np.where(g.random(n) < 0.1, g.uniform(0.0, 0.8, n), 1.0)
+def intervals(g: np.random.Generator, n: int, repeats: int, *case: Any) -> str:
+    """Measure the intervals of a mean."""
+    metric, truth, draw = case
+    held, by_t = [], []
+    for x in (draw(g, n) for _ in range(repeats)):
+        means = x.reshape(n, -1).mean(axis=1)
+        own = mean_interval(means, metric) if metric else flag_interval(
+            x.ravel(), np.repeat(np.arange(n), x.shape[1]))  # fmt: skip
+        low, high = own.bounds or (0.0, 0.0)
+        held.append(low <= truth <= high)
+        low, high = t_interval(means).bounds or (means[0], means[0])
+        by_t.append(low <= truth <= high)
+    return f"{share(held)} / {share(by_t)}"
 
 
-def jumps(g: np.random.Generator, n: int) -> F64:
-    """Draw distances of which 2 % are longer by 3 m."""
-    return 0.1 + 0.02 * g.random(n) + np.where(g.random(n) < 0.02, 3.0, 0.0)
+def betting(g: np.random.Generator, n: int, repeats: int, *case: Any) -> str:
+    """Measure ``--until-decided`` with a ceiling of n scenes."""
+    reach, margin, at_margin, truth = case
+    plan = Plan(margin, n, ALPHA)
+    answers = []
+    for draw in (at_margin, truth):
+        x = np.clip([draw(g, n) for _ in range(repeats)], -reach, reach)
+        draws = Draws(-x, reach)
+        capital = log_capital(draws, -margin, bet_sizes(draws, -margin, plan))
+        answers.append(capital.max(axis=-1) >= plan.log_bar)
+    fixed = [min(classical_bounds(one, reach)) < margin for one in x[:200]]
+    return " / ".join(map(share, (*answers, fixed)))
 
 
 def always(g: np.random.Generator, n: int) -> F64:
@@ -184,64 +160,54 @@ def always(g: np.random.Generator, n: int) -> F64:
     return (g.random((n, 10)) < chance[:, None]).astype(float)
 
 
-def intervals(repeats: int) -> list[str]:
-    """Measure the intervals of a mean."""
-    scenes = (3, 6, 12, 20, 60)
-    lines = head("scene means", scenes)
-    for words, metric, truth, draw in (
-        ("progress, one drive in ten stops early", PROGRESS, 0.94, stops),
-        ("metres, 2 % of scenes by 3 m", METRES, 0.17, jumps),
-        ("rate of 10 %, 1 seed", RATE, 0.1, lambda g, n: (g.random(n) < 0.1).astype(float)),
-        ("rate of 10 %, 5 seeds, correlated", RATE, 0.1,
-         lambda g, n: g.binomial(5, g.beta(0.3, 2.7, n)) / 5.0),
-        ("rate, 10 seeds, always in 10 % of scenes, 5 % in others", RATE, 0.145, always),
-        ("difference of that rate from 0", None, 0.145, always),
-    ):  # fmt: skip
-        cells = []
-        for n in scenes:
-            g = stream(words, n, "docs/calibration")
-            held, by_t = [], []
-            for x in (draw(g, n) for _ in range(repeats)):
-                means = x.reshape(n, -1).mean(axis=1)
-                own = mean_interval(means, metric) if metric else flag_interval(
-                    x.ravel(), np.repeat(np.arange(n), x.shape[1]))  # fmt: skip
-                low, high = own.bounds or (0.0, 0.0)
-                held.append(low <= truth <= high)
-                low, high = t_interval(means).bounds or (means[0], means[0])
-                by_t.append(low <= truth <= high)
-            cells.append(f"{share(held)} / {share(by_t)}")
-        lines.append(row(words, cells))
-    return lines
-
-
-def betting(repeats: int) -> list[str]:
-    """Measure ``--until-decided`` with a ceiling of 400 scenes."""
-    columns = ("wrong", "right", "a fixed number of scenes")
-    lines = [row("margin, differences", columns), "|---|" + "---:|" * 3]
-    for words, reach, margin, at_margin, truth in (
-        ("0.1 m: spread 0.2 m", 4.0, 0.1, normal(0.1), normal(0.0)),
-        ("0.1 m: 2.5 % of scenes by 4 m", 4.0, 0.1, rare(0.1, 4.0), rare(0.0, 1.0)),
-        ("5 points: 5 % of scenes", 1.0, 0.05, rare(0.05, 1.0), rare(0.0, 1.0)),
-        ("5 points, 5 seeds", 1.0, 0.05, seeds(0.083, 5), seeds(0.0, 5)),
-    ):
-        g = stream(words, 0, "docs/calibration")
-        plan = Plan(margin, 400, ALPHA)
-        answers = []
-        for draw in (at_margin, truth):
-            x = np.clip([draw(g, 400) for _ in range(repeats)], -reach, reach)
-            draws = Draws(-x, reach)
-            capital = log_capital(draws, -margin, bet_sizes(draws, -margin, plan))
-            answers.append(capital.max(axis=-1) >= plan.log_bar)
-        answers.append(np.array([min(classical_bounds(one, reach)) < margin for one in x[:200]]))
-        lines.append(row(words, map(share, answers)))
-    return lines
+QUIET, NOISE, SAFE = rare(0.0, 1.0), normal(0.0), "non-inferior"
+CASES = {
+    differs: ((6, 14, 42, 100), {
+        "0.1 m, spread 0.2 m; t test": (normal(0.0), normal(0.1), t_test),
+        "0.1 m, tails of t(2); t test": (heavy(0.0), heavy(0.1), t_test),
+        "rate +10 points, 1 seed; McNemar": (seeds(0.0, 1), seeds(0.1, 1), signs),
+        "rate +10 points, 5 seeds; sign test": (seeds(0.0, 5), seeds(0.1, 5), signs),
+    }),
+    verdicts: ((42, 100, 400), {
+        "0.1 m: all alike, spread 0.2 m": (SAFE, METRES, 0.1, normal(0.1), NOISE),
+        "0.1 m: 2.5 % of scenes by 4 m": (SAFE, METRES, 0.1, rare(0.1, 4.0), QUIET),
+        "0.1 m: 1 % of scenes by 15 m": (SAFE, METRES, 0.1, rare(0.15, 15.0), QUIET),
+        "5 points: 5 % of scenes": (SAFE, RATE, 0.05, rare(0.05, 1.0), QUIET),
+        "5 points, 5 seeds": (SAFE, RATE, 0.05, seeds(0.083, 5), QUIET),
+        "0.05 of progress: 10 % by half": (SAFE, PROGRESS, 0.05, rare(0.05, 0.5), QUIET),
+        "0.1 m: 1 m, spread 0.2 m": ("worse", METRES, 0.1, normal(0.1), normal(1.0)),
+        "5 points: 30 % of scenes": ("worse", RATE, 0.05, rare(0.05, 1.0), rare(0.3, 1.0)),
+    }),
+    intervals: ((3, 6, 12, 20, 60), {
+        "progress, one drive in ten stops early": (PROGRESS, 0.94, lambda g, n: np.where(
+            g.random(n) < 0.1, g.uniform(0.0, 0.8, n), 1.0)),
+        "metres, 2 % of scenes by 3 m": (METRES, 0.17, lambda g, n: (
+            0.1 + 0.02 * g.random(n) + np.where(g.random(n) < 0.02, 3.0, 0.0))),
+        "rate of 10 %, 1 seed": (RATE, 0.1, lambda g, n: (g.random(n) < 0.1).astype(float)),
+        "rate of 10 %, 5 seeds, correlated": (RATE, 0.1, lambda g, n: (
+            g.binomial(5, g.beta(0.3, 2.7, n)) / 5.0)),
+        "rate, 10 seeds, always in 10 % of scenes, 5 % in others": (RATE, 0.145, always),
+        "difference of that rate from 0": (None, 0.145, always),
+    }),
+    betting: ((400,), {
+        "0.1 m: spread 0.2 m": (4.0, 0.1, normal(0.1), NOISE),
+        "0.1 m: 2.5 % of scenes by 4 m": (4.0, 0.1, rare(0.1, 4.0), QUIET),
+        "5 points: 5 % of scenes": (1.0, 0.05, rare(0.05, 1.0), QUIET),
+        "5 points, 5 seeds": (1.0, 0.05, seeds(0.083, 5), seeds(0.0, 5)),
+    }),
+}  # fmt: skip
 
 
 if __name__ == "__main__":
-    parts = {part.__name__: part for part in (differs, verdicts, intervals, betting)}
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
-    for name in sys.argv[2:] or parts:
-        table = "\n".join(parts[name](repeats))
-        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-        text = re.sub(f"{begin}.*?{end}", f"{begin}\n{table}\n{end}", PAGE.read_text(), flags=re.S)
-        PAGE.write_text(text)
+    text = PAGE.read_text(encoding="utf-8")
+    for measure, (scenes, cases) in CASES.items():
+        if sys.argv[2:] and measure.__name__ not in sys.argv[2:]:
+            continue
+        rows = []
+        for words, case in cases.items():
+            of = [measure(stream(words, n, "docs/calibration"), n, repeats, *case) for n in scenes]
+            rows.append([words if measure is not verdicts else f"`{case[0]}`, {words}", *of])
+        head = ["differences", *(f"{n} scenes" for n in scenes)]
+        text = replaced(text, measure.__name__, table(head, rows, "---:"))
+    PAGE.write_text(text, encoding="utf-8")

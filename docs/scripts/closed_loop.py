@@ -1,35 +1,31 @@
-"""Write the tables of docs/experiments/fixer-closed-loop.md, and what README.md and
-docs/experiments/index.md say of them.
+"""Write the tables of docs/experiments/fixer-closed-loop.md, and README's sentence about driving.
 
     python docs/scripts/closed_loop.py [--check] [RUN...]
 
 Each RUN is a run of one policy over the frozen scenes. Its numbers go into the record beside that
-page, from which the pages are made. With ``--check`` nothing is written, and the exit code is 1
+page, of which the pages are made. With ``--check`` nothing is written, and the exit code is 1
 where a page is stale.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import sys
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
+import pandas as pd
+from pages import DOCS, replaced, table, write
 from scipy.special import stdtrit
 
-REPO = Path(__file__).resolve().parents[2]
-EXPERIMENTS = REPO / "docs" / "experiments"
-RECORD = EXPERIMENTS / "closed-loop.json"
+RECORD = DOCS / "experiments" / "closed-loop.json"
 TRUE, BASELINE, FIXED, BARE = RENDERERS = ("clean", "3dgs", "onefixer", "onefixer[references=0]")
 OTHERS = (TRUE, FIXED, BARE)
-EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
-UNITS = {"collision_at_fault": "%", "offroad": "%", EVENT: "%", DISTANCE: "m", "progress": "%",
-         "min_distance_to_obstacle_m": "m"}  # fmt: skip
-SAFER, KEEPS = "| Does it make driving safer? ", "| Does it keep the car on its path? "
+POLICY = "learned"  # of README's sentence
+EVENT = "offroad_or_collision_at_fault"
+UNITS = {"collision_at_fault": "%", "offroad": "%", EVENT: "%", "lateral_distance_m": "m",
+         "progress": "%", "min_distance_to_obstacle_m": "m"}  # fmt: skip
 Entry = dict[str, Any]
 
 
@@ -38,57 +34,50 @@ def read_run(run: Path) -> tuple[str, Entry]:
     with bounds and p-value, and for each family of scenes the rollouts with the event.
     """
     summary = json.loads((run / "summary.json").read_text())
-    rows = pq.read_table(run / "rollouts.parquet").to_pylist()
-    entry: Entry = {"scenes": len({row["scene"] for row in rows}),
-                    "seeds": len({row["seed"] for row in rows}), "means": {}, "minus": {}}  # fmt: skip
-    for metric, unit in UNITS.items():
-        scale = 100 if unit == "%" else 1
-        means = {name: summary["metrics"][name][metric] for name in RENDERERS}
-        pairs = {name: summary["paired"][name][metric] for name in OTHERS}
-        entry["means"][metric] = {
-            name: [scale * one["mean"], scale * one["ci95"], *_scaled(one["ci95_clustered"], scale)]
-            for name, one in means.items()
-        }
-        entry["minus"][metric] = {
-            name: [scale * one["diff"], *_scaled(one["ci95"], scale), one["p_value"]]
-            for name, one in pairs.items()
-        }
-    events: Counter[tuple[str, str]] = Counter()
-    rollouts: Counter[tuple[str, str]] = Counter()
-    for row in rows:
-        if row[EVENT] is not None:
-            key = row["scene"].split("-")[-2].replace("_", " "), row["renderer"]
-            events[key] += int(row[EVENT])
-            rollouts[key] += 1
+    rows = pd.read_parquet(run / "rollouts.parquet")
+    rows["family"] = rows["scene"].str.split("-").str[-2].str.replace("_", " ")
+    counts = (
+        rows.astype({EVENT: float}).groupby(["family", "renderer"])[EVENT].agg(["sum", "count"])
+    )
+    entry: Entry = {key + "s": rows[key].nunique() for key in ("scene", "seed")}
+    for kind, of, names, keys in (
+        ("means", "metrics", RENDERERS, ("mean", "ci95", "ci95_clustered")),
+        ("minus", "paired", OTHERS, ("diff", "ci95", "p_value")),
+    ):
+        entry[kind] = {
+            metric: {name: list(np.hstack([summary[of][name][metric][key] for key in keys]))
+                     for name in names} for metric in UNITS
+        }  # fmt: skip
     entry["events"] = {
-        family: {name: [events[family, name], rollouts[family, name]] for name in RENDERERS}
-        for family in sorted({family for family, _ in rollouts})
+        family: {name: [int(count) for count in counts.loc[family, name]] for name in RENDERERS}
+        for family in rows["family"].sort_values().unique()
     }
-    return rows[0]["policy"], entry
-
-
-def _scaled(bounds: list[float], scale: float) -> list[float]:
-    return [scale * bound for bound in bounds]
+    return rows["policy"].iloc[0], entry
 
 
 def tables(policy: str, entry: Entry) -> str:
     """Return a policy's three tables."""
-    means = [f"| metric | {' | '.join(RENDERERS)} |", "|---" * 5 + "|"]
-    minus = [f"| minus {BASELINE} | {' | '.join(OTHERS)} |", "|---" * 4 + "|"]
+    means, minus = [], []
     for metric, unit in UNITS.items():
-        n = 1 if unit == "%" else 3
-        cells = [f"{mean:.{n}f} ± {half:.{n}f} [{low:.{n}f}, {high:.{n}f}]"
-                 for mean, half, low, high in entry["means"][metric].values()]  # fmt: skip
-        means.append(f"| `{metric}` ({unit}) | {' | '.join(cells)} |")
-        cells = [f"{diff:+.{n}f} [{low:+.{n}f}, {high:+.{n}f}], p {p:.3f}"
-                 for diff, low, high, p in entry["minus"][metric].values()]  # fmt: skip
-        minus.append(f"| `{metric}` ({unit}) | {' | '.join(cells)} |")
-    events = [f"| left the road or at fault, rollouts | {' | '.join(RENDERERS)} |", means[1]]
-    for family, counts in entry["events"].items():
-        cells = [f"{number} of {rollouts}" for number, rollouts in counts.values()]
-        events.append(f"| {family} | {' | '.join(cells)} |")
-    head = f"**{policy}**: {entry['scenes']} scenes x {entry['seeds']} seeds"
-    return "\n\n".join((head, *("\n".join(lines) for lines in (means, minus, events))))
+        n, scale = (1, 100) if unit == "%" else (3, 1)
+        name = f"`{metric}` ({unit})"
+        cells = [[f"{scale * value:.{n}f}" for value in cell]
+                 for cell in entry["means"][metric].values()]  # fmt: skip
+        means.append(
+            [name, *(f"{mean} ± {half} [{low}, {high}]" for mean, half, low, high in cells)]
+        )
+        cells = [[*(f"{scale * value:+.{n}f}" for value in bounds), f"{p:.3f}"]
+                 for *bounds, p in entry["minus"][metric].values()]  # fmt: skip
+        minus.append([name, *(f"{diff} [{low}, {high}], p {p}" for diff, low, high, p in cells)])
+    events = [[family, *(f"{number} of {rollouts}" for number, rollouts in counts.values())]
+              for family, counts in entry["events"].items()]  # fmt: skip
+    parts = (
+        f"**{policy}**: {entry['scenes']} scenes x {entry['seeds']} seeds\n",
+        table(["metric", *RENDERERS], means),
+        table([f"minus {BASELINE}", *OTHERS], minus),
+        table(["left the road or at fault, rollouts", *RENDERERS], events),
+    )
+    return "\n".join(parts)
 
 
 def over_families(events: Entry) -> tuple[float, float, str, float]:
@@ -109,72 +98,39 @@ def over_families(events: Entry) -> tuple[float, float, str, float]:
     return 100 * (mean - half), 100 * (mean + half), list(events)[most], 100 * rest[most]
 
 
-def statements(entry: Entry, length: str) -> tuple[str, dict[str, str]]:
-    """Return README's sentence, and the rows of docs/experiments/index.md by how they begin."""
-    share = {name: f"{cell[0]:.1f} %" for name, cell in entry["means"][EVENT].items()}
-    metres = {name: f"{cell[0]:.2f} m" for name, cell in entry["means"][DISTANCE].items()}
-    scenes, seeds, count = entry["scenes"], entry["seeds"], len(entry["events"])
-    diff, low, high = (f"{bound:+.1f}" for bound in entry["minus"][EVENT][FIXED][:3])
+def sentence(entry: Entry, length: str) -> str:
+    """Return README's sentence."""
+    share = {name: f"{100 * cell[0]:.1f} %" for name, cell in entry["means"][EVENT].items()}
+    diff, low, high = (f"{100 * bound:+.1f}" for bound in entry["minus"][EVENT][FIXED][:3])
     lowest, highest, family, rest = over_families(entry["events"])
-    wide = f"{lowest:+.1f} to {highest:+.1f}"
-    link = "[closed loop](fixer-closed-loop.md)"
-    sentence = (
-        f"In {scenes * seeds} rollouts of the policy `learned`, {length} ({scenes} scenes of the "
-        f"two frozen test sets, {count} families, {seeds} seeds), the share that\nleaves the road "
-        f"or is at fault in a contact is {share[BASELINE]} behind `{BASELINE}`, {share[FIXED]} "
-        f"behind `{FIXED}` and {share[TRUE]} behind `{TRUE}`. `{FIXED}` minus `{BASELINE}`: {diff} "
-        f"points, 95 % interval {low} to {high} over scenes and {wide}\nover families; {rest:+.1f} "
-        f"points without the family that moves it most, {family} "
-        "([closed loop](docs/experiments/fixer-closed-loop.md))."
+    scenes, seeds, families = entry["scenes"], entry["seeds"], len(entry["events"])
+    return (
+        f"In {scenes * seeds} rollouts of the policy `{POLICY}`, {length} ({scenes} scenes of the "
+        f"two frozen test sets, {families} families, {seeds} seeds), the share that\nleaves the "
+        f"road or is at fault in a contact is {share[BASELINE]} behind `{BASELINE}`, "
+        f"{share[FIXED]} behind `{FIXED}` and {share[TRUE]} behind `{TRUE}`. `{FIXED}` minus "
+        f"`{BASELINE}`: {diff} points, 95 % interval {low} to {high} over scenes and {lowest:+.1f} "
+        f"to {highest:+.1f}\nover families; {rest:+.1f} points without the family that moves it "
+        f"most, {family} ([closed loop](docs/experiments/fixer-closed-loop.md)).\n"
     )
-    safer = (
-        f"{SAFER}`learned`, {scenes} test scenes x {seeds} seeds, {length}: off-road or at-fault "
-        f"contact, `{TRUE}` {share[TRUE]}, `{BASELINE}` {share[BASELINE]} | {share[FIXED]}; minus "
-        f"`{BASELINE}` {diff} points ({low} to {high}; {wide} over {count} families; {rest:+.1f} "
-        f"without {family}); without references {share[BARE]} | {link} |"
-    )
-    keeps = (
-        f"{KEEPS}The same rollouts: mean distance, `{TRUE}` {metres[TRUE]}, `{BASELINE}` "
-        f"{metres[BASELINE]} | {metres[FIXED]} | {link} |"
-    )
-    return sentence, {SAFER: safer, KEEPS: keeps}
 
 
 def written(record: Entry) -> dict[Path, str]:
     """Return the pages as they should be."""
-    page, readme, index = (
-        EXPERIMENTS / "fixer-closed-loop.md",
-        REPO / "README.md",
-        EXPERIMENTS / "index.md",
-    )
+    page, readme = DOCS / "experiments" / "fixer-closed-loop.md", DOCS.parent / "README.md"
     length, policies = record["length"], record["policies"]
-    sentence, rows = statements(policies["learned"], length)
-    parts = "\n\n\n".join(tables(policy, entry) for policy, entry in policies.items())
-    text = index.read_text()
-    for begins, row in rows.items():
-        text = re.sub(rf"^{re.escape(begins)}.*$", row.replace("\\", r"\\"), text, flags=re.M)
+    parts = [tables(policy, entry) for policy, entry in policies.items()]
+    text = "\n\n".join([f"{length}.", *parts])
+    claim = sentence(policies[POLICY], length)
     return {
-        page: replaced(page.read_text(), "closed-loop", f"{length}.\n\n{parts}"),
-        readme: replaced(readme.read_text(), "headline", sentence),
-        index: text,
+        page: replaced(page.read_text(encoding="utf-8"), "closed-loop", text),
+        readme: replaced(readme.read_text(encoding="utf-8"), "headline", claim),
     }
-
-
-def replaced(text: str, marker: str, content: str) -> str:
-    """Replace what stands between a marker's two comments."""
-    begin, end = f"<!-- begin {marker} -->\n", f"\n<!-- end {marker} -->"
-    before, _, rest = text.partition(begin)
-    return before + begin + content + end + rest.partition(end)[2]
 
 
 if __name__ == "__main__":
     record = json.loads(RECORD.read_text())
-    runs = [Path(word) for word in sys.argv[1:] if word != "--check"]
-    record["policies"] |= dict(map(read_run, runs))
-    if runs:
-        RECORD.write_text(json.dumps(record, indent=1) + "\n")
-    stale = [path for path, text in written(record).items() if path.read_text() != text]
-    if "--check" in sys.argv:
-        sys.exit("stale: " + ", ".join(map(str, stale)) if stale else 0)
-    for path in stale:
-        path.write_text(written(record)[path])
+    record["policies"] |= dict(read_run(Path(word)) for word in sys.argv[1:] if word != "--check")
+    if "--check" not in sys.argv:
+        RECORD.write_text(json.dumps(record) + "\n")
+    write(written(record))

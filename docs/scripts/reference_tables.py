@@ -8,12 +8,11 @@ With ``--check`` nothing is written, and the exit code is 1 where a page is stal
 
 from __future__ import annotations
 
-import re
-import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+from pages import DOCS, replaced, table, write
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -23,18 +22,10 @@ from evaluators.scores.table import BENCHMARKS
 from scenarios.schema import models
 from scenarios.schema_parts import Part
 
-DOCS = Path(__file__).resolve().parents[1]
 EVERY_VERB = ("--json", "--debug", "--help")
 OBSTACLES_UNKNOWN = METRICS["collision_any"].invalid  # long, and of every contact
 TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; bars inside of cells are escaped."""
-    lines = [["---"] * len(head), *(tuple(row) for row in rows)]
-    cells = [[str(cell).replace("|", r"\|") for cell in line] for line in lines]
-    return "\n".join(f"|{'|'.join(line)}|" for line in [list(head), *cells]) + "\n"
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -50,19 +41,16 @@ def verb_section(name: str, command: Any) -> str:
     """Return a verb's heading, what it does, and its options."""
     rows = []
     for option in command.params:
-        is_argument = option.param_type_name == "argument"
-        names = (
-            [option.metavar or option.name.upper()]
-            if is_argument
-            else [*option.opts, *option.secondary_opts]
-        )
-        is_newest = option.help == "A run folder; default: the newest."  # said once, above
+        names = [*option.opts, *option.secondary_opts]
+        if option.param_type_name == "argument":
+            names = [option.metavar or option.name.upper()]
+        meaning = option.help or ""
+        is_newest = meaning == "A run folder; default: the newest."  # said once, above
         if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB) or is_newest:
             continue
         shown = ", ".join(f"`{name}`" for name in names)
-        again = " Repeatable."
-        is_repeatable = (option.help or "").endswith(again)
-        rows.append((shown + "..." * is_repeatable, (option.help or "").removesuffix(again)))
+        again = "..." if meaning.endswith(" Repeatable.") else ""
+        rows.append((shown + again, meaning.removesuffix(" Repeatable.")))
     text = " ".join((command.help or "").partition("\n\n")[0].split())
     options = "\n" + table(("option", "meaning"), rows) if rows else ""
     return f"## {name}\n{text}\n{options}"
@@ -157,36 +145,13 @@ def key_tables() -> str:
 
 def written() -> dict[Path, str]:
     """Return the pages as they should be."""
-    tables = {
-        "cli.md": {"options": cli_tables()},
-        "metrics.md": {"metrics": metric_table()},
-        "scenario-files.md": {"keys": key_tables()},
+    tables = {"cli": ("options", cli_tables()), "metrics": ("metrics", metric_table()),
+              "scenario-files": ("keys", key_tables())}  # fmt: skip
+    return {
+        (page := DOCS / f"{name}.md"): replaced(page.read_text(encoding="utf-8"), block, content)
+        for name, (block, content) in tables.items()
     }
-    pages = {}
-    for page, parts in tables.items():
-        text = (DOCS / page).read_text(encoding="utf-8")
-        for name, content in parts.items():
-            pattern = rf"(<!-- begin {name}\b[^\n]*-->\n).*?(<!-- end {name} -->)"
-            text, found = re.subn(
-                pattern, lambda match, new=content: match[1] + new + match[2], text, flags=re.S
-            )
-            assert found == 1, f"{page} has {found} blocks called {name}"
-        pages[DOCS / page] = text
-    return pages
-
-
-def main() -> None:
-    """Write the pages, or compare them."""
-    stale = {
-        path: text for path, text in written().items() if path.read_text(encoding="utf-8") != text
-    }
-    if "--check" in sys.argv[1:]:
-        for path in stale:
-            print(f"{path} is stale: run docs/scripts/reference_tables.py")
-        sys.exit(1 if stale else 0)
-    for path, text in stale.items():
-        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    write(written())

@@ -20,7 +20,7 @@ class Refuse(importlib.abc.MetaPathFinder):
 sys.meta_path.insert(0, Refuse())
 """
 IMPORT_ALL = """
-for room in ("fixers", "nets", "renderers"):
+for room in ("fixers", "renderers"):
     package = importlib.import_module("alpasim_plugin." + room)
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(module.name)

@@ -260,17 +260,9 @@ def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road):
 
 
 @pytest.mark.parametrize("mode", ["speculative", "chunk"])
-@pytest.mark.parametrize(
-    ("fixer", "found"),
-    [
-        (Raises, "RuntimeError: out of memory"),
-        (LosesAFrame, "4 frames came back"),
-        (ShiftsTime, "'front' at 0 us came back as 'front' at 1 us"),
-        (GivesFloats, r"rgb came back as float32 \(64, 96, 3\), not uint8"),
-    ],
-)
-def test_a_fixer_that_breaks_its_contract_is_named(straight_road, mode, fixer, found):
-    with pytest.raises(FixerError, match=found) as caught:
+@pytest.mark.parametrize("fixer", [Raises, LosesAFrame, ShiftsTime, GivesFloats])
+def test_a_fixer_that_breaks_its_contract_is_named(straight_road, mode, fixer):
+    with pytest.raises(FixerError) as caught:
         drive(straight_road, fixer=fixer, mode=mode)
     assert caught.value.failure_class == "fixer"
     assert fixer.__name__ in caught.value.message
