@@ -77,7 +77,10 @@ def objectives_of(recipe):
 
 def clips_of(data, folder):
     return LatentClips(
-        PairDataset(data, "train").sequences, TinyVAE.from_state_dict(load_weights(data / "vae.safetensors")), FORM, folder
+        PairDataset(data, "train").sequences,
+        TinyVAE.from_state_dict(load_weights(data / "vae.safetensors")),
+        FORM,
+        folder,
     )
 
 
