@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import shlex
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, speeds, transform_points
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import inside, parsing, read_bytes, real
-from alpasim_plugin.core.types import F64, CameraSpec, LoggedPlan, RolloutLog
+from alpasim_plugin.core.types import F64, CameraSpec, LoggedImage, LoggedPlan, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
 from alpasim_plugin.log.images import smaller
@@ -257,36 +258,34 @@ def _document(run: Run, cause: Cause, log: RolloutLog) -> JsonObject:
     """Return what the script of the page draws."""
     content, recorded = scene_of(run, cause.rollout.scene)
     place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
-    camera = next(iter(log.info["cameras"]), None)
+    cameras = log.info["cameras"]
     return {
         "own": cause.rollout.renderer,
         "map": map_data(content, recorded, place),
         "users": [user_data(actor, place) for actor in log.actors.values()],
         "ego": place.track(log.ego),
         "rear": round(100 * float(log.T_rig_box[0, 3])),
-        "lens": None if camera is None else lens_data(camera, WIDTH_PX),
+        "lens": lens_data(cameras[0], WIDTH_PX) if cameras else None,
         "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
-        "queries": _queries(run, cause, log, camera, place),
+        "queries": _queries(run, cause, log, place),
     }
 
 
-def _queries(
-    run: Run, cause: Cause, log: RolloutLog, camera: CameraSpec | None, place: Place
-) -> list[JsonObject]:
+def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[JsonObject]:
     """Return the queries of a log that the page shows, with what the run stored of them: times in
     milliseconds, lines in world centimetres, boxes in pixels of the page's image.
     """
     rollout = cause.rollout
-    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
-    images = [image for image in log.images if camera is not None and image.camera == camera.name]
-    ends_us = np.array([image.end_us for image in images])
+    cameras = log.info["cameras"]
+    scale = min(1.0, WIDTH_PX / cameras[0].width) if cameras else 1.0
+    taken = [[one for one in log.images if one.camera == camera.name] for camera in cameras]
     driven = speeds(log.ego)
     said = run.file_of(rollout, DEBUG_NAME)
     debug = {} if said is None else {row["t_us"]: row for row in read_facts(said)}
     others = same_poses(run, rollout)
 
-    def jpeg_of(data: bytes) -> str:
-        if scale == 1.0 and data.startswith(JPEG_START):
+    def jpeg_of(data: bytes, camera: CameraSpec) -> str:
+        if camera.width <= WIDTH_PX and data.startswith(JPEG_START):
             return base64.b64encode(data).decode()
         return jpeg(smaller(decode_image(data, "a camera frame"), WIDTH_PX))
 
@@ -300,14 +299,21 @@ def _queries(
             for name, boxes in own["boxes"]
             for box in boxes
         ]
-        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
+        newest = [_newest(images, plan.now_us) for images in taken]
         seen: dict[str, JsonObject] = {}
-        if newest >= 0:
-            t_us = images[newest].end_us
-            shown = {rollout.renderer: images[newest].data}
+        if newest and newest[0] is not None:
+            t_us = newest[0].end_us
+            shown = {rollout.renderer: newest[0].data}
             shown |= {name: at[t_us] for name, at in others.items() if t_us in at}
             t_ms = place.ms([t_us])[0]
-            seen = {name: {"jpeg": jpeg_of(data), "t": t_ms} for name, data in shown.items()}
+            seen = {
+                name: {"jpeg": jpeg_of(data, cameras[0]), "t": t_ms} for name, data in shown.items()
+            }
+        beside = [
+            [camera.name, jpeg_of(image.data, camera)]
+            for camera, image in zip(cameras[1:], newest[1:], strict=True)
+            if image is not None
+        ]
         queries.append(
             {
                 "t": place.ms([plan.now_us])[0],
@@ -315,10 +321,17 @@ def _queries(
                 "route": _in_world(pose, plan.route, place),
                 "plan": plan_lines(plan, place),
                 "seen": seen,
+                "beside": beside,
                 "said": own,
             }
         )
     return queries
+
+
+def _newest(images: Sequence[LoggedImage], t_us: int) -> LoggedImage | None:
+    """Return the last image, of a camera's in order of time, that was complete at a time."""
+    count = bisect_right(images, t_us, key=lambda image: image.end_us)
+    return images[count - 1] if count else None
 
 
 def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:

@@ -4,7 +4,10 @@ failed, and a variant that repairs it, side by side.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import U8, RolloutLog
@@ -24,13 +27,13 @@ WIDTH_PX = 420
 
 @dataclass(frozen=True)
 class Shot:
-    """One camera image.
+    """The images of a rollout's cameras.
 
     Attributes:
         t_s: Seconds since the first camera frame.
         outcome: How that rollout ended.
         tone: Colour of the outcome.
-        src: The image as a ``data:`` address.
+        src: The images as one, a ``data:`` address.
         link: Where the rollout is shown, relative to the run folder.
     """
 
@@ -93,8 +96,8 @@ def _log_of(run: Run, rollout: Rollout) -> RolloutLog | None:
 def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
     log = _log_of(run, rollout)
     cameras = [] if log is None else sources(run, rollout, log)
-    image = _frame_at(cameras[0], t_us) if cameras else None
-    if log is None or image is None:
+    images = [image for image in (_frame_at(one, t_us) for one in cameras) if image is not None]
+    if log is None or not images:
         return None
     outcomes = outcomes_of(rollout)
     return Shot(
@@ -103,9 +106,23 @@ def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
         (t_us - log.render_start_us) * 1e-6,
         in_words(outcomes),
         "worse" if outcomes else "better",
-        f"data:image/jpeg;base64,{jpeg(smaller(image, WIDTH_PX))}",
+        f"data:image/jpeg;base64,{jpeg(_together(images))}",
         run.href(rollout, WHY_NAME) or run.href(rollout),
     )
+
+
+def _together(images: Sequence[U8]) -> U8:
+    """Return the first camera's image above a row of the others'."""
+    first, *others = images
+    rows = [smaller(first, WIDTH_PX)]
+    if others:
+        small = [smaller(image, rows[0].shape[1] // len(others)) for image in others]
+        row = np.zeros((max(map(len, small)), *rows[0].shape[1:]), dtype=np.uint8)
+        step = row.shape[1] // len(others)
+        for i, image in enumerate(small):
+            row[: len(image), i * step : i * step + image.shape[1]] = image
+        rows.append(row)
+    return np.concatenate(rows)
 
 
 def _frame_at(source: Source, t_us: int) -> U8 | None:

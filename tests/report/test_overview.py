@@ -235,7 +235,9 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
         manifest = {"events": [{"metric": "collision_front", "t_us": 3_300_000}]}
         (run.folder / one.path / "manifest.json").write_text(json.dumps(manifest))
     images = [
-        SimpleNamespace(camera="front", end_us=1_000_000 * k, data=grey(50 * k)) for k in range(6)
+        SimpleNamespace(camera=camera, end_us=1_000_000 * k, data=grey(level * k))
+        for k in range(6)
+        for camera, level in (("front", 50), ("left", 20))
     ]
     log = SimpleNamespace(images=images, render_start_us=500_000)
     monkeypatch.setattr(worst, "read_log", lambda path: log)
@@ -244,7 +246,8 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
     assert {(shot.scene, round(shot.t_s, 3)) for shot in shots} == {(scene, 2.8)}
     for shot in shots:
         data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
-        assert abs(float(np.mean(cv2.imdecode(data, cv2.IMREAD_COLOR))) - 150.0) < 3
+        upper, lower = np.split(cv2.imdecode(data, cv2.IMREAD_COLOR), 2)
+        np.testing.assert_allclose((upper.mean(), lower.mean()), (150.0, 60.0), atol=3)
 
 
 def test_a_missing_number_is_a_dash_and_never_zero(tmp_path):

@@ -35,7 +35,7 @@ description: A bend.
 road: {segments: [{kind: straight, length_m: 12}, {kind: arc, length_m: 60, curvature_per_m: 0.05}]}
 ego: {speed_mps: 9, cruise_mps: 9, max_lateral_accel_mps2: 5}
 environment: {buildings: 0, trees_per_100m: 0, poles_spacing_m: 0}
-cameras: [{width: 64, height: 36}]
+cameras: [{width: 64, height: 36}, {name: left, width: 32, height: 16, yaw_deg: 60}]
 timing: {duration_us: 3_000_000}
 """
 
@@ -43,7 +43,7 @@ timing: {duration_us: 3_000_000}
 class ByRoute:
     """Follows the route; the sign of its plan is wrong."""
 
-    sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
+    sensors: Sequence[SensorSpec] = (SensorSpec("front"), SensorSpec("left"))
 
     def reset(self, seed, route): ...
 
@@ -191,6 +191,8 @@ def test_a_rollout_that_broke_off_shows_its_error(tmp_path, capsys):
         page = Path(found["page"]).read_text()
         assert text in page
         assert bool(queries_of(page)) == some
+        for query in queries_of(page):
+            assert [name for name, _ in query["beside"]] == ["left"]
 
 
 def test_a_drive_that_ended_short_says_so_and_that_its_plans_stand(tmp_path, capsys):

@@ -65,12 +65,14 @@ const why = {
   tell(query) {
     const rows = [...query.said.text, ...query.said.heat.map(([name, , low, high]) => [name, `heat map from ${low} to ${high}`])];
     byId("said").replaceChildren(...rows.flatMap(([name, text]) => [make("dt", "", name), make("dd", "num", text)]));
-    byId("own-images").replaceChildren(...query.said.images.map(([name, jpeg]) => {
+    const figures = (images) => images.map(([name, jpeg]) => {
       const figure = make("figure"), image = make("img");
       Object.assign(image, { src: "data:image/jpeg;base64," + jpeg, alt: name });
       figure.append(image, make("figcaption", "small muted", name));
       return figure;
-    }));
+    });
+    byId("beside").replaceChildren(...figures(query.beside));
+    byId("own-images").replaceChildren(...figures(query.said.images));
     byId("says-nothing").hidden = rows.length + query.said.images.length + query.said.boxes.length + query.said.lines.length > 0;
   },
 
