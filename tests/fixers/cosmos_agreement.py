@@ -21,13 +21,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Marking
+from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
-from alpasim_plugin.world.paint import painted_lines
-from scenarios.recorded import SourceFiles
-from tests.fixers.cosmos_clip import read_cosmos, read_layer, read_lenses
+from tests.fixers.cosmos_clip import read_lenses, read_map, read_poses
 from tests.scenarios.ftheta_projection import RecordedLens, project_ftheta
 
 WIDTH, HEIGHT = 1280, 704
@@ -87,19 +84,9 @@ def pinhole(name):
 
 def read_clip(folder):
     """Read the clip and its lenses."""
-    log = read_cosmos(folder / "example")
-    files = SourceFiles()
-    waits = read_layer(files, folder / "example", "3d_wait_lines")
-    solid = tuple(Marking(xyz, "solid_white") for xyz, _ in painted_lines(log.lane_map))
-    lane_map = replace(
-        log.lane_map,
-        stop_lines=tuple(label.lines[0] for label in waits),  # published: implicit ones as well
-        lanes={},
-        markings=solid,
-    )
-    lenses = read_lenses(files, folder / "example")
+    source = folder / "example"
     renders = folder / "example_outputs" / "hdmap"
-    return Clip(lane_map, se3(log.ego_log.xyz, log.ego_log.quat), lenses, renders)
+    return Clip(read_map(source), read_poses(source), read_lenses(source), renders)
 
 
 def mounts():
