@@ -6,10 +6,8 @@ import pytest
 
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.wire import common_pb2, logging_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 from tests.alpasim.service_cases import StandInRenderer, hosted, in_front_of, trust_every_frame
-
-Entry = logging_pb2.LogEntry
 
 
 class RecordedRenderer(StandInRenderer):

@@ -11,8 +11,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
 from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 
-Tree = HistoryTree[tuple[bytes, ...]]
-
 
 def tree(max_bytes=1 << 30, expiry_s=60.0, clock=lambda: 0.0):
     return HistoryTree(max_bytes, expiry_s, clock)

@@ -5,7 +5,6 @@ broken.
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ from tests.examples import examples, first_of, first_rows_of
 
 VEHICLE = Vehicle()
 TRACKER = make_controller("bicycle", VEHICLE)
-Array = npt.ArrayLike
 
 
 def plan_of(t_s, x, y, yaw):

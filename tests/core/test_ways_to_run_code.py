@@ -8,8 +8,6 @@ import pickle
 import stat
 import subprocess
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +16,6 @@ import torch
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_FOLDER
 from tests.core.test_hostile_folder import DRIVE, simrun
-
-Way = Callable[[Path, "Bait"], list[list[str]]]  # (folder, bait) -> commands to try
 
 
 class Bait:

@@ -10,7 +10,6 @@ the footprint, no union, no index.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Context, Decimal, localcontext
 from itertools import pairwise
@@ -175,8 +174,6 @@ def side_at(a, b, tau, tie_m):
 
 
 # --- margin
-
-Ring = Sequence[tuple[float, float]]
 
 
 def depth_by_points(corners, rings, n=24):

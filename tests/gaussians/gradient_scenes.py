@@ -45,7 +45,6 @@ def cloud_of(splats):
 
 
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
-Gradients = dict[str, np.ndarray]
 _DEPTH_SHARE = 0.05  # weight of depths, which are metres, beside colours
 
 

@@ -105,18 +105,6 @@ class RaisesLater(Right):
         return super().act(observation)
 
 
-class ByContrast(Right):
-    """Follows the route where a picture shows anything, and loses its way where it is grey."""
-
-    def act(self, observation):
-        plan = super().act(observation)
-        return (
-            plan
-            if np.ptp(observation.frames["front"].rgb) > 9
-            else replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
-        )
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Give a run of the three in a bend."""

@@ -12,7 +12,6 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
 from alpasim_plugin.core.types import Frame
-from alpasim_plugin.lab.bench import colour_video_vdp
 from alpasim_plugin.lab.bench.real import METRICS, Judges, intervals, measure_drive, shots_of
 from alpasim_plugin.lab.cli import bench_real
 from alpasim_plugin.renderers import make_renderer
@@ -149,13 +148,3 @@ def test_the_command_prints_one_document(drive, monkeypatch, capsys):
     assert "cvvdp_jod is not measured" in err
     assert run_command(["bench", "real", "d", "--renderer", "3dgs,3dgs"]) == 2
     assert run_command(["bench", "real", "d", "--renderer", "3dgs,onefixr"]) == 2
-
-
-def test_without_the_package_the_reason_is_said(monkeypatch):
-    def gone(name):
-        raise ModuleNotFoundError("no", name=name)
-
-    monkeypatch.setattr(colour_video_vdp.importlib, "import_module", gone)
-    metric, why = colour_video_vdp.load_metric()
-    assert metric is None
-    assert "pip install cvvdp" in why

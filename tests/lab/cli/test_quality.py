@@ -159,14 +159,6 @@ def test_variants_that_cannot_be_are_refused(text, overrides, words):
         parse_variants(text, overrides)
 
 
-def test_unknown_baseline_is_refused(data, tmp_path, capsys):
-    assert (
-        run_command(["bench", "quality", str(data), "--fixer", "identity", "--out", str(tmp_path)])
-        == 2
-    )
-    assert "--baseline 3dgs" in capsys.readouterr().err
-
-
 def row(variant, clip, psnr, frames=200):
     values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
     return {

@@ -53,18 +53,6 @@ def run_train(capsys, *command):
     return json.loads(out), err
 
 
-def test_scenes_are_listed(tmp_path, capsys):
-    document, err = run_train(
-        capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2
-    )
-    assert document == {
-        "split": "val",
-        "scenes": 1,
-        "paths": [str(path) for path in (tmp_path / "val").glob("*.yaml")],
-    }
-    assert document["paths"][0] in err
-
-
 def test_pairs_made_and_kept_are_counted(tmp_path, capsys):
     (tmp_path / "scenes" / "val").mkdir(parents=True)
     (tmp_path / "scenes" / "val" / "mine.yaml").write_text(BARE)
@@ -99,31 +87,6 @@ def test_weights_come_with_digest_updates_and_time(data, tmp_path, capsys):
     assert document["last"]["loss"] > 0
     assert "1/1" in err
     assert f"wrote {weights}" in err.replace("\n", "")
-
-
-def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path, capsys):
-    assert (
-        run_command(
-            [
-                "train",
-                "fixer",
-                str(tmp_path),
-                "--recipe",
-                "vae",
-                "--out",
-                str(tmp_path / "run"),
-                "--json",
-                "--debug",
-            ]
-        )
-        == 2
-    )
-    out, err = capsys.readouterr()
-    assert "no finished sequence" in json.loads(out)["error"]["message"]
-    assert "Traceback" in err
-    for recipe in ("V9", "decoder"):
-        command = ["train", "fixer", str(tmp_path), "--recipe", recipe, "--out", str(tmp_path)]
-        assert run_command(command) == 2
 
 
 def test_a_policys_card_says_what_made_it_and_how_well_it_does(tmp_path, capsys):

@@ -134,19 +134,6 @@ def test_every_row_trains_by_one_function(data, tmp_path, name):
     )
 
 
-def test_trained_weights_serve_the_streaming_fixer(data, tmp_path):
-    path = train_fixer(run_of(data, "V9"), tmp_path / "run", ("brightness", brightness))
-    settings = small_settings(
-        "window=4", "holes=noise", "history=finalise", f"weights.bundle={path}"
-    )
-    assert load_networks(settings).note.startswith("V9, 2 updates")
-    frames = moving_picture(13)
-    session = fixer(settings)
-    assert session.trained
-    fixed = pixels(run_blocks(session, frames, maps_of(frames)))
-    assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
-
-
 def test_a_generator_from_noise_drives_with_the_render_as_its_condition(data, tmp_path):
     path = train_fixer(run_of(data, "V6"), tmp_path / "run", ("brightness", brightness))
     with pytest.raises(InputError):

@@ -20,7 +20,6 @@ from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
-from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 
@@ -149,17 +148,3 @@ def test_an_arm_resumes_bit_for_bit(train, trained, recipe):
     whole = load_weights(trained(recipe))
     assert again.keys() == whole.keys()
     assert all(torch.equal(value, whole[key]) for key, value in again.items())
-
-
-def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(
-    trained,
-):
-    path = trained("harmonizer")
-    card = json.loads(path.with_suffix(".card.json").read_text())
-    rows = [json.loads(line) for line in (path.parent / "log.jsonl").read_text().splitlines()]
-    assert 0 < card["training"]["largest_distance"] == rows[-1]["largest_distance"]
-    assert rows[-1]["perceptual"] <= 0.3 * rows[-1]["largest_distance"] + 1e-6
-    assert "largest_distance" not in json.loads(
-        (trained("difix").parent / "log.jsonl").read_text().splitlines()[0]
-    )
-    assert RenderStepLoss(weight=0.3, clamp=0.9, references="own").single == 0.5

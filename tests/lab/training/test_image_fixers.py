@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
-from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
+from alpasim_plugin.lab.image_fixers.window_fixer import fade_weights, windows
 from tests.fixers.clip_cases import moving_picture, pixels
-from tests.lab.training.image_cases import busy_settings, image_settings
+from tests.lab.training.image_cases import busy_settings
 from tests.lab.training.whole_clip_images import whole_clip_images
 
 STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")
@@ -178,24 +177,3 @@ def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded():
     with pytest.raises(InputError):
         resolve_renderer("3dgs-enhancer@4+clean")
     assert resolve_renderer("gsfix3d@4", ["untrained=random"]).fixer is not None
-
-
-def test_labels_blocks_and_refused_settings(session):
-    assert session("gsfix3d").label == "gsfix3d@8, 3 updates"
-    assert (session("difix").label, session("difix").blocks) == (
-        "difix, 3 updates",
-        BlockRule(1, 1),
-    )
-    assert isinstance(session("3dgs-enhancer"), WindowFixer)
-    for name, override, message in (
-        ("difix", "steps=4", "steps"),
-        ("difix", "uses_map=true", "no input for a map"),
-        ("difix", "mode=chunk", "no blocks"),
-        ("3dgs-enhancer", "window_frames=24", "1 \\+ 4 n"),
-        ("3dgs-enhancer", "stride_frames=26", "frames between"),
-        ("difix", "render_level.sigma=0", "greater than 0"),
-    ):
-        with pytest.raises(InputError, match=message):
-            image_settings(name, override)
-    with pytest.raises(InputError):
-        make_fixer("difix", scene_id="scene")

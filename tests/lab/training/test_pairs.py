@@ -64,13 +64,6 @@ def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street, tmp
     assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "none"
 
 
-def test_unknown_camera_names_the_known_ones(street, tmp_path):
-    with pytest.raises(InputError):
-        make_sequence(
-            street, tmp_path / "x", PairRecipe(camera="rear"), 0, split="val", family="street"
-        )
-
-
 def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_view(
     street, tmp_path
 ):

@@ -185,24 +185,6 @@ def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
     assert not found.state.hidden.requires_grad
 
 
-def test_switches_of_the_ablation():
-    net, s = generator(), sample()
-    start = net.start(s.render[:, 0])
-
-    def made(**changes):
-        return pixel_losses(
-            net, s, start, PixelObjectives(perceptual=0, **changes), None
-        ).predictions
-
-    own = made()
-    for history in ("clean", "redenoised"):
-        assert torch.equal(made(history=history)[:, 0], own[:, 0])
-        assert not torch.allclose(made(history=history)[:, 1], own[:, 1])
-    assert not torch.allclose(made(use_map=False), own)
-    assert not torch.allclose(made(source="noise"), own)
-    assert float(pixel_losses(net, s, start, PixelObjectives(flow=0, temporal=0), None).flow) == 0
-
-
 def test_a_redenoised_history_is_the_truth_noised_and_denoised():
     net, s = generator(), sample()
     found = pixel_losses(
@@ -294,24 +276,18 @@ def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_wh
     )
 
 
-def pixel_run(**options):
-    settings = fixer_settings("onefixer", list(SMALL))
-    variant = pixel_variant("V9").weighted(0.0, 0.25, 0.25, 0.01, horizon=2)
-    return PixelRun(settings, Streams(), variant, Schedule(4, warmup=0, save_every=4), **options)
-
-
 def test_a_run_on_a_device_equals_the_processors_and_goes_on_there(tmp_path, monkeypatch):
     pytest.importorskip("triton", reason="Triton is not installed")
-    wanted = load_weights(train_per_frame(pixel_run(), tmp_path / "host", None))
+    wanted = load_weights(train_per_frame(run_of(), tmp_path / "host", None))
     waits = []
     with pretended_device(monkeypatch) as traffic:
-        run = pixel_run(device="cuda")
+        run = run_of(device="cuda")
 
         def report(step, numbers):
             waits.append(sum(traffic.waits.values()))
             traffic.reset()
 
         train_per_frame(run, tmp_path / "device", None, 2, report)
-    found = load_weights(train_per_frame(pixel_run(), tmp_path / "device", None))
+    found = load_weights(train_per_frame(run_of(), tmp_path / "device", None))
     assert all(torch.equal(found[key], value) for key, value in wanted.items())
     assert waits[-1] <= 2

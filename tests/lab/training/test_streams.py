@@ -53,23 +53,6 @@ def test_update_is_a_pure_function_of_its_number_and_the_seed(root):
     assert not equal(streams(root, seed=1).update(7), forward[7])
 
 
-def test_shapes_types_and_ranges_are_those_promised(root):
-    batch = streams(root).update(5)
-    for name, channels, low in (
-        ("render", 3, -1),
-        ("opacity", 1, 0),
-        ("map", 3, -1),
-        ("target", 3, -1),
-    ):
-        value = getattr(batch, name)
-        assert value.shape == (3, 2, channels, 32, 48)
-        assert value.dtype == torch.float32
-        assert low <= value.min()
-        assert value.max() <= 1
-        assert value.is_contiguous()
-    assert batch.fresh.shape == batch.kind.shape == (3,)
-
-
 def test_frames_follow_one_another_across_updates(root):
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     for slot in range(3):
@@ -137,10 +120,3 @@ def test_held_out_video_is_never_shown(root):
 def test_what_makes_no_batch_is_refused(root, settings, found):
     with pytest.raises(InputError, match=found):
         streams(root, **settings)
-
-
-def test_video_needs_a_folder_and_shares_must_add_up(root):
-    with pytest.raises(InputError):
-        TrainingStreams(root / "pairs", None, crop=(32, 48))
-    with pytest.raises(InputError):
-        StreamShares(0.8, 0.1, 0.1, 0.1)

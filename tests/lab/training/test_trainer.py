@@ -93,8 +93,6 @@ def test_learning_rate_rises_then_falls_along_a_cosine():
     assert s.lr(60) == pytest.approx(0.505)
     assert s.lr(110) == pytest.approx(0.01)
 
-
-def test_learning_rate_falls_exponentially_or_stays():
     s = Schedule(steps=110, peak_lr=2.0, warmup=10, decay="exponential", last_share=0.01)
     assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx(
         [1.0, 2.0, 0.2, 0.02, 0.02]

@@ -5,7 +5,6 @@ import pytest
 from scipy.signal import convolve2d
 
 from alpasim_plugin.core import image_metrics
-from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.image_metrics import CAP_DB
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.video_metrics.frames import psnr_db, ssim
@@ -53,41 +52,12 @@ def test_ssim_of_black_against_white_and_of_flat_frames():
     assert ssim(black, black)[0] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_pictures_smaller_than_the_window_have_an_ssim():
-    small = TRUTH[:1, :7, :6]
-    assert ssim(small[:, ::-1], small)[0] == pytest.approx(
-        slow_ssim(small[0, ::-1], small[0]), abs=2e-5
-    )
-
-
 def test_psnr_of_a_known_error_and_of_identical_frames():
     made = TRUTH.copy()
     made[1] = np.where(made[1] > 127, made[1] - 10, made[1] + 10)
     found = psnr_db(made, TRUTH)
     assert found[1] == pytest.approx(20 * np.log10(255 / 10))
     assert list(found[[0, 2]]) == [CAP_DB, CAP_DB]
-
-
-def test_one_wrong_value_in_a_large_frame_stays_below_the_cap():
-    truth = np.zeros((1, 500, 500, 3), np.uint8)
-    made = truth.copy()
-    made[0, 3, 4, 1] = 1
-    assert psnr_db(made, truth)[0] == CAP_DB  # 106.9 dB without the cap
-
-
-@pytest.mark.parametrize("metric", [psnr_db, ssim])
-@pytest.mark.parametrize(
-    ("made", "words"),
-    [
-        (TRUTH[:2], "shapes"),
-        (TRUTH.astype(np.float32), "float32"),
-        (TRUTH[:0], r"\(0, 20, 27, 3\)"),
-        (TRUTH[..., 0], "uint8"),
-    ],
-)
-def test_videos_that_do_not_belong_together_are_refused(metric, made, words):
-    with pytest.raises(EvaluatorError, match=words):
-        metric(made, TRUTH)
 
 
 @pytest.mark.parametrize(("low", "peak"), [(0, 255.0), (0, 1.0), (-1, 2.0)])
