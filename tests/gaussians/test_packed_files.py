@@ -16,6 +16,7 @@ from alpasim_plugin.gaussians import read_ply
 from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
+    _ROW,
     read_compressed_ply,
     read_splat,
     read_spz,
@@ -128,6 +129,17 @@ def test_left_out_component_is_restored_in_its_place(largest):
 
 
 # --- .splat
+
+
+def write_splat(path, cloud):
+    """Write a cloud as ``.splat``: constant colours in 8 bits, rotations in 7 bits and sign."""
+    rgb = 0.5 + C0 * np.asarray(cloud.sh, np.float64)[:, 0]
+    rgba = np.column_stack([rgb, cloud.opacities])
+    rows = np.zeros(len(cloud), _ROW)
+    rows["position"], rows["scale"] = cloud.means, cloud.scales
+    rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
+    rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, np.float64) * 128 + 128), 0, 255)
+    path.write_bytes(rows.tobytes())
 
 
 def test_splat_bytes_worked_by_hand(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.geometry import yaw_from_quat
-from scenarios.argoverse import LABELS, PAINTS, read_argoverse
+from scenarios.argoverse import read_argoverse
 from tests.scenarios.make_argoverse import (
     CAR,
     ORIGIN,
@@ -101,29 +101,6 @@ def test_hole_in_the_drivable_area_is_an_edge_of_its_own(tmp_path):
     edges = read_argoverse(write_argoverse(tmp_path / "x", document=document)).lane_map.road_edges
     assert len(edges) == 2
     assert shapely.Polygon(edges[1][:, :2]).area == pytest.approx(60.0)
-
-
-def test_every_mark_type_and_category_has_its_place():
-    assert set(PAINTS.values()) <= {
-        "none",
-        "solid_white",
-        "dashed_white",
-        "solid_yellow",
-        "dashed_yellow",
-        "double_yellow",
-        "unknown",
-    }
-    assert len(PAINTS) == 15
-    assert set(LABELS.values()) == {
-        "car",
-        "truck",
-        "bus",
-        "pedestrian",
-        "cyclist",
-        "motorcycle",
-        "other",
-    }
-    assert len(LABELS) == 30
 
 
 def test_unknown_mark_type_and_category_are_noted(tmp_path):
