@@ -261,12 +261,6 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
     assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
 
 
-def test_no_line_about_two_runs_is_wider_than_the_terminal(runs, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert run_command(["compare", str(runs["good"]), str(runs["few"])]) == 0
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
-
-
 def test_joined_shards_print_the_one_table(tmp_path, capsys):
     shards = [
         vouch_for(

@@ -4,12 +4,11 @@ verdicts, and what is missing.
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators import aggregate, paired
 from evaluators.statistics.summary import numbers
 from tests.evaluators.eval_build import base_pairs
@@ -158,39 +157,3 @@ def test_a_table_without_its_keys_is_refused_by_name(tmp_path):
     pq.write_table(pa.table({"renderer": ["clean"]}), tmp_path / "rollouts.parquet")
     with pytest.raises(InputError, match="no column 'policy'"):
         RolloutTable.of_files([tmp_path / "rollouts.parquet"])
-
-
-def test_cells_of_rows_are_those_of_columns():
-    rows = [row for row in rows_like_a_run(("clean",), ("p",), 9, (3, 2**62, 5), 14)]
-    there = RolloutTable.of_table(table_of(rows)).sides("p")["clean"]
-    side = Side.of(rows)
-    assert side.cells == there.cells
-    assert side.cell.tolist() == there.cell.tolist()
-    assert side.scene.tolist() == there.scene.tolist()
-    assert side.place_in(there).tolist() == list(range(len(side.cells)))
-
-
-def test_the_reason_for_a_missing_value_is_asked_for_by_renderer_and_metric():
-    rows = [
-        {
-            "renderer": r,
-            "policy": "p",
-            "scene": "s",
-            "seed": 0,
-            "status": "ok",
-            "failure_class": None,
-        }
-        for r in ("clean", "3dgs")
-    ]
-    rows = [row | {"offroad": None, "offroad_valid": False} for row in rows]
-    data = pads.dataset(table_of(rows))
-    table = RolloutTable(
-        data,
-        "here",
-        lambda renderer, metric: f"{metric} of {renderer}" if renderer == "clean" else "",
-    )
-    sides = table.sides("p")
-    assert [sides[name].reason(0, "offroad") for name in ("clean", "3dgs")] == [
-        "offroad of clean",
-        "not given",
-    ]

@@ -17,7 +17,6 @@ from evaluators.metrics.outcomes import (
     evaluate_outcomes,
     in_words,
     outcomes_of,
-    recorded_speed,
 )
 from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
@@ -158,16 +157,6 @@ def test_a_recording_without_a_length_gives_no_value():
     for one in evaluate_outcomes(*drive(track(V * T), track(np.zeros(len(T)))), PRESETS["paper"]):
         assert not one.valid.any()
         assert "has no direction" in one.reason
-
-
-def test_the_recorded_speed_is_the_least_from_here_to_fifteen_metres_ahead():
-    v = np.where((T > 3) & (T < 5), 1.0, V)
-    along = travelled(v)
-    usual, pause_s = recorded_speed(along, T, v, along)
-    for k in range(len(T)):
-        window = (along >= along[k] - 2.0) & (along <= along[k] + 15.0)
-        assert usual[k] == pytest.approx(v[window].min())
-    assert pause_s.max() == pytest.approx(2.0, abs=2 * DT_S)
 
 
 def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest():

@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 
 from evaluators.statistics import betting
 from evaluators.statistics.betting import (
-    LEAST_SLOPE,
-    USUAL_SLOPE,
     Draws,
     Plan,
     relative_slope,
@@ -38,38 +36,6 @@ def log_chance(gap, left, slope):
         for at in (-gap - slope * left, slope * left - gap)
     ]
     return math.log(normal[0] + math.exp(-2 * slope * gap) * normal[1])
-
-
-def plain_log_capital(x, low, high, mean, plan):
-    """Bet scene by scene, as the modules' texts say."""
-    half = (high - low) / 2
-    imagined = betting.PRIOR_SCENES * (2 * betting.PRIOR_WIDTH * half) ** 2
-    squares = imagined
-    fourths = imagined * half**2
-    capital = 0.0
-    out = []
-    for i, value in enumerate(x):
-        spread = math.sqrt(squares / (betting.PRIOR_SCENES + i))
-        left = max(plan.horizon - i, 1) / plan.horizon
-        slope = (
-            USUAL_SLOPE
-            if plan.distance is None
-            else max(LEAST_SLOPE, plan.distance * math.sqrt(plan.horizon) / spread / 2)
-        )
-        relative = float(
-            relative_slope(np.array(capital - plan.log_bar), np.array(slope * math.sqrt(left)))
-        )
-        wanted = relative / (spread * math.sqrt(left * plan.horizon))
-        tail = fourths / squares
-        bet = float(
-            np.roots([tail, 0.0, 1.0, -wanted])[
-                np.argmin(np.abs(np.roots([tail, 0.0, 1.0, -wanted]).imag))
-            ].real
-        )
-        capital += math.log1p(min(bet, betting.AT_RISK / (mean - low)) * (value - mean))
-        squares, fourths = squares + (value - mean) ** 2, fourths + (value - mean) ** 4
-        out.append(capital)
-    return out
 
 
 # --- the line
@@ -133,29 +99,6 @@ def test_below_the_hypothesis_the_capital_only_shrinks_on_average():
     found = capital(Draws(values[courses], 1.0), 0.1)
     means = np.sum(np.prod(chances[courses], axis=1)[:, None] * found, axis=0)
     assert np.all(np.diff(means, prepend=1.0) < 0)
-
-
-HARD = {
-    "one scene": np.array([0.3]),
-    "all equal": np.zeros(40),
-    "at the bounds": np.array([1.0, -1.0] * 30),
-    "the least value each time": np.full(60, -1.0),
-    "the greatest value each time": np.ones(60),
-    "a thousand scenes": rng(1).choice([-1.0, 0.0, 1.0], 1000, p=[0.03, 0.94, 0.03]),
-}
-
-
-@pytest.mark.parametrize("case", HARD)
-@pytest.mark.parametrize("distance", [0.05, None])
-def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
-    x = HARD[case]
-    plan = Plan(distance, max(50, len(x)), 0.05)
-    draws = Draws(x, 1.0)
-    found = betting.log_capital(draws, 0.05, betting.bet_sizes(draws, 0.05, plan))
-    assert found == pytest.approx(
-        plain_log_capital(list(x), -1.0, 1.0, 0.05, plan), rel=1e-9, abs=1e-9
-    )
-    assert np.all(np.isfinite(found))
 
 
 @given(st.lists(st.sampled_from([-1.0, -0.2, 0.0, 0.0, 0.4, 1.0]), min_size=1, max_size=25))
