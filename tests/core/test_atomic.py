@@ -35,21 +35,22 @@ WRITERS = {
 }
 
 
-def full(fd):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_full_disk_leaves_the_old_file_and_no_litter(write, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_refuses_leaves_the_old_file_and_no_litter(
+    write, number, tmp_path, monkeypatch
+):
+    def full(fd):
+        raise OSError(number, os.strerror(number))
+
     path = tmp_path / "out"
     write(path, 1)
     before = path.read_bytes()
     monkeypatch.setattr(atomic.os, "fsync", full)
-    with pytest.raises(InfrastructureError, match="No space left on device") as caught:
+    with pytest.raises(InfrastructureError) as caught:
         write(path, 2)
     assert caught.value.message.startswith(str(path))
     assert caught.value.exit_code == 4
-    assert "free disk space" in caught.value.hint
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     monkeypatch.undo()
@@ -143,15 +144,3 @@ def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(InputError):
         write_bytes(tmp_path / name, b"a")
-
-
-@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_read_only_folder_is_an_error_with_four_parts(write, tmp_path, monkeypatch):
-    def refuse(self, *rest, **more):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(atomic.os, "fsync", lambda handle: refuse(tmp_path))
-    monkeypatch.setattr(Path, "unlink", refuse)  # refused even where there is no file
-    with pytest.raises(InfrastructureError, match="Read-only file system") as caught:
-        write(tmp_path / "out", 1)
-    assert "writable, or name another" in caught.value.hint

@@ -15,7 +15,6 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core import parts
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Plan, SensorSpec
-from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.run import execute_run
@@ -193,30 +192,6 @@ def test_a_drive_that_ended_short_says_so_and_that_its_plans_stand(tmp_path, cap
     found = json.loads(capsys.readouterr().out)
     assert found["outcome"] == SHORT_OF_END
     assert any("before the end stands" in line for line in found["found"])
-
-
-def test_what_a_policy_says_is_sorted_by_what_it_is():
-    debug = {
-        "picture": np.zeros((8, 8, 3), np.uint8),
-        "heat": np.eye(6),
-        "boxes_cars": np.array([[0, 0, 10, 20]]),
-        "line_left": np.zeros((5, 2)),
-        "speed": 7.25,
-        "mode": "lane",
-        "weights": [0.1, 0.2],
-        "net": object(),
-        "flat": np.ones((5, 5)),
-        "gaps": np.full((4, 4), np.nan),
-    }
-    shown = debug_row(debug)
-    assert [one[0] for one in shown["images"]] == ["picture"]
-    assert [one[0] for one in shown["heat"]] == ["heat", "flat"]
-    assert shown["boxes"] == [["boxes_cars", [[0.0, 0.0, 10.0, 20.0]]]]
-    assert shown["lines"][0][0] == "line_left"
-    text = {name: words for name, words in shown["text"]}
-    assert text["speed"] == "7.25"
-    assert text["net"] == "not shown: object"
-    assert "not shown" in text["gaps"]
 
 
 @pytest.mark.slow
