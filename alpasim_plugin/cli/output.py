@@ -23,6 +23,7 @@ from alpasim_plugin.log.run_folder.schema import STAGES
 from evaluators.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
+    from alpasim_plugin.core.types import Scenario
     from alpasim_plugin.runs.execute import Threads
     from alpasim_plugin.runs.plan import RunPlan
     from evaluators.opening import Run
@@ -30,6 +31,8 @@ if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its ke
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
 MAX_LINES = 1000  # of finished rollouts on a pipe
+LARGE_PX = 1_000_000  # of the cameras of a scene, from which on a run says what they cost
+PX_PER_S = 5e6  # that one core draws of a built scene, within a factor of two
 LINE_EVERY_S = 10.0  # on a pipe, within one stage
 
 
@@ -182,8 +185,28 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> list[str]:
     )
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     size = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}"
-    notes = [*fixer_labels(plan), *varied_lines(plan), *background_lines(plan)]
+    notes = [*fixer_labels(plan), *size_lines(plan), *varied_lines(plan), *background_lines(plan)]
     return [f"{size} -> {root}", *notes]
+
+
+def size_lines(plan: RunPlan) -> list[str]:
+    """Return how much is drawn for one instant of the scene with the most pixels, where its cameras
+    have a megapixel or more.
+    """
+    from alpasim_plugin.runs.lenses import drawn_pixels
+
+    def pixels_of(scenario: Scenario) -> int:
+        return sum(camera.width * camera.height for camera in scenario.cameras)
+
+    largest = max(plan.scenarios.values(), key=pixels_of)
+    pixels = pixels_of(largest)
+    if pixels < LARGE_PX:
+        return []
+    pinholes, drawn = drawn_pixels(largest.cameras)
+    cameras = plural(len(largest.cameras), "camera")
+    size = f"{cameras} of {pixels / 1e6:.1f} megapixels"
+    by = f"drawn as {drawn / 1e6:.1f} by {plural(pinholes, 'pinhole')}"
+    return [f"{largest.scene_id}: {size}, {by}, {drawn / PX_PER_S:.1f} CPU seconds behind clean"]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

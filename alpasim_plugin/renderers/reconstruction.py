@@ -38,7 +38,7 @@ from alpasim_plugin.gaussians.fit.lens import gain_between
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
-from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
+from alpasim_plugin.gaussians.scene.builder import finished
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import (
     Level,
@@ -170,9 +170,8 @@ def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[Sk
     """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built
     (paper, App. A).
     """
-    light = np.array(LIGHT[scenario.environment.sky])
     missing = [
-        lit(build_actor(actor, scenario), light)
+        finished(build_actor(actor, scenario), scenario)
         for actor in scenario.actors
         if actor.actor_id not in model.actors
     ]

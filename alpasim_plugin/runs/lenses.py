@@ -9,13 +9,16 @@ from dataclasses import replace
 from typing import Any
 
 from alpasim_plugin.core.interfaces import Renderer, complete
-from alpasim_plugin.core.lens import Lens, joined, lens_shares, sides_of
+from alpasim_plugin.core.lens import Lens, joined, lens_shares, resized, sides_of
 from alpasim_plugin.core.types import (
+    CameraSpec,
     Frame,
     RecordedFrame,
     RenderRequest,
     Scenario,
 )
+
+SMALLER = 4  # by side, of the cameras whose pinholes are counted
 
 
 def through_lenses(scenario: Scenario, make: Callable[[Scenario], Renderer]) -> Renderer:
@@ -37,6 +40,20 @@ def through_lenses(scenario: Scenario, make: Callable[[Scenario], Renderer]) -> 
         for side in sides[camera.name]
     ]
     return LensRenderer(make(replace(scenario, cameras=tuple(pinholes))), sides)
+
+
+def drawn_pixels(cameras: Sequence[CameraSpec]) -> tuple[int, float]:
+    """Return how many pinholes cover cameras, and their pixels together, within one in a hundred."""
+    count, pixels = 0, 0.0
+    for camera in cameras:
+        small = resized(
+            camera, *(max(side // SMALLER, 1) for side in (camera.width, camera.height))
+        )
+        share = camera.width * camera.height / (small.width * small.height)
+        sides = sides_of(small)
+        count += len(sides)
+        pixels += share * sum(side.cover[0] * side.cover[1] for side in sides)
+    return count, pixels
 
 
 class LensRenderer(Renderer):

@@ -115,6 +115,20 @@ def test_lines_and_lamps_are_sharper_where_a_camera_has_more_pixels_per_radian(s
     assert len(sharp) > 1.1 * len(usual)
 
 
+def test_a_sharp_camera_sees_what_four_times_its_pixels_average_to(street):
+    scenario, usual = street
+    sharp = built(replace(scenario, cameras=(camera_spec(1280, 720),)))
+
+    def psnr_db(graph):
+        whole = view(scenario, 0, 0.5, 2560, 1440)
+        seen = graph.render(view(scenario, 0, 0.5, 1280, 720), {}).rgb[320:440]
+        fine = graph.render(whole.window(slice(640, 880), slice(0, 2560)), {}).rgb
+        averaged = fine.reshape(120, 2, 1280, 2, 3).mean(axis=(1, 3))
+        return -10 * np.log10(np.mean((seen - averaged) ** 2))
+
+    assert psnr_db(sharp) > max(40.0, psnr_db(usual) + 3.0)
+
+
 def test_houses_leave_road_actors_and_each_other_alone():
     scenario = straight(environment=Environment(buildings=1.0))
     site = make_site(scenario, partial(height_at, scenario.ground))

@@ -1,11 +1,15 @@
 """The cameras of a scenario file: sections, shipped rigs, calibrations, and what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.output import size_lines
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import rays_of, sides_of
 from alpasim_plugin.core.types import LensModel
+from alpasim_plugin.runs.lenses import drawn_pixels
 from scenarios.load import load_scenario
 from scenarios.usdz_write import write_usdz
 
@@ -46,10 +50,19 @@ def test_a_shipped_rig_is_read_and_scaled(tmp_path, rig, count, pinholes):
     cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras
     assert [camera.width for camera in cameras] == [192] * count
     assert cameras[0].T_rig_camera[0, 2] > 0.99
-    sides = [side for camera in cameras for side in sides_of(camera)]
-    assert len(sides) == pinholes
-    pixels = sum(side.cover[0] * side.cover[1] for side in sides)
-    assert pixels < 1.6 * sum(camera.width * camera.height for camera in cameras)
+    count, drawn = drawn_pixels(cameras)
+    assert count == pinholes
+    assert drawn < 1.6 * sum(camera.width * camera.height for camera in cameras)
+
+
+def test_a_run_says_before_the_first_frame_what_large_cameras_cost(tmp_path):
+    scenarios = [
+        load_scenario(written(tmp_path, f"{{rig: alpasim-4, width: {w}}}")) for w in (192, 1900)
+    ]
+    small, large = (size_lines(SimpleNamespace(scenarios={"a": one})) for one in scenarios)
+    assert small == []
+    assert "8.2 megapixels" in large[0]
+    assert "drawn as 11.5 by 10" in large[0]
 
 
 def test_cameras_of_a_usdz_have_its_lenses(tmp_path):

@@ -12,6 +12,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades
@@ -19,6 +20,7 @@ from alpasim_plugin.gaussians.scene.build_road import build_road
 from alpasim_plugin.gaussians.scene.build_street import build_street
 from alpasim_plugin.gaussians.scene.paint import paint_strokes
 from alpasim_plugin.gaussians.scene.scene_graph import (
+    Level,
     SceneGraph,
     SceneNode,
     nodes_by_tile,
@@ -26,6 +28,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
 )
 from alpasim_plugin.gaussians.scene.site import HeightAt, make_site, path_of, section_of
 from alpasim_plugin.gaussians.scene.sky import Sky, make_sky
+from alpasim_plugin.gaussians.scene.surfels import halvings
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, SIGHT_M
 
@@ -47,14 +50,13 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
         height_at: Ground height under ``(N, 2+)`` world points, ``(N,)`` metres.
     """
     sky = make_sky(scenario.environment.sky, stream(scenario.scene_id, scenario.seed, "scene/sky"))
-    light = np.array(LIGHT[scenario.environment.sky])
-    actors = [lit(node, light) for node in build_actors(scenario)]
+    actors = [finished(node, scenario) for node in build_actors(scenario)]
     if scenario.background is not None and not scenario.background.keep_road:
         return SceneGraph([], actors, sky)
     if scenario.background is not None:
         site = make_site(scenario, height_at)
         nodes = build_road(site, paint_strokes(site))
-        return SceneGraph([lit(node, light) for node in nodes], actors, sky)
+        return SceneGraph([finished(node, scenario) for node in nodes], actors, sky)
     if len(path_of(scenario)) > BUILT_WHOLE_M:
         return LongScene(scenario, height_at, actors, sky)
     return SceneGraph(build_surroundings(scenario, height_at), actors, sky)
@@ -64,11 +66,10 @@ def build_surroundings(
     scenario: Scenario, height_at: HeightAt, section: int | None = None
 ) -> list[SceneNode]:
     """Build everything that does not move, or a section of it: see `make_site`."""
-    light = np.array(LIGHT[scenario.environment.sky])
     site = make_site(scenario, height_at, section)
     road = build_road(site, paint_strokes(site))
     facades, houses = build_facades(site)
-    return [lit(node, light) for node in (*road, *facades, *build_street(site, houses))]
+    return [finished(node, scenario) for node in (*road, *facades, *build_street(site, houses))]
 
 
 class LongScene(SceneGraph):
@@ -129,13 +130,22 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
     )
 
 
-def lit(node: SceneNode, light: F64) -> SceneNode:
-    """Return the node with all colours multiplied by ``light (3,)``."""
-    if np.all(light == 1.0):
+def finished(node: SceneNode, scenario: Scenario) -> SceneNode:
+    """Return a built node in the light of a scenario's sky. Where one of its cameras is sharp, the
+    node is antialiased, and its levels are drawn up to half the distance.
+
+    Without antialiasing all that is thinner than a pixel is drawn a pixel wide, and at 1900 pixels
+    across a line is as thin as that from 30 m on.
+    """
+    light = np.array(LIGHT[scenario.environment.sky])
+    is_sharp = bool(halvings(scenario))
+    if np.all(light == 1.0) and not is_sharp:
         return node
     levels = []
     for level in node.levels:
         sh = level.cloud.sh * light
         sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
-        levels.append(replace(level, cloud=replace(level.cloud, sh=sh.astype(np.float32))))
+        filter_px2 = MIP_PX2 if is_sharp else 0.0
+        cloud = replace(level.cloud, sh=sh.astype(np.float32), antialias_px2=filter_px2)
+        levels.append(Level(level.cell_m * (2 if is_sharp else 1), cloud))
     return replace(node, levels=tuple(levels))
