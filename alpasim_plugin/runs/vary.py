@@ -115,7 +115,7 @@ class BoundarySearch:
         names = [(cell.renderer.name, cell.policy.name) for cell in self.plan.cells]
         self.variants = variants_of(names)
         self.failed = {(one, seed): {} for one in self.variants for seed in self.plan.seeds}
-        self.at_once = len(self.failed) * 2  # two points each
+        self.at_once = len(self.failed) * 4  # points beside a change
         self.ends = self._reachable_ends()
 
     def _reachable_ends(self) -> tuple[int, int]:
@@ -254,7 +254,8 @@ class BoundarySearch:
             counted = [f"{why} in {reasons.count(why)} of {len(ended)} seeds" for why in reasons]
             return facts | {"reason": "; ".join(dict.fromkeys(counted))}, []
         side = "below" if sides.pop() else "above"
-        return facts | {"fails": side} | vars(boundary_of(brackets)), brackets
+        changes = max(one.changes for one in brackets)
+        return facts | {"fails": side, "changes": changes} | vars(boundary_of(brackets)), brackets
 
 
 def _has_failed(manifest: JsonView) -> bool | None:

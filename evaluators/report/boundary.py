@@ -18,7 +18,9 @@ def sentence_of(record: JsonView) -> str:
     texts = []
     for name, facts in record["variants"].items():
         if "value" in facts:
-            texts.append(f"{name} fails {facts['fails']} {number(facts, record['unit'])}")
+            text = f"{name} fails {facts['fails']} {number(facts, record['unit'])}"
+            changes = facts.get("changes", 1)
+            texts.append(text if changes == 1 else f"{text}, where its outcome changes {changes} times")
         else:
             texts.append(f"{name} has no boundary: {facts['reason']}")
     for name, facts in record["differences"].items():

@@ -1,9 +1,10 @@
 """Where along one parameter of a scene a policy starts to fail: which points of a grid are driven
 next, the boundary of each seed, and their mean with its interval.
 
-A seed is a repeatable policy: its outcomes along the parameter are assumed to change once. Bisection
-then encloses the change between two neighbouring points of the grid, exactly for this seed. Over
-seeds the boundary is the mean of the middles, with Student's interval widened by half a bracket.
+A seed is a repeatable policy. Bisection encloses a change of its outcome between two neighbouring
+points of the grid; then points beside it are driven, and where the outcome changes again the bracket
+reaches from the first change to the last. Over seeds the boundary is the mean of the middles, with
+Student's interval widened by half a bracket.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import scipy.stats
 
 STEPS = 64  # of the grid between both ends of the range
 FIRST_POINTS = 5  # driven before the bisection, both ends among them; they show a second change
-MOST_POINTS = 9  # that a seed drives: the first ones and four halvings
+BESIDE = (2, 4)  # steps from the outermost changes that are driven too
+MOST_POINTS = 24  # that a seed drives: after 20 no more are asked for
 CONFIDENCE = 0.95
 
 
@@ -28,11 +30,13 @@ class Bracket:
     Attributes:
         low, high: Values of the parameter between which the outcome changes.
         fails_below: The drive fails at ``low`` and not at ``high``.
+        changes: How often the outcome changes between them.
     """
 
     low: float
     high: float
     fails_below: bool
+    changes: int = 1
 
     @property
     def middle(self) -> float:
@@ -62,16 +66,29 @@ def next_points(failed: Mapping[int, bool], ends: tuple[int, int], skipped: set[
         ends: The first and the last point.
         skipped: Points at which the scene cannot be built.
     """
-    first = np.linspace(*ends, FIRST_POINTS).round().astype(int).tolist()
-    asked = [point for point in dict.fromkeys(first) if point not in skipped]
+    asked = [point for point in _first(ends) if point not in skipped]
     if missing := [point for point in asked if point not in failed]:
         return missing
-    changes = changes_of(failed)
-    if len(changes) != 1:
+    if len(changes_of({point: failed[point] for point in asked})) != 1:
         return []
-    low, high = changes[0]
-    inside = [point for point in range(low + 1, high) if point not in skipped]
-    return sorted(inside, key=lambda point: (abs(2 * point - low - high), point))[:1]
+    if len(failed) > MOST_POINTS - 2 * len(BESIDE):
+        return []
+    changes = changes_of(failed)
+    middles: list[int] = []
+    for low, high in {changes[0], changes[-1]}:
+        inside = [point for point in range(low + 1, high) if point not in skipped]
+        middles += sorted(inside, key=lambda point: (abs(2 * point - low - high), point))[:1]
+    if middles:
+        return sorted(middles)
+    low, high = changes[0][0], changes[-1][1]
+    beside = [point for step in BESIDE for point in (low - step, high + step)]
+    return [p for p in beside if ends[0] < p < ends[1] and p not in {*failed, *skipped}]
+
+
+def _first(ends: tuple[int, int]) -> list[int]:
+    """Return the points that are driven before the bisection."""
+    points = np.linspace(*ends, FIRST_POINTS).round().astype(int)
+    return list(dict.fromkeys(points.tolist()))
 
 
 def changes_of(failed: Mapping[int, bool]) -> list[tuple[int, int]]:
@@ -87,13 +104,14 @@ def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Brack
         failed: Point -> whether the drive failed there.
         values: Point -> value of the parameter.
     """
-    changes = changes_of(failed)
-    if len(changes) > 1:
+    first = _first((min(failed), max(failed)))
+    if len(changes_of({point: failed[point] for point in first if point in failed})) > 1:
         return "not monotone"
+    changes = changes_of(failed)
     if not changes:
         return "fails everywhere" if any(failed.values()) else "no failure"
-    low, high = changes[0]
-    return Bracket(values[low], values[high], failed[low])
+    low, high = changes[0][0], changes[-1][1]
+    return Bracket(values[low], values[high], failed[low], len(changes))
 
 
 def boundary_of(brackets: Sequence[Bracket]) -> Estimate:

@@ -39,6 +39,16 @@ def test_a_range_without_a_boundary_is_not_bisected():
     assert (found, len(failed)) == ("not monotone", 5)
 
 
+@pytest.mark.parametrize(
+    ("again", "ends"), [((24, 25), (21, 26)), ((17, 26), (16, 27)), ((24, 28), (21, 29))]
+)
+def test_changes_close_to_the_first_one_are_enclosed_together(again, ends):
+    found, failed = searched(lambda point: (point < 22) != (point in again))
+    assert (found.low, found.high) == ends
+    assert found.changes > 1
+    assert len(failed) <= 0.4 * STEPS
+
+
 def test_points_that_cannot_be_built_widen_the_bracket():
     found, failed = searched(lambda point: point < 22, skipped={20, 21, 22})
     assert (found.low, found.high) == (19, 23)
