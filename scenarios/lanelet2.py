@@ -15,7 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -24,12 +24,13 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, se2, transform_points
-from alpasim_plugin.core.reading import some_of
+from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Signal
 from scenarios.commonroad_map import mark_intersections
 from scenarios.map_lines import is_left_of, rails
 from scenarios.map_route import Spot
 from scenarios.opendrive import T_enu_earth, earth_xyz
+from scenarios.opendrive_signals import LOWEST_HEAD_M
 from scenarios.recorded import SourceFiles, near
 from scenarios.street_map import Head, StreetMap
 
@@ -44,7 +45,8 @@ UNMARKED = ("virtual", "road_border", "curbstone", "guard_rail", "wall", "fence"
 SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(km/h|kmh|mph|m/s|mps|)", re.ASCII)
 MPS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0}
 JUNCTION_M = 60.0  # lights whose lines lie nearer to each other belong to one junction
-LIGHT_M, SIGN_M, PLATE_M = 3.0, 2.1, 0.6  # height of lights, of signs, and of a sign itself
+SIGN_M, PLATE_M = 2.1, 0.6  # height of signs, and of a sign itself
+LAMPS_M = 0.9  # height of a light whose map does not state it
 
 
 @dataclass(frozen=True)
@@ -101,36 +103,45 @@ class Osm:
         """Return the ways of one type."""
         return [key for key, way in self.items["way"].items() if way.tags.get("type") == kind]
 
+    def get(self, kind: str, key: str) -> Item:
+        """Return an element.
+
+        Raises:
+            InputError: It is missing.
+        """
+        if key not in self.items[kind]:
+            raise InputError(f"{self.path}: {kind} {key}, which is missing", "add it to the map")
+        return self.items[kind][key]
+
     def nodes(self, way: str) -> list[str]:
         """Return the nodes of a way, each once in a row.
 
         Raises:
             InputError: The way is missing or shorter than two nodes, or one of them is missing.
         """
-        item = self.items["way"].get(way)
-        if item is None:
-            raise InputError(f"{self.path}: way {way}, which is missing", "add it to the map")
-        refs = item.of("", "node")
-        lost = next((ref for ref in refs if ref not in self.items["node"]), None)
-        where = f"{self.path}, way {way}"
-        if lost is not None:
-            raise InputError(f"{where}: node {lost}, which is missing", "add it to the map")
-        refs = refs[:1] + [after for before, after in pairwise(refs) if after != before]
+        refs = [ref for ref, _ in groupby(self.get("way", way).of("", "node"))]
         if len(refs) < 2:
-            raise InputError(f"{where}: {len(refs)} node", "give it at least two")
+            raise InputError(f"{self.path}, way {way}: {len(refs)} node", "give it at least two")
+        for ref in refs:
+            self.get("node", ref)
         return refs
 
     def line(self, nodes: Iterable[str]) -> F64:
         """Return the points ``(N, 3)`` of nodes."""
         return np.array([self.xyz[node] for node in nodes])
 
+    def rules_of(self, lanelet: Item) -> list[tuple[str, Item]]:
+        """Return the regulatory elements of a lanelet."""
+        refs = lanelet.of("regulatory_element", "relation")
+        return [(ref, self.get("relation", ref)) for ref in refs]
+
     def _used_ways(self) -> list[str]:
-        beside = ("stop_line", "traffic_sign", "traffic_light")
+        beside = ("stop_line", "traffic_sign")
         found = [key for kind in beside for key in self.ways(kind)]
         for lanelet in self.lanelets.values():
             found += [*lanelet.of("left", "way"), *lanelet.of("right", "way")]
         for rule in self.rules.values():
-            found += rule.of("ref_line", "way")
+            found += [*rule.of("ref_line", "way"), *rule.of("refers", "way")]
         return found
 
     def _placed(
@@ -148,11 +159,15 @@ class Osm:
                 f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
                 "give them to all nodes, or to none",
             )
-        axes = ("local_x", "local_y") if local else ("lon", "lat")
-        xy = np.array([[self._number(k, p, axis) for axis in axes] for k, p in places.items()])
-        xy = xy.reshape(-1, 2)
         high = all("ele" in place for place in places.values())
-        z = np.array([self._number(k, p, "ele") if high else 0.0 for k, p in places.items()])
+        axes = [*(("local_x", "local_y") if local else ("lon", "lat")), *(["ele"] if high else [])]
+        table = np.zeros((len(places), 3))
+        for row, (key, place) in zip(table, places.items(), strict=True):
+            with parsing(f"{self.path}, node {key}", "give a number"):
+                row[: len(axes)] = [float(place[axis]) for axis in axes]
+                if not np.isfinite(row).all():
+                    raise ValueError("a coordinate that is not finite")
+        xy, z = table[:, :2], table[:, 2]
         notes = [] if high else ["not all points have a height (ele): the map is level"]
         if local:
             shift = np.round(xy[0])
@@ -172,16 +187,6 @@ class Osm:
             notes.append(f"origin at latitude {lat:.3f}, longitude {lon:.3f}; x east, y north")
         near(self.path, points)
         return dict(zip(places, points, strict=True)), origin, tuple(notes)
-
-    def _number(self, key: str, place: Mapping[str, str], name: str) -> float:
-        try:
-            value = float(place[name])
-        except (KeyError, ValueError):
-            value = float("nan")
-        if not np.isfinite(value):
-            found = f"{name} = {place.get(name)!r}"
-            raise InputError(f"{self.path}, node {key}: {found}", "give a number")
-        return value
 
 
 def _item(element: Element) -> Item:
@@ -248,6 +253,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     if unread:
         notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
+    heads = _heads(osm, lanes)
     areas = len(osm.relations("multipolygon"))
     notes += [f"areas (multipolygon) left out: {areas}"] if areas else []
     return StreetMap(
@@ -256,10 +262,10 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
             {},
             crosswalks=tuple(crosswalks),
             stop_lines=tuple(osm.line(osm.nodes(way)) for way in osm.ways("stop_line")),
-            poles=_posts(osm),
+            poles=tuple(_post(one.signal) for one in heads if one.signal.head is not None),
             signs=tuple(_sign(osm, way) for way in osm.ways("traffic_sign")),
         ),
-        _heads(osm, lanes),
+        heads,
         _give_way(osm, lanes),
         lengths,
         spots,
@@ -278,21 +284,16 @@ def _for_vehicles(lanelet: Item) -> bool:
 
 def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
     """Return the bounds of a lanelet, both in the direction that has the left one on the left."""
-    where = f"{osm.path}, lanelet {key}"
-    found = []
-    for side in ("left", "right"):
-        ways = lanelet.of(side, "way")
-        if len(ways) != 1:
-            raise InputError(f"{where}: {len(ways)} ways as {side} bound", "give it one")
-        found.append(Bound(ways[0], tuple(osm.nodes(ways[0]))))
-    left, right = found
-    ends = [osm.line((bound.nodes[0], bound.nodes[-1])) for bound in found]
-    apart = np.linalg.norm(ends[0] - ends[1], axis=1).sum()
-    if np.linalg.norm(ends[0] - ends[1][::-1], axis=1).sum() < apart:
-        right = right.turned()
-    lines = osm.line(left.nodes), osm.line(right.nodes)
-    if left.way == right.way or min(float(arc_lengths(line)[-1]) for line in lines) <= 0.0:
-        raise InputError(f"{where}: a bound without length, or one for both sides", "correct it")
+    with parsing(f"{osm.path}, lanelet {key}", "give it one way with a length for each bound"):
+        ((left_way,), (right_way,)) = (lanelet.of(side, "way") for side in ("left", "right"))
+        left, right = (Bound(way, tuple(osm.nodes(way))) for way in (left_way, right_way))
+        ends = [osm.line((bound.nodes[0], bound.nodes[-1])) for bound in (left, right)]
+        apart = np.linalg.norm(ends[0] - ends[1], axis=1).sum()
+        if np.linalg.norm(ends[0] - ends[1][::-1], axis=1).sum() < apart:
+            right = right.turned()
+        lines = osm.line(left.nodes), osm.line(right.nodes)
+        if left_way == right_way or min(float(arc_lengths(line)[-1]) for line in lines) <= 0.0:
+            raise ValueError("a bound without length, or one for both sides")
     if not is_left_of(*lines):
         left, right = left.turned(), right.turned()
     return left, right
@@ -360,9 +361,11 @@ def _limits(osm: Osm) -> tuple[dict[str, float], list[str]]:
     unread: list[str] = []
     for key, lanelet in osm.lanelets.items():
         texts = [lanelet.tags["speed_limit"]] if "speed_limit" in lanelet.tags else []
-        rules = [_rule(osm, key, r) for r in lanelet.of("regulatory_element", "relation")]
-        speeds = [rule for rule in rules if rule.tags.get("subtype") == "speed_limit"]
-        texts += [rule.tags.get("sign_type", "") for rule in speeds]
+        texts += [
+            rule.tags.get("sign_type", "")
+            for _, rule in osm.rules_of(lanelet)
+            if rule.tags.get("subtype") == "speed_limit"
+        ]
         for text in texts:
             found = SPEED.fullmatch(text.strip())
             if found is None:
@@ -372,37 +375,45 @@ def _limits(osm: Osm) -> tuple[dict[str, float], list[str]]:
     return limits, unread
 
 
-def _rule(osm: Osm, lanelet: str, ref: str) -> Item:
-    if ref not in osm.rules:
-        raise InputError(
-            f"{osm.path}, lanelet {lanelet}: regulatory element {ref}, which is missing",
-            "add it to the map",
-        )
-    return osm.rules[ref]
-
-
 def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
     """Return the traffic lights: those of one line are one group, those of lines that lie close
     together one junction.
     """
     held: dict[tuple[str, str], list[str]] = {}  # stop line or else lanelet, and element
     for key in (key for key in lanes if key in osm.lanelets):
-        for ref in osm.lanelets[key].of("regulatory_element", "relation"):
-            if osm.rules[ref].tags.get("subtype") == "traffic_light":
-                line = next(iter(osm.rules[ref].of("ref_line", "way")), f"end of {key}")
+        for ref, rule in osm.rules_of(osm.lanelets[key]):
+            if rule.tags.get("subtype") == "traffic_light":
+                line = next(iter(rule.of("ref_line", "way")), f"end of {key}")
                 held.setdefault((line, ref), []).append(key)
     signals = [
-        _stop(osm, line, ref, [lanes[key] for key in keys]) for (line, ref), keys in held.items()
+        (line, replace(stop, head=head))
+        for (line, ref), keys in held.items()
+        for stop in [_stop(osm, line, ref, [lanes[key] for key in keys])]
+        for head in _lamps(osm, osm.rules[ref], stop) or [None]
     ]
     if not signals:
         return ()
-    middles = np.array([signal.stop.mean(axis=0)[:2] for signal in signals])
+    middles = np.array([signal.stop.mean(axis=0)[:2] for _, signal in signals])
     close = scipy.spatial.distance.cdist(middles, middles) < JUNCTION_M
     _, junction = scipy.sparse.csgraph.connected_components(close)
     return tuple(
         Head(signal, str(number), line, line)
-        for signal, number, (line, _) in zip(signals, junction, held, strict=True)
+        for (line, signal), number in zip(signals, junction, strict=True)
     )
+
+
+def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64]:
+    """Return the middle of the lamps of each light of an element: a way is their lower edge, in
+    maps without heights on the ground.
+    """
+    middles = []
+    for way in rule.of("refers", "way"):
+        middle = osm.line(osm.nodes(way)).mean(axis=0)
+        with parsing(f"{osm.path}, way {way}, height", "give a number of metres"):
+            middle[2] += float(osm.items["way"][way].tags.get("height", LAMPS_M)) / 2
+        middle[2] = max(middle[2], float(stop.stop[:, 2].mean()) + LOWEST_HEAD_M)
+        middles.append(middle)
+    return middles
 
 
 def _give_way(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Signal, ...]:
@@ -418,21 +429,20 @@ def _give_way(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Signal, ...]:
 
 def _stop(osm: Osm, line: str, name: str, lanes: Sequence[Lane]) -> Signal:
     """Return the line at which lanelets wait: a way, or the end of the first one."""
-    first = lanes[0]
-    assert first.left is not None
-    assert first.right is not None
-    ends = np.stack([first.left[-1], first.right[-1]])
+    ends = np.stack([edge[-1] for edge in rails(lanes[0])])
     if line in osm.items["way"]:
         ends = osm.line(osm.nodes(line))[[0, -1]]
-    along = first.centre[-1, :2] - first.centre[-2, :2]
+    along = lanes[0].centre[-1, :2] - lanes[0].centre[-2, :2]
     heading_rad = float(np.arctan2(along[1], along[0]))
     return Signal(ends, heading_rad, (), 0, name, tuple(lane.lane_id for lane in lanes))
 
 
-def _posts(osm: Osm) -> tuple[F64, ...]:
-    """Return a post for each way that is a traffic light, as high as lights hang."""
-    lights = [osm.line(osm.nodes(way))[0] for way in osm.ways("traffic_light")]
-    return tuple(np.stack([foot, foot + np.array([0.0, 0.0, LIGHT_M])]) for foot in lights)
+def _post(signal: Signal) -> F64:
+    """Return the post ``(2, 3)`` that the lamps of a light stand on."""
+    assert signal.head is not None
+    foot = signal.head.copy()
+    foot[2] = signal.stop[:, 2].mean()
+    return np.stack([foot, signal.head])
 
 
 def _sign(osm: Osm, way: str) -> tuple[F64, Box]:

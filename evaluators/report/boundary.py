@@ -20,7 +20,9 @@ def sentence_of(record: JsonView) -> str:
         if "value" in facts:
             text = f"{name} fails {facts['fails']} {number(facts, record['unit'])}"
             changes = facts.get("changes", 1)
-            texts.append(text if changes == 1 else f"{text}, where its outcome changes {changes} times")
+            texts.append(
+                text if changes == 1 else f"{text}, where its outcome changes {changes} times"
+            )
         else:
             texts.append(f"{name} has no boundary: {facts['reason']}")
     for name, facts in record["differences"].items():

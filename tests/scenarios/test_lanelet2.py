@@ -60,9 +60,13 @@ WAYS = (
     way(329, 33, 32, 31, type="curbstone"),
     way(312, 31, 32),
     way(90, 12, 22, type="stop_line"),
+    way(95, 12, 22, type="traffic_light", height="8.0"),
+    way(96, 21, 22, type="traffic_light"),
 )
 LIGHT = relation(
-    7, [("way", "ref_line", 90)], {"type": "regulatory_element", "subtype": "traffic_light"}
+    7,
+    [("way", "ref_line", 90), ("way", "refers", 95), ("way", "refers", 96)],
+    {"type": "regulatory_element", "subtype": "traffic_light"},
 )
 STREET = (
     *places(),
@@ -105,8 +109,11 @@ def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_pa
     file = written(tmp_path, STREET)
     route = ("map.route.from=1:10", "map.route.to=2:80", "map.vehicles=0")
     made = load_scenario(file, None, route)
-    (signal,) = made.lane_map.signals
-    assert (signal.name, signal.lanes) == ("7", ("1",))
+    signal, other = made.lane_map.signals
+    assert (signal.name, signal.lanes) == (other.name, other.lanes) == ("7", ("1",))
+    assert signal.head[1:] + made.world_origin[1:] == pytest.approx([5.25, 4.0])
+    assert other.head[1:] + made.world_origin[1:] == pytest.approx([7.0, 3.0])
+    assert len(made.lane_map.poles) == 2
     assert signal.stop[:, 0] + made.world_origin[0] == pytest.approx([1150.0, 1150.0])
     x = made.ego_log.xyz[:, 0] + made.world_origin[0]
     front = x + made.vehicle.rear_axle_to_centre_m + made.vehicle.box.length_m / 2
@@ -135,7 +142,7 @@ def test_latitude_and_longitude_become_east_and_north(tmp_path):
 BROKEN = {
     "node 12": tuple(p for p in STREET if 'node id="12"' not in p),
     "way 212": tuple(p for p in STREET if 'way id="212"' not in p),
-    "regulatory element 7": STREET[:-1],
+    "relation 7": STREET[:-1],
     "lanelet 3": (*STREET[:-2], lanelet(3, 212, 212), LIGHT),
     "way 112": (*places(), way(112, 11, 11), *WAYS[1:], *STREET[-4:]),
     "node 21": (
