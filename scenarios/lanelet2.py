@@ -161,12 +161,13 @@ class Osm:
             )
         high = all("ele" in place for place in places.values())
         axes = [*(("local_x", "local_y") if local else ("lon", "lat")), *(["ele"] if high else [])]
+        most = (1e9, 1e9, 1e9) if local else (180.0, 90.0, 1e9)
         table = np.zeros((len(places), 3))
         for row, (key, place) in zip(table, places.items(), strict=True):
-            with parsing(f"{self.path}, node {key}", "give a number"):
+            with parsing(f"{self.path}, node {key}", "give numbers, degrees or metres"):
                 row[: len(axes)] = [float(place[axis]) for axis in axes]
-                if not np.isfinite(row).all():
-                    raise ValueError("a coordinate that is not finite")
+                if not (np.abs(row) <= most).all():
+                    raise ValueError(f"no place on the earth: {row.tolist()}")
         xy, z = table[:, :2], table[:, 2]
         notes = [] if high else ["not all points have a height (ele): the map is level"]
         if local:
@@ -174,11 +175,6 @@ class Osm:
             origin = (float(shift[0]), float(shift[1]), 0.0)
             points = np.column_stack([xy - shift, z])
         else:
-            if not (np.abs(xy) <= (180.0, 90.0)).all():
-                key = list(places)[int(np.argmax((np.abs(xy) > (180.0, 90.0)).any(axis=1)))]
-                raise InputError(
-                    f"{self.path}, node {key}: no place on the earth", "correct lat and lon"
-                )
             origin = (0.0, 0.0, 0.0)
             lon, lat = np.round((xy.min(axis=0) + xy.max(axis=0)) / 2, 3) if len(xy) else (0.0, 0.0)
             earth = earth_xyz(xy[:, 1], xy[:, 0], np.zeros(len(xy)))

@@ -179,9 +179,27 @@ def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
     ``log.actors`` says.
     """
     log = drawn.spec.log
-    if log is None or log.actors == "replay":
+    if log is None:
+        files = {one.id: _appearance(drawn, i) for i, one in enumerate(drawn.spec.actors)}
+        return tuple(replace(actor, appearance=files.get(actor.actor_id)) for actor in drive.actors)
+    if log.actors == "replay":
         return drive.actors
     return () if log.actors == "none" else tuple(_reactive(actor) for actor in drive.actors)
+
+
+def _appearance(drawn: Drawn, i: int) -> str | None:
+    """Return the file of an actor's Gaussians; None where it is built."""
+    document, file, key = (
+        drawn.document,
+        drawn.spec.actors[i].appearance,
+        ("actors", i, "appearance"),
+    )
+    if file is None:
+        return None
+    path = document.folder_of(key) / file
+    if not os.path.isfile(path):
+        raise document.error(key, f"{path} does not exist", "correct the path")
+    return str(path)
 
 
 def _reactive(actor: Actor) -> Actor:
@@ -269,8 +287,12 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"
         _drop(content["log"], ("osi",))
-    for actor in content["actors"]:
+    for i, actor in enumerate(content["actors"]):
         _drop(actor, ("yields",) if actor.get("role") else ("yields", "role", "gap_m"))
+        _drop(actor, ("appearance",))
+        if "appearance" in actor:
+            folder = drawn.document.folder_of(("actors", i, "appearance"))
+            actor["appearance"] = file_sha256(folder / actor["appearance"])
     if spec.map is None:
         del content["map"]
     else:

@@ -8,7 +8,6 @@ of lanes that it joins gets a lane.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
-from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
-from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, same_way
+from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
 from scenarios.osi_messages import UNREAD, ground_truths
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
@@ -46,29 +45,30 @@ class _Track:
     """One moving object as it is collected."""
 
     first: Any  # its first message
-    t_us: list[int] = field(default_factory=list)
-    xyz: list[tuple[float, float, float]] = field(default_factory=list)
-    angles: list[tuple[float, float, float]] = field(default_factory=list)  # yaw, pitch, roll
+    rows: list[tuple[float, ...]] = field(default_factory=list)  # t_us, x, y, z, yaw, pitch, roll
 
     @property
     def label(self) -> str:
         """Return the class of road user."""
-        if self.first.type == PEDESTRIAN:
-            return "pedestrian"
-        if self.first.type != VEHICLE:
-            return "other"
-        return LABELS.get(self.first.vehicle_classification.type, "car")
+        of_type = {VEHICLE: LABELS.get(self.first.vehicle_classification.type, "car")}
+        return {**of_type, PEDESTRIAN: "pedestrian"}.get(self.first.type, "other")
 
     @property
     def box(self) -> Box:
         size = self.first.base.dimension
         return Box(size.length, size.width, size.height)
 
-    def trajectory(self, where: str, origin: F64) -> Trajectory:
+    def trajectory(self, where: str, origin: F64, least: int = 1) -> Trajectory:
         """Return the poses of the box centre."""
-        quat = Rotation.from_euler("ZYX", np.nan_to_num(self.angles)).as_quat()[:, [3, 0, 1, 2]]
-        xyz = np.array(self.xyz) - origin
-        return checked_trajectory(where, np.array(self.t_us), near(where, xyz), quat)
+        table = np.array(self.rows)
+        turns = Rotation.from_euler("ZYX", np.nan_to_num(table[:, 4:]))
+        return checked_trajectory(
+            where,
+            table[:, 0].astype(np.int64),
+            near(where, table[:, 1:4] - origin),
+            turns.as_quat(scalar_first=True),
+            least,
+        )
 
 
 def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
@@ -85,39 +85,40 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     file = Path(path)
     files = SourceFiles()
     tracks: dict[int, _Track] = {}
-    times: list[int] = []
-    host: int | None = None
+    count, why = 0, f"object {ego}"
     roads: Any = None
-    unread: Counter[str] = Counter()
     notes: list[str] = []
     for message in ground_truths(files, file):
-        times.append(message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000))
-        if not times[:-1]:
-            unread.update({name: len(getattr(message, name)) for name in UNREAD})
-        if host is None and message.HasField("host_vehicle_id"):
-            host = message.host_vehicle_id.value
+        if not count:
+            unread = {name: len(getattr(message, name)) for name in UNREAD}
+            notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
+        count += 1
+        if ego is None and message.HasField("host_vehicle_id"):
+            ego, why = str(message.host_vehicle_id.value), "the host vehicle"
         if roads is None and message.lane:
             roads = message
+        t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
         for one in message.moving_object:
-            track = tracks.setdefault(one.id.value, _Track(one))
             place, turn = one.base.position, one.base.orientation
-            track.t_us.append(times[-1])
-            track.xyz.append((place.x, place.y, place.z))
-            track.angles.append((turn.yaw, turn.pitch, turn.roll))
-    chosen, why = _choose_ego(file, tracks, len(times), host, ego)
-    begin = tracks[chosen].xyz[0]
-    if not np.isfinite(begin).all():
-        raise InputError(f"{file}, object {chosen}: a place that is not finite", "repair it")
-    origin = np.array([*np.round(begin[:2]), 0.0])
+            row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
+            tracks.setdefault(one.id.value, _Track(one)).rows.append(row)
+    if ego is None:
+        ego, why = _usual_ego(file, tracks, count), "the first vehicle that is always there"
+    chosen = next((key for key in tracks if str(key) == ego), None)
+    if chosen is None:
+        raise InputError(
+            f"{file}: no moving object {ego!r} for the ego",
+            f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
+        )
+    origin = np.array([*np.round(tracks[chosen].rows[0][1:3]), 0.0])
     centres = {
-        key: track.trajectory(f"{file}, object {key}", origin) for key, track in tracks.items()
+        key: track.trajectory(f"{file}, object {key}", origin, 2 if key == chosen else 1)
+        for key, track in tracks.items()
     }
     vehicle = _vehicle(tracks[chosen])
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
     ego_log = offset_trajectory(centres[chosen], T_centre_rig)
-    if len(ego_log) < 2:
-        raise InputError(f"{file}, object {chosen}: 1 pose", "choose an ego that drives")
     lanes = {} if roads is None else _lanes(file, roads, origin)
     if any(lane.kind == "vehicle" for lane in lanes.values()):
         lane_map = bordered(lanes, LaneMap({}))
@@ -127,7 +128,12 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         ground = flat(float(np.median(ego_log.xyz[:, 2])))
         lane_map = corridor(ego_log, ground)
         lane_map = bordered(lane_map.lanes, lane_map)
-    notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
+    actors = [
+        actor
+        for key, centre in centres.items()
+        if key != chosen
+        for actor in actors_of_track(str(key), tracks[key].label, tracks[key].box, centre)
+    ]
     return RecordedLog(
         f"osi-{file.stem}",
         "osi",
@@ -135,51 +141,27 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         ground,
         ego_log,
         vehicle,
-        _actors({key: (tracks[key], centres[key]) for key in tracks if key != chosen}),
+        tuple(actors),
         (),
         (float(origin[0]), float(origin[1]), 0.0),
         files.content_hash,
-        (why, *notes),
+        (f"ego is {why}: {chosen}", *notes),
     )
 
 
-def _actors(tracks: Mapping[int, tuple[_Track, Trajectory]]) -> tuple[Actor, ...]:
-    return tuple(
-        actor
-        for key, (track, centre) in tracks.items()
-        for actor in actors_of_track(str(key), track.label, track.box, centre)
-    )
-
-
-def _choose_ego(
-    path: Path,
-    tracks: Mapping[int, _Track],
-    n_messages: int,
-    host: int | None,
-    ego: str | None,
-) -> tuple[int, str]:
-    """Return the id of the object that becomes the ego, and why it does."""
-    if ego is not None or host is not None:
-        name = str(host) if ego is None else ego
-        key = next((key for key in tracks if str(key) == name), None)
-        if key is None:
-            raise InputError(
-                f"{path}: no moving object {name!r} for the ego",
-                f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
-            )
-        return key, f"ego is {'the host vehicle' if ego is None else 'object'} {key}"
+def _usual_ego(path: Path, tracks: Mapping[int, _Track], n_messages: int) -> str:
+    """Return the vehicle of the smallest id that is present all the time."""
     always = [
         key
         for key, track in tracks.items()
-        if track.first.type == VEHICLE and len(track.t_us) == n_messages
+        if track.first.type == VEHICLE and len(track.rows) == n_messages
     ]
     if not always:
         raise InputError(
             f"{path}: {len(tracks)} moving objects, none a vehicle that is present all the time",
             "name the ego: log: {osi: FILE, ego: ID}",
         )
-    key = min(always)
-    return key, f"the trace names no host vehicle: ego is vehicle {key}; choose another with ego=ID"
+    return str(min(always))
 
 
 def _vehicle(track: _Track) -> Vehicle:
@@ -290,12 +272,7 @@ def _paint(border: Any) -> Paint:
 
 def _through(area: str, begin: Lane, end: Lane) -> Lane:
     """Return the lane through an intersection from the end of one lane to the start of another."""
-    assert begin.left is not None
-    assert begin.right is not None
-    assert end.left is not None
-    assert end.right is not None
-    left = _curve(begin.left, end.left)
-    right = _curve(begin.right, end.right)
+    left, right = (_curve(*edges) for edges in zip(rails(begin), rails(end), strict=True))
     return Lane(
         f"{area}.{begin.lane_id}.{end.lane_id}",
         (left + right) / 2,

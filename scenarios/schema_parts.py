@@ -255,6 +255,10 @@ class _Actor(Part):
     id: ActorId
     label: Label = field("Class of road user.", "car")
     size_m: tuple[Side, Side, Side] | None = field("Length, width, height; none: as usual.", None)
+    appearance: str | None = field(
+        "Gaussian file in the frame of its box, such as an actors/*.ply of an imported drive; none: built.",
+        None,
+    )
 
 
 class _InLane(_Actor):

@@ -109,6 +109,7 @@ class Actor:
     track: Trajectory
     is_static: bool = False
     behaviour: Behaviour = Behaviour()
+    appearance: str | None = None  # a Gaussian file in the box's frame; None: built
 
 
 # --- sensors

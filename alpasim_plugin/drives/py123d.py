@@ -10,7 +10,6 @@ Source: the writers of py123d 0.7.0 (github.com/kesai-labs/py123d).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -133,48 +132,36 @@ def _T(pose: Sequence[float]) -> F64:
 def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[PosedPhotograph]:
     """Return the photographs of a camera in order of time; none of a camera that is no pinhole."""
     path, name = folder / f"{key}.arrow", key.removeprefix(CAMERA)
-    facts, columns = _modality(folder, key, ("timestamp_us", "data", "camera_to_global_se3"))
+    columns = ("timestamp_us", "data", "camera_to_global_se3")
+    facts, (times, data, stated) = _modality(folder, key, columns)
     with parsing(path, DO_THIS):
-        model = facts["camera_model"]
-        if model != "pinhole" or facts["intrinsics"] is None:
-            notes.append(f"camera {name} left out: {model} without a pinhole's intrinsics")
+        if facts["camera_model"] != "pinhole":
+            notes.append(f"camera {name} left out: its lens is {facts['camera_model']}")
             return []
         fx, fy, cx, cy, skew = facts["intrinsics"]
         if skew:
-            raise InputError(f"{path}: a lens with skew {skew:g}", "give images without skew")
+            raise ValueError(f"a lens with skew {skew:g}")
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + FROM_CORNER
         bends = None if facts["is_undistorted"] else facts["distortion"]
         distortion = np.array(bends or [0.0] * 5)
         lens = Lens(facts["width"], facts["height"], K, distortion).check(str(path), DO_THIS)
-        times = columns[0].to_numpy()
-        if not (np.diff(times) > 0).all():
-            raise InputError(f"{path}: times that do not increase", DO_THIS)
-        film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(columns[1].type) else []
-        T_imu_camera = _T(facts["camera_to_imu_se3"])
-        photographs = []
-        for i, (data, pose) in enumerate(zip(columns[1], columns[2].to_pylist(), strict=True)):
-            if not data.is_valid:
-                continue
-            where, t_us = f"{path}, row {i}", int(times[i])
-            known_us = min(max(t_us, int(ego.t_us[0])), int(ego.t_us[-1]))
-            T = interpolate(ego, known_us) @ T_imu_camera if pose is None else _T(pose)
+        t_us = times.to_numpy()
+        if not (np.diff(t_us) > 0).all():
+            raise ValueError("times that do not increase")
+        of_ego = interpolate(ego, t_us.clip(ego.t_us[0], ego.t_us[-1]))
+        poses = of_ego @ _T(facts["camera_to_imu_se3"])
+        film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(data.type) else []
+        pictures = []
+        for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
+            where = f"{path}, row {i}"
+            T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), where)
             file, encoded = path, None
-            if pa.types.is_string(columns[1].type):
-                file = folder / data.as_py()
-                if not os.path.isfile(file):
-                    raise InputError(
-                        f"{where}: no photograph {file}",
-                        f"link the data set's folder {Path(data.as_py()).parts[0]} into the log's folder, or convert with camera_store_option: jpeg_binary",
-                    )
+            if pa.types.is_string(data.type):
+                file = folder / value.as_py()
             else:
-                encoded = memoryview(film[data.as_py()] if film else data.as_buffer())
-            T = rigid_pose(T.tolist(), where)
-            photographs.append(PosedPhotograph(file, lens, T, where, t_us, name, {}, encoded))
-    if len(photographs) < len(times):
-        notes.append(
-            f"camera {name}: {len(times) - len(photographs)} rows without an image left out"
-        )
-    return photographs
+                encoded = memoryview(film[value.as_py()] if film else value.as_buffer())
+            pictures.append(PosedPhotograph(file, lens, T, where, int(t_us[i]), name, {}, encoded))
+    return pictures
 
 
 def _film(path: Path) -> list[bytes]:

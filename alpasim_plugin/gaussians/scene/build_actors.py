@@ -12,13 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply import read_ply
 from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
 from alpasim_plugin.gaussians.scene.surfels import (
@@ -31,6 +34,7 @@ from alpasim_plugin.gaussians.scene.surfels import (
 )
 from alpasim_plugin.gaussians.sh import C0
 
+OUTSIDE_M, SPILL = 0.1, 0.05  # how far, and what share of, an appearance may leave the box
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(
     [
@@ -74,8 +78,13 @@ def build_actors(scenario: Scenario) -> list[SceneNode]:
 
 def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
     """Return the node of one actor of a scenario at three levels of detail, and more for sharp
-    cameras.
+    cameras; an appearance of its own has one.
     """
+    if actor.appearance is not None:
+        cloud = read_ply(Path(actor.appearance))
+        _check_size(actor, np.abs(cloud.means))
+        parts = GaussianCloud.concatenate([cloud, _shadow(actor.box, actor.label)])
+        return SceneNode(actor.actor_id, "actor", (Level(0.0, parts),))
     rng = stream(scenario.scene_id, scenario.seed, f"scene/actor/{actor.actor_id}")
     draw, noise = rng.random(8), rng.standard_normal(4096)
     shape = _SHAPES.get(actor.label, _other)
@@ -88,6 +97,20 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
         )
         levels.append(Level(float(cell_m), cloud))
     return SceneNode(actor.actor_id, "actor", tuple(levels))
+
+
+def _check_size(actor: Actor, reach: F64) -> None:
+    """Refuse an appearance of which more than `SPILL` lies outside of the actor's box, which is what
+    others hit.
+    """
+    box = actor.box
+    half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + OUTSIDE_M
+    if (reach > half).any(axis=1).mean() > SPILL:
+        own = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
+        raise InputError(
+            f"{actor.appearance}: Gaussians of {own} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
+            "give the actor this size_m, in a file whose origin is the middle of the box",
+        )
 
 
 def _shadow(box: Box, label: str) -> GaussianCloud:

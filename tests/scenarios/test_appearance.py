@@ -1,0 +1,42 @@
+"""An actor of a built road that looks like a Gaussian file, and files that are no such actor."""
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.gaussians.files.ply import write_ply
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
+from alpasim_plugin.gaussians.scene.build_actors import build_actors
+from scenarios.load import load_scenario
+
+ROAD = """version: 1
+road: {segments: [{kind: straight, length_m: 200}]}
+actors:
+  - {id: lead, kind: drive, s_m: 20, speeds: [[0, 10]]%s}
+"""
+
+
+def written(folder, half, more=", appearance: car.ply"):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1.0, 1.0, (200, 3)) * half
+    write_ply(folder / "car.ply", cloud_from_points(points, np.full((200, 3), 0.5)))
+    (folder / "scene.yaml").write_text(ROAD % more)
+    return load_scenario(folder / "scene.yaml")
+
+
+def test_an_actor_looks_like_its_file_and_the_scene_is_another_one(tmp_path):
+    built, made = written(tmp_path, (2.2, 0.9, 0.7), ""), written(tmp_path, (2.2, 0.9, 0.7))
+    plain, own = (build_actors(scenario)[0] for scenario in (built, made))
+    assert (len(plain.levels), len(own.levels)) == (3, 1)
+    assert 200 < len(own.levels[0].cloud) < 210
+    other = written(tmp_path, (2.1, 0.9, 0.7))
+    assert len({one.content_hash for one in (built, made, other)}) == 3
+
+
+@pytest.mark.parametrize(
+    ("half", "file"), [((4.0, 0.9, 0.7), "car.ply"), ((2, 0.9, 0.7), "no.ply")]
+)
+def test_a_file_that_is_larger_than_the_actor_or_missing_is_named(tmp_path, half, file):
+    with pytest.raises(InputError) as caught:
+        build_actors(written(tmp_path, half, f", appearance: {file}"))
+    assert file in caught.value.message
