@@ -18,6 +18,7 @@ from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.log.run_folder.schema import rollout_folder
 from alpasim_plugin.renderers.background import background_note
 from evaluators import resolve_evaluators
@@ -263,7 +264,7 @@ def _check_fixer_settings(
 
 
 def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
-    """Load scenarios, with a note where the background is not as stated."""
+    """Load scenarios with the files that they show, and a note where the background is not as stated."""
     loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
     for ref in dict.fromkeys(refs):  # what two suites list is driven once
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
@@ -272,6 +273,9 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
                 f"{ref.path} and {loaded[scenario.scene_id][0].path}: both have the scene id {scenario.scene_id!r}",
                 "give one of them another id, or name it once",
             )
+        for actor in scenario.actors:
+            if actor.appearance is not None:
+                build_actor(actor, scenario)
         note = background_note(scenario)
         loaded[scenario.scene_id] = (
             ref,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
@@ -31,6 +32,11 @@ def test_an_actor_looks_like_its_file_and_the_scene_is_another_one(tmp_path):
     assert 200 < len(own.levels[0].cloud) < 210
     other = written(tmp_path, (2.1, 0.9, 0.7))
     assert len({one.content_hash for one in (built, made, other)}) == 3
+
+
+def test_a_run_refuses_an_appearance_that_is_larger_than_what_is_hit(tmp_path):
+    written(tmp_path, (4.0, 0.9, 0.7))
+    assert run_command(["--renderer", "clean", "--dry-run", str(tmp_path / "scene.yaml")]) == 2
 
 
 @pytest.mark.parametrize(
