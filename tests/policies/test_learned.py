@@ -3,7 +3,7 @@ image.
 """
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -235,6 +235,42 @@ def test_plan_follows_the_pixels_and_not_the_route():
     )
     policy.reset(0, policy_route())
     assert policy.act(shifted).xy[20, 1] < plan.xy[20, 1] - 0.3
+
+
+def test_frames_of_one_camera_reach_no_other_view(tmp_path):
+    """A black camera, and one whose every second frame is late, change their own history alone."""
+    scenario = canned_scenario()
+    net = LearnedNet(3, (FRONT, *SIDES))
+    torch.nn.init.normal_(net.out.weight, std=0.1, generator=torch.Generator().manual_seed(0))
+    save_net(net, tmp_path / "three.safetensors", {})
+    cameras = {camera.name: camera for camera in scenario.cameras}
+    observations_seen = list(observations(STRAIGHT, cameras))
+    policy = Learned(scenario, weights=tmp_path / "three.safetensors")
+    assert [sensor.camera for sensor in policy.sensors] == ["front", "left", "right"]
+
+    def histories(change):
+        policy.reset(0, scenario.route)
+        for step, observation in enumerate(observations_seen):
+            frames = {name: change(name, step) or f for name, f in observation.frames.items()}
+            plan = policy.act(replace(observation, frames=frames))
+        return plan, [list(history) for history in policy.histories]
+
+    def black(name, step):
+        frame = observations_seen[step].frames[name]
+        return replace(frame, rgb=0 * frame.rgb) if name == "left" else None
+
+    def late(name, step):
+        return observations_seen[step - 1].frames[name] if name == "right" and step % 2 else None
+
+    plan, untouched = histories(lambda name, step: None)
+    for change, changed in ((black, 1), (late, 2)):
+        other, seen = histories(change)
+        assert not np.array_equal(other.xy, plan.xy)
+        for view, (a, b) in enumerate(zip(untouched, seen, strict=True)):
+            same = len(a) == len(b) and all(
+                t == u and np.array_equal(x, y) for (t, x), (u, y) in zip(a, b, strict=True)
+            )
+            assert same == (view != changed)
 
 
 def test_wrong_frame_is_refused():

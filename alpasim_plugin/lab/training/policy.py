@@ -17,7 +17,7 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstrations_digest
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M
 from alpasim_plugin.lab.training.trainer import Loss
-from policies.learned_input import level_view, network_input
+from policies.learned_input import FRONT, level_view, network_input
 from policies.learned_net import (
     GRID_M,
     KNOTS_M,
@@ -40,6 +40,8 @@ class PolicyRecipe:
         speed_noise: Standard deviation of the relative noise on both speeds.
         lateral_scale_m, lateral_scale_per_m: Lateral errors are divided by ``lateral_scale_m +
             lateral_scale_per_m * distance``.
+        black_share: Share of the samples in which a side view is black, for each side: without its
+            camera the policy drives as on average, not as at random.
         seed: Of sampling and noise.
     """
 
@@ -48,6 +50,7 @@ class PolicyRecipe:
     speed_noise: float = 0.02
     lateral_scale_m: float = 0.08
     lateral_scale_per_m: float = 0.025
+    black_share: float = 0.08
     seed: int = 0
 
 
@@ -192,6 +195,8 @@ class PolicyTask:
                 )
                 for frame, yaw in (("frame", "yaw"), ("before", "yaw_before"))
             )
+            if random is not None and view != FRONT and random.random() < self.recipe.black_share:
+                now, before = np.zeros_like(now), np.zeros_like(before)
             images.append(network_input(now, before))
         inputs = np.array([*(state / SPEED_UNIT_MPS), real], dtype=np.float32)
         gap = float(a["gap"][row])
