@@ -8,6 +8,14 @@ import math
 
 import torch
 from einops import rearrange, repeat
+from torch.nn.functional import (
+    gelu,
+    layer_norm,
+    linear,
+    rms_norm,
+    scaled_dot_product_attention,
+    silu,
+)
 
 from alpasim_plugin.block_fixers.dit import initial_weights
 
@@ -23,19 +31,11 @@ def random_weights(sizes, seed=0):
 
 
 def rms(x, gain):
-    return x / (x.pow(2).mean(-1, keepdim=True) + 1e-6).sqrt() * gain
+    return rms_norm(x, gain.shape, gain, 1e-6)
 
 
 def norm(x):
-    return (x - x.mean(-1, keepdim=True)) / (x.var(-1, unbiased=False, keepdim=True) + 1e-6).sqrt()
-
-
-def silu(x):
-    return x / (1 + torch.exp(-x))
-
-
-def gelu(x):
-    return x * 0.5 * (1 + torch.erf(x / math.sqrt(2)))
+    return layer_norm(x, x.shape[-1:], eps=1e-6)
 
 
 def rope_angles(start, frames, rows, columns, head_width, ratios):
@@ -64,9 +64,8 @@ def rotate(x, angles):
 
 
 def attend(q, k, v, mask):
-    scores = torch.einsum("bqhd,bkhd->bhqk", q, k) / math.sqrt(q.shape[-1])
-    weights = scores.masked_fill(~mask, -torch.inf).softmax(-1)
-    return rearrange(torch.einsum("bhqk,bkhd->bqhd", weights, v), "b l h d -> b l (h d)")
+    heads = (x.transpose(1, 2) for x in (q, k, v))
+    return rearrange(scaled_dot_product_attention(*heads, mask), "b h l d -> b l (h d)")
 
 
 def latent_mask(frames, block, window=None, sink=0):
@@ -100,65 +99,40 @@ def velocity(
     x, t, text, hdmap = (a.double() for a in (x, t, text, hdmap))
     b, _, frames, height, width = x.shape
     rows, columns = height // 2, width // 2
-    condition = (
-        torch.zeros(b, 1, frames, height, width).double()
-        if condition_mask is None
-        else condition_mask.double()
-    )
-    padding = (
-        torch.zeros(b, 1, frames, height, width).double()
-        if padding_mask is None
-        else padding_mask.double()
-    )
-    cut = "b c t (h p) (w q) -> b (t h w) (c p q)"
-    stream = (
-        rearrange(torch.cat([x, condition, padding], 1), cut, p=2, q=2)
-        @ sd["x_embedder.proj.1.weight"].T
-    )
-    maps = sd["additional_patch_embedding.proj.1.weight"].shape[1] // 4
-    stream = (
-        stream
-        + rearrange(hdmap[:, :maps], cut, p=2, q=2)
-        @ sd["additional_patch_embedding.proj.1.weight"].T
-    )
-    opacity = rearrange(
-        hdmap[:, maps:], cut, p=2, q=2
-    )  # of no channels where the network embeds none
+    nothing = torch.zeros_like(x[:, :1])
+    masks = [nothing if mask is None else mask.double() for mask in (condition_mask, padding_mask)]
+
+    def apply(name, y):
+        return linear(y, sd[f"{name}.weight"], sd.get(f"{name}.bias"))
+
+    def cut(y):
+        return rearrange(y, "b c t (h p) (w q) -> b (t h w) (c p q)", p=2, q=2)
+
+    name = "additional_patch_embedding.proj.1"
+    maps = sd[f"{name}.weight"].shape[1] // 4
+    stream = apply("x_embedder.proj.1", cut(torch.cat([x, *masks], 1)))
+    stream = stream + apply(name, cut(hdmap[:, :maps]))
+    opacity = cut(hdmap[:, maps:])  # of no channels where the network embeds none
     d = stream.shape[-1]
 
-    angle = (t * 0.001)[..., None] * torch.exp(
-        -math.log(10000) * torch.arange(d // 2).double() / (d // 2)
-    )
+    angle = (t * 0.001)[..., None] * 10000 ** (-torch.arange(d // 2).double() / (d // 2))
     sinusoid = torch.cat([angle.cos(), angle.sin()], -1)
     emb = rms(sinusoid, sd["t_embedding_norm.weight"])
-    lora = (
-        silu(sinusoid @ sd["t_embedder.1.linear_1.weight"].T) @ sd["t_embedder.1.linear_2.weight"].T
-    )
-    context = gelu(text @ sd["crossattn_proj.0.weight"].T + sd["crossattn_proj.0.bias"])
+    lora = apply("t_embedder.1.linear_2", silu(apply("t_embedder.1.linear_1", sinusoid)))
+    context = gelu(apply("crossattn_proj.0", text))
 
     def modulation(name, parts):
-        low = (
-            silu(emb) @ sd[f"{name}.1.weight"].T @ sd[f"{name}.2.weight"].T + lora[..., : parts * d]
-        )
+        low = apply(f"{name}.2", apply(f"{name}.1", silu(emb))) + lora[..., : parts * d]
         return repeat(low, "b t d -> b (t n) d", n=rows * columns).chunk(parts, -1)
 
-    angles = rope_angles(
-        start, frames, rows, columns, sd["blocks.0.self_attn.q_norm.weight"].shape[0], ratios
-    )
-    causal = (
-        latent_mask(frames, block or frames, window, sink)
-        .repeat_interleave(rows * columns, 0)
-        .repeat_interleave(rows * columns, 1)
-    )
-    everything = torch.ones(1, 1, dtype=torch.bool)
+    head_width = len(sd["blocks.0.self_attn.q_norm.weight"])
+    angles = rope_angles(start, frames, rows, columns, head_width, ratios)
+    causal = latent_mask(frames, block or frames, window, sink)
+    causal = causal.repeat_interleave(rows * columns, 0).repeat_interleave(rows * columns, 1)
 
     def heads(y, name, part):
+        y = rearrange(apply(f"{name}.{part}_proj", y), "b l (h d) -> b l h d", d=head_width)
         gain = sd.get(f"{name}.{part}_norm.weight")
-        y = rearrange(
-            y @ sd[f"{name}.{part}_proj.weight"].T,
-            "b l (h d) -> b l h d",
-            d=sd[f"{name}.q_norm.weight"].shape[0],
-        )
         return y if gain is None else rms(y, gain)
 
     i = 0
@@ -168,24 +142,20 @@ def velocity(
             y = norm(stream) * (1 + scale) + shift
             name = f"blocks.{i}.{sub}"
             if sub == "self_attn" and opacity.shape[-1]:
-                y = y + opacity @ sd[f"blocks.{i}.opacity_embed.weight"].T
+                y = y + apply(f"blocks.{i}.opacity_embed", opacity)
             if sub == "mlp":
-                y = gelu(y @ sd[f"{name}.layer1.weight"].T) @ sd[f"{name}.layer2.weight"].T
+                y = apply(f"{name}.layer2", gelu(apply(f"{name}.layer1", y)))
             else:
-                source = y if sub == "self_attn" else context.expand(b, *context.shape[1:])
-                q = heads(y, name, "q")
-                k = heads(source, name, "k")
-                v = heads(source, name, "v")
-                if sub == "self_attn":
+                is_self = sub == "self_attn"
+                source = y if is_self else context.expand(b, *context.shape[1:])
+                q, k, v = heads(y, name, "q"), heads(source, name, "k"), heads(source, name, "v")
+                if is_self:
                     q, k = rotate(q, angles), rotate(k, angles)
-                y = (
-                    attend(q, k, v, causal if sub == "self_attn" else everything)
-                    @ sd[f"{name}.output_proj.weight"].T
-                )
+                y = apply(f"{name}.output_proj", attend(q, k, v, causal if is_self else None))
             stream = stream + gate * y
         i += 1
     shift, scale = modulation("final_layer.adaln_modulation", 2)
-    out = (norm(stream) * (1 + scale) + shift) @ sd["final_layer.linear.weight"].T
+    out = apply("final_layer.linear", norm(stream) * (1 + scale) + shift)
     return rearrange(
         out, "b (t h w) (p q c) -> b c t (h p) (w q)", t=frames, h=rows, w=columns, p=2, q=2
     )

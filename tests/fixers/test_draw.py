@@ -2,21 +2,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.fixers.semantic_map import draw
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.fixers.semantic_map.style import COLOURS
-from tests.examples import examples, first_of
-from tests.fixers.draw_reference import draw_map_reference, draw_reference
+from tests.examples import first_of
 from tests.fixers.views import BIG, CAR, EMPTY, PIN, at, line, marked
 
 SMALL = replace(PIN, width=128, height=72, K=np.diag([0.5, 0.5, 1]) @ PIN.K)
-COARSE_RAD = 0.12  # bends by a tenth of a pixel at this size
 
 
 def lit(image, colour, slack=40):
@@ -184,8 +179,6 @@ def test_road_user_that_straddles_the_near_plane_is_drawn_where_it_is_ahead(x):
     image = draw_map(prepare_map(EMPTY), SMALL, at(), (box,))
     assert image[:, :64].any()
     assert not image[:, 70:].any()
-    twin = draw_map_reference(prepare_map(EMPTY), SMALL, at(), (box,), angle_rad=COARSE_RAD)
-    assert (np.abs(image.astype(int) - twin).max(axis=2) > 24).mean() < 0.01
 
 
 def test_camera_inside_a_box_sees_its_inside():
@@ -247,7 +240,7 @@ def test_utm_sized_coordinates_draw_the_same_picture():
     assert (np.abs(near.astype(int) - far).max(axis=2) > 1).mean() < 1e-3
 
 
-# --- the twin
+# --- parts
 
 
 def street():
@@ -271,40 +264,6 @@ def street():
     )
     boxes = tuple(ActorBox(se2(x, y, yaw, z), CAR, label) for x, y, yaw, z, label in places)
     return prepare_map(lane_map), boxes
-
-
-def test_raster_equals_the_plain_one_bit_by_bit():
-    scene, boxes = street()
-    fast = draw_map(scene, PIN, at(), boxes)
-    view, pose = draw.view_of(scene, PIN, at())
-    faces, edges = draw.actor_geometry(boxes, scene, pose)
-    lines, box_edges = (draw.strokes_of(part, pose, view) for part in (scene.segments, edges))
-    shapes = [draw.shapes_of(part, pose, view) for part in (scene.triangles, faces)]
-    strokes = np.concatenate([lines, box_edges])
-    plain = draw_reference(strokes, len(lines), np.concatenate(shapes), PIN)
-    different = np.abs(plain.astype(int) - fast).max(axis=2) > 0
-    assert different.sum() <= 2  # a sample within rounding of an edge
-    assert (fast.max(axis=2) > 0).mean() > 0.1
-
-
-@settings(max_examples=examples(25), deadline=None)
-@given(
-    a=st.tuples(*[st.floats(-30, 60)] * 2, st.floats(-3, 6)),
-    b=st.tuples(*[st.floats(-30, 60)] * 2, st.floats(-3, 6)),
-    yaw=st.floats(-3, 3),
-)
-@example(a=(0.0, -26.0, 2.0), b=(43.0, 31.0, -0.25), yaw=0.75)
-def test_any_line_is_drawn_like_its_dense_points(a, b, yaw):
-    scene = prepare_map(replace(EMPTY, road_edges=(line(a, b),)))
-    fast, twin = (
-        draw_map(scene, SMALL, at(yaw=yaw)),
-        draw_map_reference(scene, SMALL, at(yaw=yaw)),
-    )
-    only_one = (fast.max(axis=2) > 8) != (twin.max(axis=2) > 8)
-    both = (fast.max(axis=2) > 8).sum() + 20
-    assert only_one.sum() <= 0.15 * both  # rim pixels: a quarter of a pixel of bend
-    same = ~only_one
-    assert (np.abs(fast.astype(int) - twin).max(axis=2)[same] > 16).mean() < 0.002
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.geometry import inverse
-from policies.lane_filter import predict, search, shift, start, update
+from policies.lane_filter import predict, search, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from policies.road_vision import (
@@ -123,21 +123,6 @@ def test_lane_is_recovered_from_its_paint(offset, heading, curvature, width):
     assert np.allclose(lane.centre(x), offset + heading * x + curvature * x**2 / 2, atol=0.12)
 
 
-def test_outliers_beside_the_lane_do_not_pull_it():
-    good = paint_of(0.2, 0.02, 0.0, 3.5)
-    random = np.random.default_rng(1)
-    x = random.uniform(6, 30, 30)
-    stray = PaintPoints(
-        np.concatenate([good.x_m, x]),
-        np.concatenate([good.y_m, random.uniform(-6, 6, 30)]),
-        np.full(len(good.x_m) + 30, 3.0),
-        np.full(len(good.x_m) + 30, 0.06),
-    )
-    assert settled(stray, start(0.0, 0.0, 0.0)).mean[0] == pytest.approx(
-        settled(good, start(0.0, 0.0, 0.0)).mean[0], abs=0.08
-    )
-
-
 def test_prediction_sees_the_lane_that_a_moved_ego_would_see():
     """The same curve, drawn from a pose further along it."""
     road = PaintedRoad(curvature_1pm=1 / 80)
@@ -244,18 +229,3 @@ def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of
         assert np.allclose(
             settled(both, found).centre(x), truth + 0.05 * x + 0.01 * x**2 / 2, atol=0.1
         )
-
-
-def test_neighbouring_lane_is_one_width_away():
-    assert shift(start(0.2, 0.0, 0.0, 3.4), 1).mean[0] == pytest.approx(3.6)
-
-
-def test_thing_nearer_than_the_image_reaches_keeps_its_distance():
-    track = None
-    for k in range(12):
-        track = track_obstacle(track, (max(8.0 - 0.3 * k, 5.5), 0.3), 3.0, 0.1, 5.5)
-    assert track is not None
-    for _ in range(10):
-        track = track_obstacle(track, (5.5, 0.3), 0.0, 0.1, 5.5)
-        assert track is not None
-    assert track.distance_m < 5.5

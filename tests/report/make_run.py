@@ -333,37 +333,12 @@ def _files(folder, row, content, plan):
 
 
 def _picture(renderer, k, width, height):
-    image = np.zeros((height, width, 3), np.uint8)
-    horizon = int(height * 0.45)
-    image[:horizon] = np.linspace((225, 190, 150), (240, 225, 205), horizon)[:, None]
-    image[horizon:] = (98, 96, 94)
-    vanish = np.array([width * (0.5 + 0.01 * k), horizon])
-    for x, colour in ((-0.1, (235, 235, 235)), (0.62, (235, 235, 235)), (1.3, (120, 150, 120))):
-        cv2.line(
-            image,
-            vanish.astype(int).tolist(),
-            (int(x * width), height),
-            colour,
-            max(1, width // 120),
-            cv2.LINE_AA,
-        )
-    for side, tone in ((-1, (120, 140, 165)), (1, (140, 130, 120))):
-        x = int(width * (0.5 + side * 0.36))
-        cv2.rectangle(
-            image,
-            (x - width // 9, horizon - height // 3),
-            (x + width // 9, horizon + height // 12),
-            tone,
-            -1,
-        )
-    car = width // 14 + k * width // 60
-    cv2.rectangle(
-        image,
-        (int(vanish[0]) - car, horizon),
-        (int(vanish[0]) + car, horizon + car),
-        (60, 40, 130),
-        -1,
-    )
+    image = np.full((height, width, 3), (98, 96, 94), np.uint8)
+    horizon, middle, car = int(height * 0.45), width // 2, width // 14 + k * width // 60
+    image[:horizon] = (230, 205, 175)
+    for x in (0.0, 0.62, 1.3):
+        cv2.line(image, (middle, horizon), (int(x * width), height), (235, 235, 235), 2)
+    image[horizon : horizon + car, middle - car : middle + car] = (60, 40, 130)
     if renderer == "3dgs":
         image = cv2.GaussianBlur(image, (0, 0), 1.5 + 1.2 * k)
     elif renderer == "onefixer":
@@ -371,45 +346,24 @@ def _picture(renderer, k, width, height):
     return image
 
 
+CELL = dict.fromkeys(("renderer", "policy", "scene"), pa.string()) | {"seed": pa.int64()}
+
+
+def _write(path, rows, fields):
+    pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(CELL | fields)), path)
+
+
 def _write_rows(folder, rows):
-    fields = [
-        ("renderer", pa.string()),
-        ("policy", pa.string()),
-        ("scene", pa.string()),
-        ("seed", pa.int64()),
-        ("status", pa.string()),
-    ]
-    fields += [
-        ("failure_class", pa.string()),
-        ("failure", pa.string()),
-        ("path", pa.string()),
-        ("wall_s", pa.float64()),
-    ]
-    fields += [("frames", pa.int64()), ("steps", pa.int64())]
+    fields = dict.fromkeys(("status", "failure_class", "failure", "path"), pa.string())
+    fields |= {"wall_s": pa.float64(), "frames": pa.int64(), "steps": pa.int64()}
     for name in METRICS:
-        fields += [(name, pa.float64()), (f"{name}_valid", pa.bool_())]
-    schema = pa.schema(fields)
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), folder / "rollouts.parquet")
+        fields |= {name: pa.float64(), f"{name}_valid": pa.bool_()}
+    _write(folder / "rollouts.parquet", rows, fields)
 
 
 def _write_steps(folder, steps):
-    fields = [
-        ("renderer", pa.string()),
-        ("policy", pa.string()),
-        ("scene", pa.string()),
-        ("seed", pa.int64()),
-        ("t_us", pa.int64()),
-    ]
-    fields += [
-        ("metric", pa.string()),
-        ("value", pa.float64()),
-        ("valid", pa.bool_()),
-        ("reason", pa.string()),
-    ]
-    schema = pa.schema(fields)
-    pq.write_table(
-        pa.Table.from_pylist(steps, schema=schema), folder / "steps.parquet", compression="zstd"
-    )
+    fields = {"t_us": pa.int64(), "metric": pa.string(), "value": pa.float64()}
+    _write(folder / "steps.parquet", steps, fields | {"valid": pa.bool_(), "reason": pa.string()})
 
 
 def summary_of(rows, plan, table):

@@ -2,8 +2,7 @@
 seen from a camera.
 
 Prepare a scene once (`prepare_map`), then draw it from any pinhole camera. A depth buffer resolves
-occlusion; colours and widths fade with depth along the optical axis. Tests compare with the
-reference implementation `tests/fixers/draw_reference.py`.
+occlusion; colours and widths fade with depth along the optical axis.
 
 Camera axes are x right, y down, z forward; pixel (row i, column j) covers columns j to j + 1 and
 rows i to i + 1.

@@ -1,7 +1,6 @@
 """Draw strokes and shapes into an image with a depth buffer, band by band, four samples a pixel.
 
-The rules are those of `tests/fixers/draw_reference.py`; here pixels that cannot be covered are
-skipped. A band of rows is drawn by one thread in the order of the lists, so the image does not
+Pixels that cannot be covered are skipped. A band of rows is drawn by one thread in the order of the lists, so the image does not
 depend on the number of threads.
 """
 

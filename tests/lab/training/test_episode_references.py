@@ -32,43 +32,32 @@ INDEX = np.arange(3)
 K = [[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]
 
 
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory):
-    """Give a sequence with three recorded frames; a wall stands 10 m ahead."""
-    folder = tmp_path_factory.mktemp("references") / "train" / "a"
-    wall = np.full((HEIGHT, WIDTH), 10, np.float16)
-    car = Actor(
-        "car",
-        "car",
-        Box(4, 2, 1.5),
-        Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
-    )
+WALL = np.full((HEIGHT, WIDTH), 10, np.float16)
+STANDS = Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
+CAR = Actor("car", "car", Box(4, 2, 1.5), STANDS)
+
+
+def written(folder, frames, count):
+    """Write a sequence with so many recorded frames; a wall stands 10 m ahead."""
 
     def recorded(i):
         T = np.eye(4)
         T[0, 3] = 2.0 * i
-        return RecordedFrame(
-            200_000 * i,
-            "front",
-            np.array(K),
-            T,
-            {},
-            lambda: (pair(10 * i).rgb_gt, wall.astype(np.float32)),
-        )
+        shown = pair(10 * i).rgb_gt, WALL.astype(np.float32)
+        return RecordedFrame(200_000 * i, "front", np.array(K), T, {}, lambda: shown)
 
     def beside(partial):
-        write_references(
-            partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car]
-        )
+        write_references(partial, frames, [recorded(i) for i in range(count)], [CAR])
 
-    write_sequence(
-        folder,
-        (pair(i) for i in range(FRAMES)),
-        FRAMES,
-        {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}},
-        beside,
-    )
+    info = {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}
+    write_sequence(folder, (pair(i) for i in range(FRAMES)), FRAMES, info, beside)
     return PairSequence(folder)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("references") / "train" / "a"
+    return written(folder, [FrameGeometry(WALL, {})] * FRAMES, 3)
 
 
 def shown(
@@ -89,37 +78,12 @@ def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence):
 
 def test_road_users_are_where_their_boxes_are(tmp_path):
     """A car of 4 x 2 x 1.5 m stands 10 m ahead of the camera in the first frame alone."""
-    wall, T_world_box = np.full((HEIGHT, WIDTH), 10, np.float16), np.eye(4)
+    T_world_box = np.eye(4)
     T_world_box[2, 3] = 10.0
-    frames = [FrameGeometry(wall, {"car": T_world_box} if i == 0 else {}) for i in range(FRAMES)]
-    car = Actor(
-        "car",
-        "car",
-        Box(4, 2, 1.5),
-        Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
-    )
-    recorded = [
-        RecordedFrame(
-            0,
-            "front",
-            np.array(K),
-            np.eye(4),
-            {},
-            lambda: (pair(0).rgb_gt, wall.astype(np.float32)),
-        )
-    ]
-    info = {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}
-    write_sequence(
-        tmp_path / "a",
-        (pair(i) for i in range(FRAMES)),
-        FRAMES,
-        info,
-        lambda to: write_references(to, frames, recorded, [car]),
-    )
-    whole = road_users(
-        PairSequence(tmp_path / "a"), np.array([0, 1]), slice(0, HEIGHT), slice(0, WIDTH)
-    )
-    part = road_users(PairSequence(tmp_path / "a"), np.array([0]), slice(8, 24), slice(16, 48))
+    frames = [FrameGeometry(WALL, {"car": T_world_box} if i == 0 else {}) for i in range(FRAMES)]
+    with_car = written(tmp_path / "a", frames, 1)
+    whole = road_users(with_car, np.array([0, 1]), slice(0, HEIGHT), slice(0, WIDTH))
+    part = road_users(with_car, np.array([0]), slice(8, 24), slice(16, 48))
     assert whole[0].any()
     assert not whole[0].all()
     assert not whole[1].any()

@@ -1,6 +1,4 @@
-"""Image models and windows as sessions: streaming equals the whole clip, cameras are independent,
-windows cover a clip.
-"""
+"""Image models and windows as sessions: cameras are independent, windows cover a clip."""
 
 from dataclasses import replace
 
@@ -16,9 +14,6 @@ from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.window_fixer import fade_weights, windows
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings
-from tests.lab.training.whole_clip_images import whole_clip_images
-
-STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")
 
 
 @pytest.fixture(autouse=True)
@@ -51,39 +46,6 @@ def run(fixer, frames):
 
 def levels(a, b):
     return int(np.abs(a.astype(int) - b).max())
-
-
-@pytest.mark.parametrize("overrides", [(), ("decoder.kind=latent",)], ids=["render", "latent"])
-@pytest.mark.parametrize("name", STREAMED)
-def test_streaming_equals_the_whole_clip(
-    session,
-    settings_of,
-    name,
-    overrides,
-):
-    frames = moving_picture(7, (16, 40))
-    streamed = pixels(run(session(name, *overrides), frames))
-    assert (
-        levels(streamed, whole_clip_images(settings_of(name, *overrides), frames, "scene", 0)) <= 1
-    )
-    assert np.abs(streamed.astype(int) - pixels(frames)).mean() > 2, "these weights do something"
-
-
-@pytest.mark.parametrize(
-    ("count", "stitch"), [(7, "fade"), (25, "fade"), (45, "fade"), (45, "cut")]
-)
-def test_windows_equal_the_weighted_sum_over_the_whole_clip(session, settings_of, count, stitch):
-    frames = moving_picture(count, (16, 24))
-    streamed = run(session("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames)
-    assert [frame.t_us for frame in streamed] == [frame.t_us for frame in frames]
-    if count < 25:
-        frames = frames + [
-            replace(frames[-1], t_us=frames[-1].t_us + 1 + i) for i in range(25 - count)
-        ]
-    wanted = whole_clip_images(
-        settings_of("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames, "scene", 0
-    )
-    assert levels(pixels(streamed), wanted[:count]) <= 1
 
 
 @pytest.mark.parametrize("frames", [1, 8, 25, 26, 42, 59, 60, 198, 900])
