@@ -10,11 +10,9 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parents[1]
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "---") -> str:
-    """Return a Markdown table; bars inside of cells are escaped. ``align`` is of all columns but the
-    first.
-    """
-    lines = [head, ["---", *[align] * (len(head) - 1)], *rows]
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; bars inside of cells are escaped."""
+    lines = [head, ["---"] * len(head), *rows]
     cells = [[cell.replace("|", r"\|") for cell in line] for line in lines]
     return "\n".join(f"|{'|'.join(line)}|" for line in cells) + "\n"
 

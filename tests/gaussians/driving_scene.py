@@ -26,7 +26,7 @@ def driving_like_scene(n, seed=0, sh_degree=3):
     sh = rng.normal(0, 0.03, (n, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = rng.uniform(-1.2, 1.2, (n, 3))
     opacities = np.clip(rng.beta(4.0, 1.2, n), 0.02, 0.999)
-    turned = [1.0, 0, 0, 0] + rng.normal(0, 0.1, (n, 4))
+    turned = np.eye(4)[0] + rng.normal(0, 0.1, (n, 4))
     return GaussianCloud(means, *(x.astype(np.float32) for x in (turned, scales, opacities, sh)))
 
 

@@ -77,7 +77,7 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path)
             if 0 < left < 248 and 0 < top < 184:
                 found = cv2.moments(view.rgb[top : top + 8, left : left + 8, 0])
                 centre = np.array([found["m10"], found["m01"]]) / found["m00"] + 0.5
-                assert np.abs(centre + [left, top] - [u, v]).max() < 0.4
+                assert np.abs(centre - [u - left, v - top]).max() < 0.4
 
 
 @pytest.mark.parametrize(
