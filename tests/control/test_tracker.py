@@ -98,14 +98,6 @@ def test_lane_change_is_followed_within_ten_centimetres(speed):
     assert np.abs(went[:, 0] - speed * 0.1 * np.arange(len(went))).max() < 0.1
 
 
-def test_mirrored_plan_gives_the_mirrored_drive():
-    t = np.arange(0, 10, 0.1)
-    a = 8 * t / 15
-    left = drive(plan_of(t, 15 * np.sin(a), 15 * (1 - np.cos(a)), a), at(speed=8.0), 5.0)
-    right = drive(plan_of(t, 15 * np.sin(a), -15 * (1 - np.cos(a)), -a), at(speed=8.0), 5.0)
-    assert np.allclose(xy(left) * [1, -1], xy(right), atol=1e-9)
-
-
 def test_drive_does_not_depend_on_where_in_the_world_it_happens():
     t = np.arange(
         0, 10, 0.0937

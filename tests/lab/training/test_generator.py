@@ -17,7 +17,7 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
-from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
+from alpasim_plugin.lab.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
@@ -63,11 +63,6 @@ def run_of(data, recipe, *, steps=2, init=None):
         BatchForm(clips=2, columns=4),
         schedule,
     )
-
-
-def task_of(run, clips, distance=("b", brightness)):
-    stage = run.recipe.stages[0]
-    return stage.objective.task(stage_inputs(run, stage, clips, run.weights, distance))
 
 
 def objectives_of(recipe):
@@ -177,21 +172,3 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     )
     np.testing.assert_array_equal(fixed, blacked)
     assert (fixed != nothing).any()
-
-
-def test_draws_are_functions_of_their_number(data, tmp_path):
-    run, clips = run_of(data, "V9"), clips_of(data, tmp_path)
-    one, two = task_of(run, clips), task_of(run, clips)
-    two.batch(0)
-    a, b = one.batch(5), two.batch(5)
-    assert all(
-        torch.equal(getattr(a.sample, key), getattr(b.sample, key))
-        for key in ("z_0", "z_r", "m", "eps", "t")
-    )
-    assert a.sample.w == b.sample.w
-    assert a.sample.z_0.shape == (2, 16, 4, 4, 4)  # cropped to 4 of 6 columns
-    assert not torch.equal(a.sample.eps, one.batch(6).sample.eps)
-    with pytest.raises(InputError):
-        BatchForm(columns=3)
-    with pytest.raises(InputError):
-        task_of(run, clips, None)
