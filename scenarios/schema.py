@@ -81,6 +81,7 @@ class EnvironmentSpec(Part):
         "Light: of day, of a low sun ahead, or of lamps.", "day"
     )
     rain: float = number(0, 200, "Rain, mm/h; 0: dry.", 0.0)
+    snow: float = number(0, 10, "Snowfall, mm/h of water; 0: none falls and none lies.", 0.0)
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:

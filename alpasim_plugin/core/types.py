@@ -381,11 +381,12 @@ class Environment:
     )
     time: Literal["day", "low_sun", "night"] = "day"
     rain: float = 0.0  # mm/h
+    snow: float = 0.0  # mm/h of water
 
     @property
     def in_clear_day(self) -> Environment:
         """Return the same surroundings without weather: what is built and reconstructed."""
-        return replace(self, fog_visibility_m=None, time="day", rain=0.0)
+        return replace(self, fog_visibility_m=None, time="day", rain=0.0, snow=0.0)
 
 
 @dataclass(frozen=True)

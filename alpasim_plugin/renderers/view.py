@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.types import F32, F64, HeightField
+from alpasim_plugin.core.types import F32, F64, Box, HeightField
 from alpasim_plugin.world.ground import height_at
 
 # What is less than this above the ground, and so much more with distance, is ground that the model
-# shows too near; what is twice as high is none.
-GROUND_M, GROUND_PER_M = 0.25, 0.01
+# shows too near, unless it is about so near to a road user; what is twice as high is none.
+GROUND_M, GROUND_PER_M, BOX_M = 0.35, 0.015, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,13 @@ class View:
         return self.T_world_camera[:3, 3]
 
 
-def view_of(depth: F32, K: F64, T_world_camera: F64, ground: HeightField) -> View:
+def view_of(
+    depth: F32,
+    K: F64,
+    T_world_camera: F64,
+    ground: HeightField,
+    boxes: Sequence[tuple[F64, Box]] = (),
+) -> View:
     """Return the view of a depth image.
 
     Args:
@@ -54,6 +61,7 @@ def view_of(depth: F32, K: F64, T_world_camera: F64, ground: HeightField) -> Vie
         K: ``(3, 3)`` intrinsics of the pinhole, pixels.
         T_world_camera: ``(4, 4)`` its pose.
         ground: Heights of the ground.
+        boxes: Poses and sizes of road users.
     """
     height, width = depth.shape
     local = np.ones((height, width, 3), np.float32)
@@ -70,9 +78,13 @@ def view_of(depth: F32, K: F64, T_world_camera: F64, ground: HeightField) -> Vie
     low = points[is_low] + T_world_camera[:3, 3]
     above_m = low[:, 2] - height_at(ground, low)
     limit_m = GROUND_M + GROUND_PER_M * distance_m[is_low]
+    share = np.clip(2 - above_m / limit_m, 0, 1)
+    for pose, box in boxes:
+        reach = BOX_M + np.array([box.length_m, box.width_m, box.height_m]) / 2
+        share[(np.abs((low - pose[:3, 3]) @ pose[:3, :3]) < reach).all(axis=1)] = 0
     belongs = np.zeros(depth.shape, np.float32)
-    belongs[is_low] = np.clip(2 - above_m / limit_m, 0, 1)
-    points[is_low, 2] -= belongs[is_low] * above_m
+    belongs[is_low] = share
+    points[is_low, 2] -= share * above_m
     return View(K, T_world_camera, rays, depth_m, distance_m, belongs, points)
 
 

@@ -5,7 +5,8 @@ and a low sun put another light there, rain wets the ground, and lamps shine
 (`alpasim_plugin.renderers.lights`). Air takes light away with distance and adds its own
 (Koschmieder, 1924): ``L = L_0 exp(-beta d) + A (1 - exp(-beta d))``, where d is the distance along
 the pixel's ray. Of fog ``beta = 3.912 / visibility``: at the visibility, 2 % of a contrast is left
-(CIE 17.4). Rain adds an extinction of its own (`alpasim_plugin.renderers.rain`).
+(CIE 17.4). Rain and snow add their own (`alpasim_plugin.renderers.precipitation`); snow lies on what
+is seen (`alpasim_plugin.renderers.snow`).
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn
-from alpasim_plugin.renderers.rain import extinction, mirrored_share, streaks, wet_albedo
+from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
+from alpasim_plugin.renderers.snow import ALBEDO, SnowCover
 from alpasim_plugin.renderers.view import View, view_of
 
 KOSCHMIEDER = 3.912  # -ln(0.02)
-FOG_SRGB = (202, 206, 210)  # light of the air itself, by day
 STEPS = 4095  # of the table from linear light to bytes
 # At night, in lux: what a camera shows as white, and the light of the sky over a town; in white:
 # what it compresses any light of lamps to.
@@ -59,6 +60,8 @@ def _encoded(light: F64) -> F64:
 
 
 LIGHT_OF_BYTE = _linear(np.arange(256) / 255.0).astype(np.float32)
+FOG_SRGB = (202, 206, 210)
+DAY_AIR_RGB = LIGHT_OF_BYTE[list(FOG_SRGB)]  # of the air itself, and of what falls
 BYTE_OF_STEP = np.rint(255 * _encoded(np.arange(STEPS + 1) / STEPS)).astype(np.uint8)
 
 
@@ -83,9 +86,12 @@ class WeatherRenderer(Renderer):
         self.is_clear = scenario.environment == scenario.environment.in_clear_day
         self.lights = SceneLights(scenario)
         self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], np.float32)
-        self.air_rgb = LIGHT_OF_BYTE[list(FOG_SRGB)] * self.light_rgb
-        visibility_m = scenario.environment.fog_visibility_m or np.inf
-        self.extinction = KOSCHMIEDER / visibility_m + extinction(scenario.environment.rain)
+        self.air_rgb = DAY_AIR_RGB * self.light_rgb
+        rates = ((RAIN, scenario.environment.rain), (SNOW, scenario.environment.snow))
+        self.falling = [(kind, rate) for kind, rate in rates if rate]
+        self.extinction = KOSCHMIEDER / (scenario.environment.fog_visibility_m or np.inf)
+        self.extinction += sum(kind.extinction(rate) for kind, rate in self.falling)
+        self.snow = SnowCover(scenario) if scenario.environment.snow else None
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # that of the base
@@ -115,7 +121,7 @@ class WeatherRenderer(Renderer):
         if frame.depth is None:
             raise RendererError(
                 f"weather over {type(self.base).__name__}: its frame has no depth",
-                "Remove environment.time, rain and fog_visibility_m, or let the renderer return depth",
+                "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
             )
         image, camera = (frame.rgb, frame.depth), request.camera
         taken = RecordedFrame(
@@ -132,15 +138,19 @@ class WeatherRenderer(Renderer):
         """Return an image in this weather, and its depth."""
         rgb, depth = frame.read()
         environment = self.scenario.environment
-        view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground)
+        sizes = {one.actor_id: one.box for one in self.scenario.actors}
+        boxes = [(T, sizes[name]) for name, T in frame.actors.items() if name in sizes]
+        view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground, boxes)
         T_world_rig = interpolate(self.scenario.ego_log, frame.t_us)
         for camera in self.scenario.cameras:
             if camera.name == frame.camera:
                 T_world_rig = frame.T_world_camera @ inverse(camera.T_rig_camera)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
-        if environment.rain:
+        if environment.rain or environment.snow:
             light += view.ground[..., None] * (wet_albedo(light) - light)
+        if self.snow:
+            light += self.snow.on(view)[..., None] * (ALBEDO - light)
         illumination = self.light_rgb
         if self.lights.is_night:
             lamps = self.lights.lux(view, T_world_rig) / np.float32(WHITE_LUX)
@@ -157,10 +167,10 @@ class WeatherRenderer(Renderer):
             light += glow
         if environment.time == "low_sun":
             light += self._veil(view)
-        if environment.rain:
-            key = (self.scenario.scene_id, self.seed, f"rain.{frame.camera}", frame.t_us)
-            covered = streaks(depth.shape, frame.K, environment.rain, stream(*key))
-            light += covered[..., None] * (self.air_rgb - light)
+        for kind, rate in self.falling:
+            key = (self.scenario.scene_id, self.seed, f"{kind.name}.{frame.camera}", frame.t_us)
+            covered = kind.covered(depth.shape, frame.K, rate, stream(*key))
+            light += covered[..., None] * (DAY_AIR_RGB * illumination - light)
         return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
 
     def _mirrored(self, view: View, spots: Sequence[Spot], ground_m: float) -> F32:

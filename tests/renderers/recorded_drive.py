@@ -20,13 +20,13 @@ EXPOSURE = 1.2  # of the fitted photographs
 WIDE, HIGH = 64, 48
 
 
-def recorded_drive(folder, count=9):
+def recorded_drive(folder, count=9, long_m=60.0):
     """Write a model and photographs every 0.2 s, the fourth held out, and of a right camera 0.5 m
     beside; return the scenario.
     """
     x, y = (
         axis.ravel()
-        for axis in np.meshgrid(np.arange(-5.0, 60.0, 0.5), np.arange(-10.0, 10.0, 0.5))
+        for axis in np.meshgrid(np.arange(-5.0, long_m, 0.5), np.arange(-10.0, 10.0, 0.5))
     )
     n = len(x)
     means, flat = np.column_stack([x, y, np.zeros(n)]), np.tile([0.3, 0.3, 0.02], (n, 1))
