@@ -6,7 +6,6 @@ A frame is drawn at the shutter's end, unless its request says when its pixels a
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -23,6 +22,7 @@ from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.background import read_background
+from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.rolling import draw_frame
 from alpasim_plugin.world.ground import height_at
 
@@ -64,41 +64,7 @@ class CleanRenderer(Renderer):
 
 def scene_of(scenario: Scenario) -> SceneGraph:
     """Return the scenario's scene, built once per process."""
-    return in_memory(f"scene:{scene_key(scenario)}", partial(_build, scenario))
-
-
-def scene_key(scenario: Scenario) -> str:
-    """Return what a scene's look depends on, as a digest: the source's content, the seed and what
-    is built.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    for part in (
-        scenario.scene_id,
-        scenario.seed,
-        scenario.content_hash,
-        scenario.environment.in_clear_day,
-        scenario.background,
-        scenario.vehicle.box,
-    ):
-        digest.update(repr(part).encode())
-    digest.update(
-        repr(
-            [
-                (c.name, c.width, c.height, c.K.tolist(), c.T_rig_camera.tolist())
-                for c in scenario.cameras
-            ]
-        ).encode()
-    )
-    digest.update(scenario.ego_log.xyz.tobytes())
-    for actor in scenario.actors:
-        digest.update(
-            f"{actor.actor_id}{actor.label}{actor.box}{actor.is_static}".encode()
-            + actor.track.xyz.tobytes()
-        )
-    if not scenario.content_hash:
-        for lane in scenario.lane_map.lanes.values():
-            digest.update(lane.lane_id.encode() + lane.centre.tobytes())
-    return digest.hexdigest()
+    return in_memory(f"scene:{reconstruction_key(scenario, None)}", partial(_build, scenario))
 
 
 def clear_cache(kind: str = "") -> None:

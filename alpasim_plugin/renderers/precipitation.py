@@ -5,6 +5,7 @@ wet.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from alpasim_plugin.core.types import F32, F64
 
 WATER_INDEX = 1.33  # of refraction
 FILM_SHARE = 0.15  # of wet ground that is smooth enough for a mirror
-NEAR_M, FAR_M = 0.6, 4.0  # distances of the particles that are drawn
+SHELLS_M = (4.0, 3.0, 2.2, 1.6, 1.2, 0.85, 0.6)  # about the camera, of particles that are drawn
 SUBPIXEL_BITS = 4  # sixteenths
 
 
@@ -58,23 +59,18 @@ class Precipitation:
         per_mm = self.slope[0] * rate_mm_per_h ** self.slope[1]
         per_m3 = self.density[0] * rate_mm_per_h ** self.density[1] / per_mm * np.exp(-per_mm)
         area = shape[0] * shape[1] / (K[0, 0] * K[1, 1])  # of the view at 1 m
-        count = rng.poisson(per_m3 * area * FAR_M**3 / 3)
-        scale = K[1, 1] / np.maximum(FAR_M * np.cbrt(rng.random(count)), NEAR_M)  # pixels a metre
-        begin = rng.random((count, 2)) * shape[::-1]
-        end = begin + np.outer(scale * self.fallen_m, [0, 1])
-        lines = np.rint(16 * np.stack([begin, end], axis=1)).astype(np.int32)
-        size_px = scale * self.size_m
-        in_a_row = size_px / np.maximum(scale * self.fallen_m, 1)
-        share = np.minimum(size_px, 1) * np.minimum(in_a_row, 1)
         drawn = np.zeros(shape, np.float32)
-        group = np.ceil(4 * size_px).astype(int)
-        for quarters in np.unique(group):
-            mine = group == quarters
-            width_px = int(max(1, quarters // 4))
-            value = float(share[mine].mean())
-            cv2.polylines(
-                drawn, list(lines[mine]), False, value, width_px, cv2.LINE_8, SUBPIXEL_BITS
-            )
+        for far_m, near_m in pairwise(SHELLS_M):
+            px_per_m = K[1, 1] * 2 / (far_m + near_m)
+            size_px, fallen_px = px_per_m * self.size_m, px_per_m * self.fallen_m
+            share = min(size_px, 1) * min(size_px / max(fallen_px, 1), 1)
+            count = rng.poisson(per_m3 * area * (far_m**3 - near_m**3) / 3)
+            begin = rng.random((count, 2)) * shape[::-1]
+            lines = np.rint(
+                16 * np.stack([begin, begin + np.array([0, fallen_px])], axis=1)
+            ).astype(np.int32)
+            width_px = max(1, int(size_px))
+            cv2.polylines(drawn, list(lines), False, share, width_px, cv2.LINE_8, SUBPIXEL_BITS)
         return drawn
 
 

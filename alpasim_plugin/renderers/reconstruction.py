@@ -47,12 +47,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
     nodes_by_tile,
     tile_numbers,
 )
-from alpasim_plugin.renderers.gaussian import (
-    CleanRenderer,
-    in_memory,
-    scene_key,
-    scene_of,
-)
+from alpasim_plugin.renderers.gaussian import CleanRenderer, in_memory, scene_of
 from alpasim_plugin.renderers.reconstruction_key import (
     REFUSED_S,
     ReconstructionRecipe,
@@ -140,9 +135,12 @@ def model_of(scenario: Scenario, threads: int | None = None) -> Model:
     """
     recipe = recipe_of(scenario)
     key = reconstruction_key(scenario, recipe)
-    return in_memory(
-        f"reconstruction:{key}", lambda: scene_from(scenario, *ensure(scenario, recipe, threads))
-    )
+
+    def read() -> Model:
+        model, sky_views = ensure(scenario, recipe, threads)
+        return Model(_graph(model, scenario), SkyMask(sky_views))
+
+    return in_memory(f"reconstruction:{key}", read)
 
 
 def ensure(
@@ -166,23 +164,18 @@ def ensure(
     )
 
 
-def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[SkyView]) -> Model:
-    """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built
-    (paper, App. A).
+def _graph(model: Reconstruction, scenario: Scenario) -> SceneGraph:
+    """Return a model as a scene: its background is cut into tiles, and actors that it lacks are
+    spliced in as built ones (paper, App. A).
     """
-    missing = [
-        finished(build_actor(actor, scenario), scenario)
-        for actor in scenario.actors
-        if actor.actor_id not in model.actors
-    ]
-    return Model(_graph(model, missing), SkyMask(sky_views))
-
-
-def _graph(model: Reconstruction, missing: Sequence[SceneNode]) -> SceneGraph:
-    """Join a model and the actors that it lacks; its background is cut into tiles."""
     tile = tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003)
     fitted = [
         SceneNode(name, "actor", (Level(0.0, cloud),)) for name, cloud in model.actors.items()
+    ]
+    missing = [
+        finished(build_actor(actor, scenario), scenario)
+        for actor in scenario.actors
+        if actor.actor_id not in model.actors and not actor.actor_id.startswith(STANDING_ID)
     ]
     return SceneGraph(
         nodes_by_tile("fit", [(0.0, model.background, tile)]), [*fitted, *missing], model.sky
@@ -193,7 +186,7 @@ class ImportedRenderer(Renderer):
     """Render the reconstruction of an imported drive.
 
     Raises:
-        InputError: The scenario names no model, or its folder holds no finished reconstruction.
+        InputError: The folder of the scenario's model holds no finished reconstruction.
     """
 
     has_history = False
@@ -201,7 +194,12 @@ class ImportedRenderer(Renderer):
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
         self.device = require_device(device)
-        self.graph = graph_of(scenario)
+        assert scenario.model is not None, "a drive without a model has no such renderer"
+        folder = Path(scenario.model)
+        self.graph = in_memory(
+            f"imported:{reconstruction_key(scenario, None)}",
+            lambda: _graph(Reconstruction.load(folder), scenario),
+        )
         self.fitted = [one for one in scenario.recording if one.use == "fitted"]
 
     def render(self, request: RenderRequest) -> Frame:
@@ -225,29 +223,6 @@ class ImportedRenderer(Renderer):
         known = {name: T for name, T in actors.items() if name in self.graph.actors}
         out = self.graph.render(camera, known, self.threads, self.device)
         return out.with_sky(camera.above_horizon())
-
-
-def graph_of(scenario: Scenario) -> SceneGraph:
-    """Return the model of an imported drive as a scene, read once per process; road users that it
-    lacks are drawn as built ones are.
-    """
-    if scenario.model is None:
-        raise InputError(
-            f"{scenario.scene_id}: no model",
-            "import the drive again: simrun import drive FOLDER -o OUT",
-        )
-    folder = Path(scenario.model)
-
-    def read() -> SceneGraph:
-        model = Reconstruction.load(folder)
-        missing = [
-            build_actor(actor, scenario)
-            for actor in scenario.actors
-            if actor.actor_id not in model.actors and not actor.actor_id.startswith(STANDING_ID)
-        ]
-        return _graph(model, missing)
-
-    return in_memory(f"imported:{scene_key(scenario)}:{folder}", read)
 
 
 def exposure_near(fitted: Sequence[Photograph], camera: str, place: F64) -> F32:

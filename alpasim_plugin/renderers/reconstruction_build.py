@@ -36,7 +36,7 @@ FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is
 def build(
     scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, folder: Path
 ) -> None:
-    """Fit a reconstruction and write it into an empty folder.
+    """Fit a reconstruction, from misplaced poses and rough depth, and write it into an empty folder.
 
     Points inside the boxes of actors never start a background Gaussian. Without ``fit_actors``
     nothing explains the actors' pixels, as in the second fit of the cycle render (paper, App. A,
@@ -59,37 +59,9 @@ def build(
         lateral_m=recipe.lateral_offset_m,
         threads=threads,
     )
-    model, sky_views = reconstruct(
-        views, {a.actor_id: a.box for a in scenario.actors}, recipe, scenario.scene_id, threads
-    )
-    facts = {"scene_id": scenario.scene_id, "recipe": asdict(recipe), "views": len(views)}
-    write_model(folder, model, sky_views, facts)
-
-
-def reconstruct(
-    views: Sequence[PosedView],
-    boxes: Mapping[str, Box],
-    recipe: ReconstructionRecipe,
-    scene_id: str,
-    threads: int | None,
-) -> tuple[Reconstruction, list[SkyView]]:
-    """Fit a model to views as a recipe says: from misplaced poses and rough depth.
-
-    Args:
-        views: In order of time, with depth.
-        boxes: Size of each actor that a view may show.
-        recipe: Amounts and schedule.
-        scene_id: Key of the random streams, with the recipe's seed.
-        threads: Of the rasteriser.
-
-    Returns:
-        The model, and where its views showed sky.
-
-    Raises:
-        InputError: The views show nothing.
-    """
-    splat = recipe.splat
+    scene_id = scenario.scene_id
     believed = misplaced(views, recipe.pose_error_m, scene_id, splat.seed)
+    boxes = {one.actor_id: one.box for one in scenario.actors}
     start = rough_start(believed, boxes, recipe, scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})
     with _one_torch_thread():
@@ -105,7 +77,8 @@ def reconstruct(
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
     }
     sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in believed if v.sky is not None]
-    return Reconstruction(fitted.background, actors, fitted.sky), sky_views
+    facts = {"scene_id": scene_id, "recipe": asdict(recipe), "views": len(views)}
+    write_model(folder, Reconstruction(fitted.background, actors, fitted.sky), sky_views, facts)
 
 
 @contextmanager

@@ -164,16 +164,11 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
     return digest.hexdigest()
 
 
-def is_reconstructed(scenario: Scenario) -> bool:
-    """Tell whether what the renderer ``3dgs`` shows of a scenario is a fit."""
-    return scenario.degradation.kind in ("reconstruction", "cycle")
-
-
 def model_key(scenario: Scenario) -> str | None:
     """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is
     fitted.
     """
-    if not is_reconstructed(scenario):
+    if scenario.degradation.kind == "none":
         return None
     return reconstruction_key(scenario, recipe_of(scenario))
 

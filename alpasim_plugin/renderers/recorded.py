@@ -9,7 +9,7 @@ of its registration, so a recorded frame is no better placed than a user's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -130,7 +130,9 @@ def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[Rec
     """
     widths = {camera.name: camera.width for camera in scenario.cameras}
     frames = []
-    for one in of_use(scenario, "fitted"):
+    for one in sorted(scenario.recording, key=lambda one: (one.t_us, one.camera)):
+        if one.use != "fitted":
+            continue
         camera = photograph_camera(one, widths.get(one.camera, one.width))
         actors = log_actors(scenario, one.t_us)
         read = partial(_read, one, camera, partial(depth_from, camera, actors))
@@ -157,20 +159,8 @@ def photograph_image(one: Photograph, camera: PinholeCamera) -> U8:
     """
     rgb = read_image(Path(one.path))[..., ::-1]
     size = camera.width, camera.height
-    small = (
-        rgb
-        if size == (one.width, one.height)
-        else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    )
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(small, dtype=np.uint8)
-
-
-def of_use(scenario: Scenario, use: str) -> Sequence[Photograph]:
-    """Return the drive's photographs of one use, in order of time."""
-    return sorted(
-        (one for one in scenario.recording if one.use == use),
-        key=lambda one: (one.t_us, one.camera),
-    )
 
 
 def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:

@@ -69,7 +69,12 @@ def view_of(
     local[..., 1] = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
     along = np.sqrt(np.einsum("...i,...i->...", local, local))
     rays = (local / along[..., None]) @ T_world_camera[:3, :3].T.astype(np.float32)
-    filled = _nearest_surface(depth)
+    _, labels = cv2.distanceTransformWithLabels(
+        np.uint8(depth == 0), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(labels.max() + 1, np.float32)
+    of_label[labels[depth > 0]] = depth[depth > 0]
+    filled = of_label[labels]  # each hole by the nearest pixel that has a surface
     is_sky = (filled == 0) | ((depth == 0) & (rays[..., 2] > 0))
     depth_m = np.where(is_sky, np.float32(np.inf), filled)
     distance_m = depth_m * along
@@ -86,17 +91,3 @@ def view_of(
     belongs[is_low] = share
     points[is_low, 2] -= share * above_m
     return View(K, T_world_camera, rays, depth_m, distance_m, belongs, points)
-
-
-def _nearest_surface(depth: F32) -> F32:
-    """Return a depth image with holes filled by the nearest pixel that has a surface."""
-    surfaces = np.flatnonzero(depth)
-    if surfaces.size in (0, depth.size):
-        return depth
-    holes = (depth == 0).astype(np.uint8)
-    _, labels = cv2.distanceTransformWithLabels(
-        holes, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.zeros(int(labels.max()) + 1, np.float32)
-    of_label[labels.reshape(-1)[surfaces]] = depth.reshape(-1)[surfaces]
-    return of_label[labels]

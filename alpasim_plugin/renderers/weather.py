@@ -54,15 +54,11 @@ def _linear(levels: F64) -> F64:
     return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
 
 
-def _encoded(light: F64) -> F64:
-    """Return the sRGB values of linear light in 0..1."""
-    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
 LIGHT_OF_BYTE = _linear(np.arange(256) / 255.0).astype(np.float32)
 FOG_SRGB = (202, 206, 210)
 DAY_AIR_RGB = LIGHT_OF_BYTE[list(FOG_SRGB)]  # of the air itself, and of what falls
-BYTE_OF_STEP = np.rint(255 * _encoded(np.arange(STEPS + 1) / STEPS)).astype(np.uint8)
+STEP_LIGHT = np.arange(STEPS + 1) / STEPS
+BYTE_OF_STEP = np.rint(np.interp(STEP_LIGHT, LIGHT_OF_BYTE, np.arange(256))).astype(np.uint8)
 
 
 class WeatherRenderer(Renderer):

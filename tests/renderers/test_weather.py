@@ -12,7 +12,7 @@ from alpasim_plugin.renderers import weather
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.renderers.lights import STREET_CD, SceneLights, Spot, drawn
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
-from alpasim_plugin.renderers.snow import ALBEDO, BESIDE, LANE, TRACK, TRACK_M
+from alpasim_plugin.renderers.snow import ALBEDO, BESIDE, LANE, TRACK
 from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
@@ -188,7 +188,7 @@ def test_snow_lies_by_the_map_and_not_on_road_users():
     image = shown(scenario, depth_of_road(), np.zeros_like(GREY))
     lit = weather.LIGHT_OF_BYTE[image].mean(axis=2)
     row = 50  # 7.3 m ahead
-    columns = (50 + 100 * np.array([0.0, TRACK_M, -TRACK_M, 3.0]) / 7.3).astype(int)
+    columns = (50 + 100 * np.array([0.0, 0.8, -0.8, 3.0]) / 7.3).astype(int)
     np.testing.assert_allclose(
         lit[row, columns], ALBEDO * np.array([LANE, TRACK, TRACK, BESIDE]), atol=0.02
     )
