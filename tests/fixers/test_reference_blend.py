@@ -8,7 +8,12 @@ import torch.nn.functional as F
 
 from alpasim_plugin.fixers.gather import CPU
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
-from alpasim_plugin.fixers.network.reference_blend import _sampled, in_floats
+from alpasim_plugin.fixers.network.reference_blend import (
+    BlendHeads,
+    _sampled,
+    enlarged,
+    in_floats,
+)
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
 HEIGHT, WIDTH = 32, 64
@@ -96,6 +101,16 @@ def test_a_network_that_sees_smaller_images_blends_at_full_size(references):
             align_corners=False,
         )
         assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
+
+
+def test_a_large_image_is_not_bent_by_small_offsets_and_takes_more_of_its_references():
+    offset = torch.tensor([0.5, 1.6]).view(1, 1, 1, 2, 1) * torch.tensor([0.6, 0.8])
+    heads = BlendHeads(torch.zeros(1, 1, 1, 2, 4), offset, torch.zeros(1, 1, 1, 2, 12))
+    half, tenth = enlarged(heads, 2), enlarged(heads, 10)
+    assert torch.allclose(half.offset_px[..., 0, :], torch.zeros(2))
+    assert torch.allclose(half.offset_px[..., 1, :].norm(), torch.tensor(1.0))
+    assert torch.equal(half.weight, heads.weight)
+    assert torch.allclose(tenth.weight.exp(), torch.tensor(5.0))
 
 
 def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on():

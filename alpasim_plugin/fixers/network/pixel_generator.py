@@ -47,6 +47,7 @@ from alpasim_plugin.fixers.network.reference_blend import (
     Operations,
     ReferenceBlend,
     blend,
+    enlarged,
     gather_references,
     larger,
     smaller,
@@ -376,6 +377,8 @@ class PixelGenerator(nn.Module):
         heads = None
         if self.blend is not None and seen is not None:
             heads = self.blend(y, fine, seen)
+            if scale > 1:
+                heads = enlarged(heads, scale)
         return Repaired(render + operations.larger(change, scale), hidden, heads)
 
     @classmethod

@@ -20,6 +20,7 @@ network gives it no weight.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -41,6 +42,8 @@ HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 # of a reference: colour minus that of the render where the reference holds, and where it holds
 CHANNELS = 4
 OFFSET_PX = 8.0  # largest learned offset
+SMALL_OFFSET_PX = 0.6  # of a smaller image: within it, an offset is no better known than none
+USUAL_SCALE = 2  # up to which a network weighs references in a smaller image as in the whole one
 NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
 MATCH_CELLS = 2  # how far a reference is compared with the image, in cells
 MATCH_CHANNELS = 16  # of the features compared
@@ -185,6 +188,19 @@ def offsets(at2: Tensor, at4: Tensor) -> Tensor:
         at4.float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False
     )
     return torch.tanh(at2.float() + finer.permute(0, 2, 3, 1)) * OFFSET_PX
+
+
+def enlarged(heads: BlendHeads, scale: int) -> BlendHeads:
+    """Return what a network that saw images ``scale`` times smaller says of the whole ones.
+
+    Errors of an offset grow with the image and bend its lines, so offsets are shortened by
+    `SMALL_OFFSET_PX`, down to none. The blur of a render is not seen in a smaller image, so
+    references weigh more, the more the smaller it was; at half the size the network is right.
+    """
+    length = heads.offset_px.norm(dim=-1, keepdim=True)
+    kept = 1 - SMALL_OFFSET_PX / length.clamp(min=SMALL_OFFSET_PX)
+    more = math.log(max(scale / USUAL_SCALE, 1.0))
+    return heads._replace(weight=heads.weight + more, offset_px=heads.offset_px * kept)
 
 
 class Sources(NamedTuple):
