@@ -21,6 +21,7 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.scene.log_views import SkyView
+from alpasim_plugin.gaussians.scene.surfels import halvings
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -37,6 +38,10 @@ ACTOR_POINTS = 400  # by camera
 # as often.
 INSTANTS_ONE_CAMERA, INSTANTS_RIG = 6, 2
 STEPS_RIG = 2.0
+# Steps, points and pixels across of views, where a camera has so many pixels per radian that the
+# street is built finer (`halvings`); one such camera is fitted as one of several. An error of depth
+# moves what a fixer takes from recorded frames by as many more pixels.
+SHARP = 2
 
 
 @dataclass(frozen=True)
@@ -83,18 +88,20 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
             "say reconstruction or cycle",
         )
     cameras = max(1, len(scenario.cameras))
-    is_rig = cameras > 1
+    is_sharp = bool(halvings(scenario))
+    detail = SHARP if is_sharp else 1
+    is_rig = cameras > 1 or is_sharp
     log_s = (scenario.ego_log.t_us[-1] - scenario.ego_log.t_us[0]) * 1e-6
     watched_s = cameras * min(LONGEST_S, log_s)
-    steps = amount.share * FULL_STEPS_PER_S * watched_s * (STEPS_RIG if is_rig else 1.0)
+    steps = detail * amount.share * FULL_STEPS_PER_S * watched_s * (STEPS_RIG if is_rig else 1.0)
     views = min(MOST_VIEWS * cameras, round(amount.views_per_s * log_s * cameras))
-    points = max(POINTS_PER_S, round(POINTS_PER_S * watched_s))
+    points = detail * max(POINTS_PER_S, round(POINTS_PER_S * watched_s))
     splat = SplatRecipe(
         steps=max(1, round(steps)),
         views=max(FEWEST_VIEWS, views),
-        width=160,
+        width=160 * detail,
         points=points,
-        actor_points=ACTOR_POINTS * cameras,
+        actor_points=detail * ACTOR_POINTS * cameras,
         cap=points,
         sh_degree=1,
         lr_means=4e-4,

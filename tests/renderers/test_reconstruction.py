@@ -183,6 +183,15 @@ def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cac
     np.testing.assert_allclose(y, -0.8, atol=1e-6)  # the log runs at y = -1.8
 
 
+def test_a_sharp_camera_is_fitted_with_more_steps_and_points_of_larger_views():
+    scenario = street()
+    sharp = replace(scenario, cameras=(camera_spec(1280, 720),))
+    usual, fine = recipe_of(scenario).splat, recipe_of(sharp).splat
+    assert (fine.steps, fine.points) == (4 * usual.steps, 2 * usual.points)
+    assert fine.width == 2 * usual.width
+    assert len(sharp.cameras) == len(scenario.cameras)
+
+
 def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else():
     scenario = street()
     key = reconstruction_key(scenario, recipe_of(scenario))
