@@ -355,7 +355,7 @@ def _checked(policy: Policy, scenario: Scenario) -> Report:
     if not replays:
         situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK, *(IMAGES if cameras else ())]
     plans: dict[str, list[Plan]] = {}
-    durations_ms: list[float] = []
+    durations_ms = []
     for situation in situations:
         driven = _drive(policy, situation, cameras, durations_ms)
         if not isinstance(driven, str):
@@ -429,7 +429,7 @@ def _drive(
 ) -> list[Plan] | str:
     """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
-    plans: list[Plan] = []
+    plans = []
     method = "reset"
     try:
         policy.reset(

@@ -183,7 +183,7 @@ def read_ground(
     transform_path = files.only(folder, ("*___img_Sim2_city.json",), what)
     raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), what)
     sim2 = files.read_json(transform_path)
-    raster = np.asarray(parse_npy(files.read_bytes(raster_path), raster_path))
+    raster = parse_npy(files.read_bytes(raster_path), raster_path)
     with parsing(transform_path, "give the keys R, t and s, and a raster of 2-D floats"):
         if raster.ndim != 2 or raster.dtype.kind != "f":
             raise ValueError(f"a raster of {raster.dtype} {raster.shape}")
@@ -216,7 +216,7 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
 
     def mean(values: F64) -> F64:
         total = np.where(finite, values.reshape(shape), 0.0).sum(axis=(1, 3))
-        return np.asarray(total[count > 0] / count[count > 0])
+        return total[count > 0] / count[count > 0]
 
     return mean(padded), mean(row), mean(column)
 
@@ -359,7 +359,7 @@ def read_actors(
     T_local_box = T_local_ego @ se3(_columns(table, POSE[4:]), quat)
     xyz, turns = T_local_box[:, :3, 3].copy(), quat_from_matrix(T_local_box[:, :3, :3])
     size = _columns(table, sizes)
-    actors: list[Actor] = []
+    actors = []
     unknown: Counter[str] = Counter()
     split = 0
     order, first = np.unique(uuid[others], return_index=True)
@@ -406,7 +406,7 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
             strict=True,
         )
     )
-    cameras: list[CameraSpec] = []
+    cameras = []
     for i, name in enumerate(inner["sensor_name"].astype(str)):
         if name not in mounts:
             raise InputError(

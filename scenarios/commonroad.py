@@ -212,7 +212,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
     steps = np.concatenate([one.steps for one in obstacles if not one.static])
     ends_us = np.round(np.array([steps.min(), steps.max()]) * dt_s * 1e6).astype(np.int64)
-    actors: list[Actor] = []
+    actors = []
     for one in obstacles:
         track = one.trajectory(file, dt_s)
         if one.static:  # it is there for the whole recording

@@ -62,10 +62,10 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
     elements = root.findall("lanelet")
     signs = _speed_signs(root)
     lights, notes = _traffic_lights(path, root)
-    signals: list[Signal] = []
+    signals = []
     lanes: dict[str, Lane] = {}
-    crosswalks: list[F64] = []
-    stop_lines: list[F64] = []
+    crosswalks = []
+    stop_lines = []
     left_out: Counter[str] = Counter()
     strange: Counter[str] = Counter()
     swapped = 0

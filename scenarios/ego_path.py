@@ -132,7 +132,7 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
         return tuple(_follow(road, lane))
     i = ego_path.stretch_at(at_s_m)
     stretch = road.stretches[i]
-    ids: list[str] = []
+    ids = []
     if lane >= 0 and lane < len(stretch.forward) and stretch.forward[lane] is not None:
         ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [
             lane_id for lane_id, _ in road.forward_chain(lane, i)
@@ -152,7 +152,7 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
 
 
 def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
-    out: list[tuple[str, int]] = []
+    out = []
     k = lane
     for part in reversed(road.stretches[:stretch]):
         before = [

@@ -10,7 +10,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
@@ -191,7 +190,7 @@ def _near(line: Path, shapes: Sequence[F64]) -> Bool:
     route = shapely.linestrings(line.xyz[::8, :2])
     shapely.prepare(route)
     places = [shapely.multipoints(shape[:, :2]) for shape in shapes]
-    return np.asarray(shapely.dwithin(route, places, AROUND_M), dtype=np.bool_)
+    return shapely.dwithin(route, places, AROUND_M)
 
 
 def _around(street: StreetMap, line: Path) -> LaneMap:

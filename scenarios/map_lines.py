@@ -230,7 +230,7 @@ def border_lines(area: Any, heights: F64) -> tuple[F64, ...]:
             one.
     """
     tree = scipy.spatial.KDTree(heights[:, :2])
-    lines: list[F64] = []
+    lines = []
     for part in shapely.get_parts(area):
         for ring in (part.exterior, *part.interiors):
             xy = densify(shapely.get_coordinates(ring), STEP_M)

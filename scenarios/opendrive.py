@@ -199,7 +199,7 @@ def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
     origin = geographic_origin(geo_reference)
     if origin is None:
         return np.eye(4)
-    return np.asarray(np.linalg.inv(T_enu_earth(*origin) @ T_earth_local), dtype=np.float64)
+    return np.linalg.inv(T_enu_earth(*origin) @ T_earth_local)
 
 
 def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
@@ -370,7 +370,7 @@ def _section(
         and np.isfinite(np.tan(cubics_at(road.superelevation, s))).all()
     ):
         raise ValueError(OFF_THE_ROAD)
-    out: list[Lane] = []
+    out = []
     marks = {lane.lane_id: lane.mark for lane in section.lanes}
     for lane, inner_t, outer_t in lane_borders(road, section, s):
         sign = 1 if lane.lane_id > 0 else -1

@@ -95,7 +95,7 @@ class Geometry:
         u = np.linspace(0.0, max(self.length_m, 1e-9), _TABLE)  # an arc is never shorter than its u
         speed = np.hypot(1.0, Polynomial(self.numbers).deriv()(u))
         s = scipy.integrate.cumulative_simpson(speed, x=u, initial=0)
-        return np.asarray(scipy.interpolate.CubicSpline(s, u)(s_m))
+        return scipy.interpolate.CubicSpline(s, u)(s_m)
 
 
 def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:

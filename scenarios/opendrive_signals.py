@@ -38,10 +38,10 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
     """Return a map without lanes: the crosswalks, stop lines, signs and posts of the roads of
     ``lanes``.
     """
-    crosswalks: list[F64] = []
-    stop_lines: list[F64] = []
-    poles: list[F64] = []
-    signs: list[tuple[F64, Box]] = []
+    crosswalks = []
+    stop_lines = []
+    poles = []
+    signs = []
     for road in _roads(odr, lanes):
         crosswalks += [placed(road, ring, T_local_map) for ring in road.crosswalks]
         for one in road.signals:
@@ -74,8 +74,8 @@ def traffic_lights(
     A light is waited for at the nearest stop line of its direction, without one beside itself; one
     that stands on a road inside of a junction, where that road's lanes begin.
     """
-    heads: list[Head] = []
-    loose: list[str] = []
+    heads = []
+    loose = []
     for road in _roads(odr, lanes):
         for one in (signal for signal in road.signals if signal.dynamic):
             found = _heads(road, one, odr.controllers, lanes, T_local_map)
@@ -179,7 +179,7 @@ def _lanes_at(
     """Return the lanes of one direction for vehicles, where a signal names some of them, only
     those.
     """
-    found: list[tuple[int, Held]] = []
+    found = []
     for lane, key, inner_t, outer_t in lanes_at(road, s_m):
         made = lanes.get(key)
         for_vehicles = made is not None and made.kind in ("vehicle", "bus")

@@ -188,7 +188,7 @@ def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRe
         )
     document = load_yaml(path)
     spec = validate(SuiteSpec, document)
-    out: list[ScenarioRef] = []
+    out = []
     for i, entry in enumerate(spec.scenarios):
         item = SuiteItem(path=entry) if isinstance(entry, str) else entry
         try:

@@ -63,8 +63,8 @@ def place_actors(
     ego = drawn.spec.ego
     placer = _Placer(drawn.spec, road, ego_path, vehicle, grid(end_us))
     scripted = _gap_cars(placer)
-    followers: list[Follower] = []
-    late: list[tuple[int, CrossingActor]] = []
+    followers = []
+    late = []
     for i, actor in enumerate(drawn.spec.actors):
         with drawn.at("actors", i):
             if isinstance(actor, CrossingActor):
@@ -228,7 +228,7 @@ def _outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tupl
 
 def _gap_cars(placer: _Placer) -> list[Actor]:
     """Return the parked cars of every narrow gap."""
-    out: list[Actor] = []
+    out = []
     assert placer.spec.road is not None
     for i, segment in enumerate(placer.spec.road.segments):
         if not isinstance(segment, NarrowGapSegment):

@@ -64,7 +64,7 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
     Raises:
         InputError: A lane lacks a rail, its rails differ in length, or a coordinate is not finite.
     """
-    notes: list[str] = []
+    notes = []
     for folder in FOLDERS:
         missing = [table for table in TABLES if f"{folder}/{table}.parquet" not in archive]
         if len(missing) == len(TABLES):
@@ -208,7 +208,7 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject
     it is missing.
     """
     before = predecessors(lanes)
-    out: list[JsonObject] = []
+    out = []
 
     def add(kind: str, subject: str, objects: list[str]) -> None:
         own = {"subjects": subject, "objects": objects}

@@ -101,7 +101,7 @@ def compare(
         "paired_with_base": result.with_base,
         "paired_arms": result.policies,
     }
-    lines: list[Any] = []
+    lines = []
     if means is not None:
         facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
         lines += first_screen(shown)

@@ -43,7 +43,7 @@ def command_of(verb: Callable[..., None]) -> Callable[..., None]:
     again for the call. ``--debug`` is added where the verb does not have it; `cli.main` reads it.
     """
     hints = get_type_hints(verb, include_extras=True)
-    options: list[inspect.Parameter] = []
+    options = []
     dataclasses: dict[str, tuple[Any, list[str]]] = {}
     for parameter in inspect.signature(verb).parameters.values():
         hint = hints[parameter.name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -93,7 +93,7 @@ def score(
     facts = {"exit_code": code, "presets": documents}
     if len(names) == 1:
         facts = documents[names[0]]
-    lines: list[Any] = []
+    lines = []
     for result in results.values():
         if len(names) == 1:
             lines += first_screen(read_run(result.root))

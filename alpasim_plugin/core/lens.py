@@ -412,7 +412,7 @@ def _growing(lens: LensModel) -> float:
 
 
 def _value(coefficients: Any, x: F64) -> F64:
-    return np.asarray(np.polynomial.polynomial.polyval(x, np.asarray(coefficients)))
+    return np.polynomial.polynomial.polyval(x, np.asarray(coefficients))
 
 
 def _inverse(polynomial: F64, values: F64, limit: float, name: str) -> tuple[F64, Bool]:

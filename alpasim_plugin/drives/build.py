@@ -303,9 +303,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
         return points
     T = rough.T_world_source
     return points.joined(
-        road_points(front, rough.poses[drive.front], rough.strip).moved(
-            np.asarray(np.linalg.inv(T), dtype=np.float64)
-        )
+        road_points(front, rough.poses[drive.front], rough.strip).moved(np.linalg.inv(T))
     )
 
 
@@ -485,7 +483,7 @@ def fitted(
         The model, and the exposure of each view by its name.
     """
     torch.set_num_threads(1)
-    near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
+    near = points.chosen(points.spread < np.percentile(points.spread, 90))
     start = cloud_from_points(near.xyz, near.rgb)
     done = fit_drive(
         views,

@@ -265,12 +265,10 @@ class _Strip:
             slack = end + 2 / np.sqrt(weight)  # a far point is assessed by its own spread
             robust = np.where(np.abs(error) < slack, (1 - (error / slack) ** 2) ** 2, 0.0)
             W = scipy.sparse.diags(weight * robust)
-            coefficients = np.asarray(
-                scipy.sparse.linalg.spsolve(
-                    (A.T @ W @ A + self.prior).tocsc(), A.T @ (weight * robust * h)
-                )
+            coefficients = scipy.sparse.linalg.spsolve(
+                (A.T @ W @ A + self.prior).tocsc(), A.T @ (weight * robust * h)
             )
-        return coefficients, np.asarray(robust > 0.1)
+        return coefficients, robust > 0.1
 
 
 def _hats(s: F64, knots: F64) -> scipy.sparse.csr_matrix:

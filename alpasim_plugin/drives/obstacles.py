@@ -129,7 +129,7 @@ def _driven(grid: Bool, low: F64, ego: Trajectory, vehicle: Vehicle) -> Bool:
     s, left, _ = frame.place(xy)
     begins, ends = -1.0, frame.s[-1] + frame.s[0] + vehicle.box.length_m
     inside = (np.abs(left) < vehicle.box.width_m / 2 + SPARE_M) & (s > begins) & (s < ends)
-    return np.asarray(inside.reshape(grid.shape))
+    return inside.reshape(grid.shape)
 
 
 def _tops(places: F64, above: F64, low: F64, shape: tuple[int, ...]) -> F64:
@@ -156,7 +156,7 @@ def _boxes(
     )
     count, label = scipy.sparse.csgraph.connected_components(near, directed=False)
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
-    out: list[Obstacle] = []
+    out = []
     for number in range(count):
         mine = label == number
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))

@@ -81,7 +81,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     cameras = [view.camera for view in views]
     if tracks.count:  # observations that do not fit are left out once
         error_px = place(tracks, cameras).error_px
-        tracks = tracks.only(np.asarray(error_px < 3 * ERROR_PX))
+        tracks = tracks.only(error_px < 3 * ERROR_PX)
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     found = place(tracks, cameras)
@@ -112,7 +112,7 @@ def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F
     J = slope @ R[tracks.view]
     H = np.zeros((tracks.count, 3, 3))
     np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
-    return np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64)
+    return np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2
 
 
 def _matched(views: Sequence[PosedView]) -> Tracks:
@@ -202,10 +202,7 @@ def road_points(photographs: Sequence[PosedPhotograph], poses: F64, strip: Groun
         small_view(replace(photograph, T_world_camera=pose))
         for photograph, pose in zip(photographs, poses, strict=True)
     ]
-    shots = [
-        (view.camera, np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
-        for view in views
-    ]
+    shots = [(view.camera, cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)) for view in views]
     rows = [np.zeros((0, 4))]
     count = 0
     for i in range(len(shots) - 1):
@@ -252,7 +249,7 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
         warped = cv2.warpPerspective(
             shown, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
-        moved, good = _flow(image, np.asarray(warped, dtype=np.uint8), at)
+        moved, good = _flow(image, warped, at)
         there = cv2.perspectiveTransform(moved[:, None].astype(np.float64), H).reshape(-1, 2)
         good &= ((there >= 0) & (there < [other.width, other.height])).all(axis=1)
         which = np.nonzero(good)[0]

@@ -157,4 +157,4 @@ def _disagreement(a: U8, b: U8, size: int) -> I32:
     """
     apart = cv2.transform(cv2.absdiff(a, b), GREY)
     apart[cv2.min(cv2.extractChannel(a, 3), cv2.extractChannel(b, 3)) == 0] = UNSEEN
-    return np.asarray(cv2.boxFilter(apart, cv2.CV_32S, (size, size), normalize=False), np.int32)
+    return cv2.boxFilter(apart, cv2.CV_32S, (size, size), normalize=False)

@@ -60,7 +60,7 @@ def decode_image(data: bytes, what: str = "a camera image") -> U8:
         InputError: Not a whole image.
     """
     bgr = images.decode_image(data, what, "store PNG or JPEG images in the log")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def smaller(rgb: U8, width_px: int) -> U8:
@@ -69,4 +69,4 @@ def smaller(rgb: U8, width_px: int) -> U8:
     if width <= width_px:
         return rgb
     size = (width_px, max(1, round(height * width_px / width)))
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -119,8 +119,8 @@ def execute(
         notify: Called with one line for each damaged rollout.
     """
     manifests: dict[Path, JsonObject] = {}
-    todo: list[Cell] = []
-    copies: list[tuple[Cell, Cell]] = []  # with the rollout that each is a copy of
+    todo = []
+    copies = []  # with the rollout that each is a copy of
     originals: dict[tuple[str, str, int], Cell] = {}
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)

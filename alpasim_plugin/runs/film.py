@@ -6,7 +6,7 @@ from itertools import count
 from pathlib import Path
 
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import U8, Scenario, SensorSpec
+from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, VIDEO_NAME
 from alpasim_plugin.runs.cameras import logged_request
@@ -35,7 +35,7 @@ def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
     times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
     requests = [logged_request(log, camera, t_us) for t_us in times]
     rule = renderer.block or BlockRule(1, 1)
-    images: list[U8] = []
+    images = []
     for number in count():
         end = len(images) + rule.frames(number)
         if end > len(requests):

@@ -75,7 +75,7 @@ def check_policies(
     shipped = {target for target, _ in BUILTIN["policy"].values()}
     scenarios = list(plan.scenarios.values())
     found: JsonObject = {}
-    todo: list[PartSpec] = []
+    todo = []
     for policy in plan.policies:
         before = known.get(policy.name)
         if policy.digest is not None and before and before["digest"] == policy.digest:

@@ -67,4 +67,4 @@ def ego_states_from_log(
 
 def _along(move: F64, forward: F64) -> F64:
     """Return the component ``(N,)`` of moves ``(N, 3)`` along unit vectors ``(N, 3)``."""
-    return np.asarray(np.sum(move * forward, axis=-1))
+    return np.sum(move * forward, axis=-1)

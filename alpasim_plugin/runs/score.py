@@ -126,7 +126,7 @@ def _aggregate(
     good = [one.manifest for one in scores if one.scored is not None]
     has_images = any(manifest["frames"] for manifest in good)
     failed = [one.manifest for one in scores if one.scored is None]
-    reduced: Sequence[Any] = []
+    reduced = []
     marks: dict[int, SceneScore] | None = {}
     error: EvaluatorError | None = None
     try:

@@ -101,7 +101,7 @@ def score_logs(
         InputError: A log of a scene that is not among the given ones, or a scene that cannot be
             read.
     """
-    scores: list[LogScore] = []
+    scores = []
     taken: set[str] = set()
     names: set[str] = set()
     for log in logs:

@@ -121,7 +121,7 @@ def _speeds(t_us: I64, xyz: F64) -> F64:
     if len(t_us) < 2:
         return np.zeros(len(t_us))
     seconds = (t_us - t_us[0]).astype(np.float64) * 1e-6
-    return np.asarray(np.linalg.norm(np.gradient(xyz[:, :2], seconds, axis=0), axis=1))
+    return np.linalg.norm(np.gradient(xyz[:, :2], seconds, axis=0), axis=1)
 
 
 def _placed(rollout: RolloutLog, reduction: Reduction) -> list[JsonObject]:

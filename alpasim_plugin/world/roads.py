@@ -168,7 +168,7 @@ def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
     """Join each arm's left border to the right border of the next arm counter-clockwise, and close
     the drivable ring.
     """
-    ring: list[F64] = []
+    ring = []
     for a, b in zip(arms, arms[1:] + arms[:1], strict=True):
         curve = connect(a.joint["left"], a.heading_rad + np.pi, b.joint["right"], b.heading_rad)
         kerb = offset_line(curve, 0.0)
@@ -229,7 +229,7 @@ class Road:
 
         The chain stops where the lane does not go on.
         """
-        out: list[tuple[str, int]] = []
+        out = []
         at: int | None = lane
         for part in self.stretches[stretch:]:
             if at is None or at >= len(part.forward) or part.forward[at] is None:
@@ -242,7 +242,7 @@ class Road:
         """Return the oncoming lane ids in *their* driving direction, from the far end of the main
         road.
         """
-        out: list[str] = []
+        out = []
         for stretch in reversed(self.stretches):
             if lane >= len(stretch.backward) or stretch.backward[lane] is None:
                 out.clear()  # the lane starts nearer than this

@@ -104,7 +104,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     step = contacts.step
     side = contacts.side
     actor = contacts.actor
-    first: list[MetricSeries] = []
+    first = []
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
         step = swept.step
@@ -164,7 +164,7 @@ def _at_fault(drive: ScoredRollout, actor: I64, side: I64, step: I64) -> Bool:
     stands = tracks.there[actor, step] & (tracks.speed[actor, step] <= nuplan.STOPPED_MPS)
     between = (side == LATERAL) & (False if drive.astray is None else drive.astray[step])
     guilty = stands | (side == FRONT) | between
-    return np.asarray(guilty & (drive.ego.speed[step] > nuplan.STOPPED_MPS))
+    return guilty & (drive.ego.speed[step] > nuplan.STOPPED_MPS)
 
 
 def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
@@ -206,7 +206,7 @@ def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSer
 
 def in_rig(xy: F64, rollout: RolloutLog) -> F64:
     """Return points ``(N, 2)`` of the ego's box frame in its rig frame."""
-    return np.asarray(xy @ rollout.T_rig_box[:2, :2].T + rollout.T_rig_box[:2, 3])
+    return xy @ rollout.T_rig_box[:2, :2].T + rollout.T_rig_box[:2, 3]
 
 
 FACTORY = with_preset(evaluate_collision)

@@ -25,7 +25,7 @@ def origin_of(track: Trajectory, preset: Preset) -> F64:
     """Return the point ``(3,)`` that geometry is relative to: whole metres near the start of a
     track; zero for float32 presets.
     """
-    return np.zeros(3) if preset.float32 else np.asarray(np.round(track.xyz[0]))
+    return np.zeros(3) if preset.float32 else np.round(track.xyz[0])
 
 
 def held(values: F64, preset: Preset) -> F64:
@@ -60,12 +60,12 @@ class Footprints:
     @property
     def radius_m(self) -> F64:
         """Radius ``(N,)`` of the circle around each box."""
-        return np.asarray(np.hypot(self.size[:, 0], self.size[:, 1]) / 2)
+        return np.hypot(self.size[:, 0], self.size[:, 1]) / 2
 
     @property
     def inner_radius_m(self) -> F64:
         """Radius ``(N,)`` of a circle around the centre inside each footprint."""
-        return np.asarray(np.minimum(self.size[:, 0], self.size[:, 1]) / 2)
+        return np.minimum(self.size[:, 0], self.size[:, 1]) / 2
 
     def take(self, index: I64) -> Footprints:
         """Return the boxes at some rows."""
@@ -83,11 +83,7 @@ class Footprints:
         """Return the reference point ``(N, 2)`` of the body: the box centre, or for float32 presets
         the rounded shape's centroid.
         """
-        return (
-            np.asarray(shapely.get_coordinates(shapely.centroid(self.shapes())))
-            if self.float32
-            else self.xy
-        )
+        return shapely.get_coordinates(shapely.centroid(self.shapes())) if self.float32 else self.xy
 
     def shapes(self) -> Geometries:
         """Return the footprints ``(N,)`` as shapely polygons."""
@@ -96,9 +92,7 @@ class Footprints:
         return (
             boxes
             if r is None
-            else np.asarray(
-                shapely.buffer(shapely.buffer(boxes, -r, quad_segs=16), r, quad_segs=16)
-            )
+            else shapely.buffer(shapely.buffer(boxes, -r, quad_segs=16), r, quad_segs=16)
         )
 
     def bumpers(self) -> tuple[Geometries, Geometries]:
@@ -212,7 +206,7 @@ class ActorTable:
         span = (track_t[follows] - track_t[i]).astype(np.float64)
         passed = np.where(present, t_us - track_t[i], 0).astype(np.float64)
         fraction = np.divide(passed, span, out=np.zeros_like(span), where=span > 0)
-        return np.asarray(self._start[actor] + i), fraction, np.asarray(present)
+        return self._start[actor] + i, fraction, present
 
 
 @dataclass(frozen=True)
@@ -228,7 +222,7 @@ class ActorsAt:
         """Return box centres ``(A, Q, 2)``; meaningless where not present."""
         f = self.fraction[..., None]
         follows = np.where(self.fraction > 0, self.row + 1, self.row)
-        return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[follows] * f)
+        return self.table._xy[self.row] * (1 - f) + self.table._xy[follows] * f
 
     def centre_distance_m(self, xy: F64) -> F64:
         """Return distances ``(A, Q)`` from points ``(Q, 2)`` to the centres; inf where an actor is

@@ -27,10 +27,7 @@ def decode(image: LoggedImage) -> U8:
     from alpasim_plugin.core.reading.images import decode_image
 
     where = f"camera {image.camera!r} at {image.end_us} us"
-    return np.asarray(
-        decode_image(image.data, where, "log PNG or JPEG"),
-        dtype=np.uint8,
-    )
+    return decode_image(image.data, where, "log PNG or JPEG")
 
 
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:

@@ -77,7 +77,7 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
         np.broadcast_to(np.maximum(ego.velocity[:, 0], 0.0), gap_m.shape), ahead_mps
     )
     counts = tracks.there & (along > 0) & (lateral < ego.size[1] / 2 + length * s + width * c)
-    return np.asarray(np.where(counts, margin_m, np.inf).min(axis=0, initial=np.inf))
+    return np.where(counts, margin_m, np.inf).min(axis=0, initial=np.inf)
 
 
 def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:

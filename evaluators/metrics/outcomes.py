@@ -311,7 +311,7 @@ def _lasting(condition: Bool, seconds: F64) -> F64:
 def _recently(condition: Bool, seconds: F64) -> Bool:
     """Return where a condition holds or has held within `AFTER_S`."""
     last = np.maximum.accumulate(np.where(condition, seconds, -np.inf))
-    return np.asarray(seconds - last <= AFTER_S)
+    return seconds - last <= AFTER_S
 
 
 FACTORY = with_preset(evaluate_outcomes)

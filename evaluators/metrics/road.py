@@ -38,9 +38,7 @@ class Polylines:
 
     @cached_property
     def _segments(self) -> Geometries:
-        return np.asarray(
-            shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1))
-        )
+        return shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1))
 
     @cached_property
     def _tree(self) -> shapely.STRtree:
@@ -71,7 +69,7 @@ class Polylines:
         """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in
         3-D.
         """
-        return np.asarray(self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]])
+        return self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]]
 
     def nearest_of_level(self, xyz: F64, height_m: float) -> I64:
         """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there
@@ -138,7 +136,7 @@ class Road:
                     self.origin,
                 )
             shapely.prepare(self._areas[new])
-        return np.asarray(self._areas[lane])
+        return self._areas[lane]
 
     @cached_property
     def edges(self) -> Geometries:
@@ -203,11 +201,9 @@ class Road:
         limit_m = self._preset.edge_touch_m
         if self._preset.edge_query == "nearest_of_level":
             owner = self._edge.nearest_of_level(xyz, self._preset.edge_height_m)
-            return np.asarray(
-                (owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m)
-            )
+            return (owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m)
         if self._preset.edge_query == "nearest_vertex":
-            return np.asarray(
+            return (
                 shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints)
                 < limit_m
             )
@@ -224,7 +220,7 @@ class Road:
         )
         after = shapely.get_coordinates(shapely.line_interpolate_point(lines, s + 0.01))
         delta = after - before
-        return np.asarray(np.arctan2(delta[:, 1], delta[:, 0]))
+        return np.arctan2(delta[:, 1], delta[:, 0])
 
 
 def join(areas: Geometries, seam_m: float) -> Any:

@@ -51,9 +51,7 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
     """
     line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
     positions = shapely.points(points)
-    return np.asarray(shapely.distance(line, positions)), np.asarray(
-        shapely.line_locate_point(line, positions)
-    )
+    return shapely.distance(line, positions), shapely.line_locate_point(line, positions)
 
 
 def moving(path: F64) -> I64:
@@ -129,7 +127,7 @@ def left_of(path: F64, s: F64, points: F64) -> F64:
     segment = long[np.clip(np.searchsorted(lengths[long + 1], s), 0, len(long) - 1)]
     offset = points - path[segment]
     along = steps[segment]
-    return np.asarray(np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]))
+    return np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0])
 
 
 def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:

@@ -150,7 +150,7 @@ def series(
 
 def relevant(rollout: RolloutLog) -> Bool:
     """Return for every ego time ``(T,)`` whether the warm-up with the forced recording is over."""
-    return np.asarray(rollout.ego.t_us >= handover_us(rollout))
+    return rollout.ego.t_us >= handover_us(rollout)
 
 
 def handover_us(rollout: RolloutLog) -> int:

@@ -92,7 +92,7 @@ class Surface:
         )
         at_least_m = np.hypot(outside[..., 0], outside[..., 1])  # (T, B)
         rise_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
-        out = np.asarray(rise_m <= self._level_m + SLOPE * at_least_m)
+        out = rise_m <= self._level_m + SLOPE * at_least_m
         for b in np.flatnonzero(~out.all(axis=0)):
             rows, line = np.flatnonzero(~out[:, b]), self._outlines[b]
             flat, points = shapely.linestrings(line[:, :2]), shapely.points(xyz[rows, :2])
@@ -148,7 +148,7 @@ class Region:
         (_, segment), distance = self._tree.query_nearest(
             shapes, return_distance=True, all_matches=False
         )
-        return np.asarray(segment), np.asarray(distance)
+        return segment, distance
 
     def _depth_m(self, footprints: Geometries) -> F64:
         """Return how far ``(N,)`` footprints stick out: the greatest distance to the shape among
@@ -257,7 +257,7 @@ def _open_share(added: Geometries, region: Region) -> F64:
     length = np.linalg.norm(ring[side + 1] - ring[side], axis=1)
     apart = region.border_distance_m((ring[side + 1] + ring[side]) / 2) > 10 * _GRID_M
     whole = np.bincount(part[side], length, minlength=len(added))
-    return np.asarray(np.bincount(part[side], length * apart, minlength=len(added)) / whole)
+    return np.bincount(part[side], length * apart, minlength=len(added)) / whole
 
 
 def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
@@ -285,4 +285,4 @@ def segment_distance(start: F64, end: F64, points: F64) -> F64:
     length2 = sum(a * a for a in along)
     f = sum(a * o for a, o in zip(along, offset, strict=True))
     f = np.clip(np.divide(f, length2, out=np.zeros(len(start)), where=length2 > 0), 0.0, 1.0)
-    return np.asarray(np.sqrt(sum((o - f * a) ** 2 for a, o in zip(along, offset, strict=True))))
+    return np.sqrt(sum((o - f * a) ** 2 for a, o in zip(along, offset, strict=True)))

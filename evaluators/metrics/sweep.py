@@ -43,11 +43,11 @@ class Motions:
         length2 = np.einsum("ij,ij->i", self.shift, self.shift)
         f = -np.einsum("ij,ij->i", self.start, self.shift)
         f = np.clip(np.divide(f, length2, out=np.zeros_like(f), where=length2 > 0), 0.0, 1.0)
-        return np.asarray(np.linalg.norm(self.start + f[:, None] * self.shift, axis=1))
+        return np.linalg.norm(self.start + f[:, None] * self.shift, axis=1)
 
     def radius_m(self) -> F64:
         """Return the radii ``(M, 2)`` of the circles around ego and other."""
-        return np.asarray(np.hypot(self.half[..., 0], self.half[..., 1]))
+        return np.hypot(self.half[..., 0], self.half[..., 1])
 
 
 def gaps(pairs: Motions, tau: F64) -> F64:
@@ -97,7 +97,7 @@ def slope(pairs: Motions) -> F64:
         np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1)
     )
     turn = np.abs(pairs.turn)
-    return np.asarray(
+    return (
         np.linalg.norm(pairs.shift, axis=1)
         + turn.max(axis=1) * far
         + turn.sum(axis=1) * pairs.radius_m().max(axis=1)

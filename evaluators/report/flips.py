@@ -83,7 +83,7 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
     for rollout in run.rollouts:
         if has_ended(rollout):
             known.setdefault(rollout.cell, rollout)
-    flips: list[Flip] = []
+    flips = []
     compared = 0
     for rollout in run.rollouts:
         for base in bases if has_ended(rollout) else ():

@@ -227,14 +227,9 @@ def motion(ego: EgoStates) -> dict[str, F64]:
 
 def uncomfortable(series: dict[str, F64]) -> Bool:
     """Return where ``(T,)`` one of the bounds of comfort is broken, from what `motion` gives."""
-    return np.asarray(
-        np.any(
-            [
-                (series[name] <= low) | (series[name] >= high)
-                for name, (low, high) in COMFORT.items()
-            ],
-            axis=0,
-        )
+    return np.any(
+        [(series[name] <= low) | (series[name] >= high) for name, (low, high) in COMFORT.items()],
+        axis=0,
     )
 
 

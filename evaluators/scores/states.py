@@ -151,11 +151,7 @@ def _rate(values: F64, t_us: I64) -> F64:
     """Return the central difference in time of values ``(T, ...)``, per second; 0 of a single
     one.
     """
-    return (
-        np.zeros_like(values)
-        if len(values) < 2
-        else np.asarray(np.gradient(values, t_us * 1e-6, axis=0))
-    )
+    return np.zeros_like(values) if len(values) < 2 else np.gradient(values, t_us * 1e-6, axis=0)
 
 
 def in_axes(vectors: F64, yaw: F64) -> F64:
@@ -170,7 +166,7 @@ def smooth(values: F64) -> F64:
     """Return values ``(T,)`` through a Savitzky-Golay filter of order 2, whose window of 8 is never
     longer than they are.
     """
-    return np.asarray(scipy.signal.savgol_filter(values, min(8, _enough(values, 2)), 2))
+    return scipy.signal.savgol_filter(values, min(8, _enough(values, 2)), 2)
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
@@ -179,7 +175,7 @@ def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: i
     """
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
     window = min(window, _enough(values, order))
-    return np.asarray(scipy.signal.savgol_filter(values, window, order, times, step_s))
+    return scipy.signal.savgol_filter(values, window, order, times, step_s)
 
 
 def _enough(values: F64, order: int) -> int:

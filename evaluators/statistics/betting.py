@@ -88,7 +88,7 @@ class Plan:
         if self.distance is None:
             return np.full_like(spread, USUAL_SLOPE)
         slope = 0.5 * self.distance * math.sqrt(self.horizon) / spread
-        return np.asarray(np.maximum(LEAST_SLOPE, slope))
+        return np.maximum(LEAST_SLOPE, slope)
 
 
 def log_chance(gap: F64, slope: F64) -> F64:
@@ -104,7 +104,7 @@ def log_chance(gap: F64, slope: F64) -> F64:
     """
     below = scipy.special.log_ndtr(-(gap + slope))
     beyond = scipy.special.log_ndtr(slope - gap) - 2.0 * slope * gap
-    return np.asarray(np.minimum(np.logaddexp(below, beyond), 0.0))
+    return np.minimum(np.logaddexp(below, beyond), 0.0)
 
 
 def relative_slope(log_p: F64, slope: F64) -> F64:
@@ -134,7 +134,7 @@ def _steepness(gap: F64, slope: F64, log_p: F64) -> F64:
     at_line = math.log(2.0) - LOG_SQRT_2PI - 0.5 * (gap + slope) ** 2
     with np.errstate(divide="ignore"):
         drift = np.log(2.0 * slope) - 2.0 * slope * gap + scipy.special.log_ndtr(slope - gap)
-    return np.asarray(np.exp(np.logaddexp(at_line, drift) - log_p))
+    return np.exp(np.logaddexp(at_line, drift) - log_p)
 
 
 def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
@@ -183,7 +183,7 @@ def growing(wanted: F64, tail: F64) -> F64:
     half = 0.5 * wanted / tail
     third = 1.0 / (3.0 * tail)
     root = np.sqrt(half**2 + third**3)
-    return np.asarray(np.cbrt(half + root) - np.cbrt(root - half))
+    return np.cbrt(half + root) - np.cbrt(root - half)
 
 
 def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
@@ -227,4 +227,4 @@ def lower_bound(draws: Draws, sizes: F64, log_bar: float) -> F64:
         is_refuted = log_capital(draws, middle, sizes).max(axis=-1) >= log_bar
         low = np.where(is_refuted, middle, low)
         high = np.where(is_refuted, high, middle)
-    return np.asarray(np.where(is_any_refuted, low, -draws.reach))
+    return np.where(is_any_refuted, low, -draws.reach)

@@ -185,7 +185,7 @@ def closed(log_e: F64) -> F64:
         total = np.where(is_among, sums[size - 1], e + sums[size - 2])
         least = np.minimum(least, total / size)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(least) + scale)
+        return np.log(least) + scale
 
 
 class MetricLook(TypedDict):
@@ -240,7 +240,7 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
     is_bad: Bool = log_bad >= bar
     binding = [asked.binding for asked in question.metrics]
     all_good = is_good[binding].all(axis=0) & any(binding)
-    answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
+    answer = _first(all_good, is_bad.any(axis=0))
     states: dict[str, MetricLook] = {}
     for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
         x = values[asked.metric]

@@ -287,7 +287,7 @@ def check_gate(
     is_paired = any(rule.is_paired for rule in spec.metrics.values())
     base = _base(list(sides), spec, list(base_sides), owner, is_paired)
     compares = is_paired or stored is not None or spec.baseline is not None
-    checks: list[Check] = []
+    checks = []
     for variant in _tested_variants(list(sides), spec, base, is_paired):
         side = sides[variant]
         if compares:

@@ -65,7 +65,7 @@ def within(interval: Interval, low: float, high: float) -> Interval:
 
 def are_alike(values: F64) -> Bool:
     """Tell whether the values on the last axis of ``(..., n)`` are equal but for rounding."""
-    return np.asarray(np.ptp(values, axis=-1) <= ROUNDING * np.max(np.abs(values), axis=-1))
+    return np.ptp(values, axis=-1) <= ROUNDING * np.max(np.abs(values), axis=-1)
 
 
 def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:

@@ -46,17 +46,17 @@ def still_map(
     first_us = int(min((ends[0] for ends in ends_us), default=0))
     last_us = int(max((ends[1] for ends in ends_us), default=0))
     place = Place(recorded[0], clock_zero_us(content, first_us))
-    tracks: list[JsonObject] = []
+    tracks = []
     for rollout in driven:
         colour, dash = variant_of[rollout.renderer, rollout.policy]
         x, y = (series[rollout.cell][name][1] for name in ("ego_x_m", "ego_y_m"))
         tracks.append(
             {"colour": colour, "dash": dash, "line": path(np.column_stack([x, y]), place)}
         )
-    marks: list[JsonObject] = []
+    marks = []
     # road users are drawn at the scene's first event, else half way through
     at_us, moment = (first_us + last_us) // 2, "half way"
-    happened: list[tuple[int, str]] = []
+    happened = []
     for rollout in rollouts:
         names = [rollout.renderer, rollout.policy] if names_policy else [rollout.renderer]
         label = " \u00b7 ".join([*names, f"seed {rollout.seed}"])
@@ -76,7 +76,7 @@ def still_map(
     if happened:
         at_us, what = min(happened)
         moment = f"when the first {what} happens"
-    users: list[tuple[float, JsonObject]] = []
+    users = []
     line = shapely.linestrings(recorded)
     for actor in content.get("actors") or ():
         if actor["x_m"]:

@@ -289,7 +289,7 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
             return base64.b64encode(data).decode()
         return jpeg(smaller(decode_image(data, "a camera frame"), WIDTH_PX))
 
-    queries: list[JsonObject] = []
+    queries = []
     for plan in shown_plans(log, cause.failed_us):
         pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
         own: JsonObject = dict(debug.get(plan.now_us) or debug_row({}))

@@ -236,7 +236,7 @@ def moments(
     guard replaced or named.
     """
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
-    found: list[JsonObject] = []
+    found = []
     for event in events_of(rollout, series_by_cell(known)):
         text, t_ms = event.what, None
         if event.t_us is not None and event.t_s is not None:
@@ -259,7 +259,7 @@ def _frame_events(frames: Rows, place: Place) -> list[JsonObject]:
     """Return when an event of the frames began, such as a fixer's frame that was replaced; one that
     goes on is told once.
     """
-    found: list[JsonObject] = []
+    found = []
     before: set[str] = set()
     for row in frames:
         now = set(str(row.get("events") or "").split())

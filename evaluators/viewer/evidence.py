@@ -90,14 +90,14 @@ def _boxes(poses: F64, box: Box) -> Geometries:
     """Return the boxes at poses ``(N, 4, 4)`` of their centres as polygons ``(N,)``."""
     size = np.broadcast_to([box.length_m, box.width_m], (len(poses), 2))
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    return np.asarray(shapely.polygons(rectangle_corners(poses[:, :2, 3], yaw, size)))
+    return shapely.polygons(rectangle_corners(poses[:, :2, 3], yaw, size))
 
 
 def _ahead(plan: LoggedPlan, after_us: int) -> F64:
     """Return where a plan leads within some time, ``(2,)`` metres, rig frame at the query."""
     end_us = min(plan.trajectory.t_us[-1], plan.now_us + after_us)
     now, then = interpolate(plan.trajectory, np.array([plan.trajectory.t_us[0], end_us]))
-    return np.asarray((inverse(now) @ then)[:2, 3])
+    return (inverse(now) @ then)[:2, 3]
 
 
 def _beside_m(plan: LoggedPlan) -> float:

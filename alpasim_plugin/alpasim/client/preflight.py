@@ -112,7 +112,7 @@ def findings(
         warmup_steps: Queries in which empty plans are accepted.
         limit_s: Of a drive call.
     """
-    out: list[Finding] = []
+    out = []
 
     def add(name: str, is_failed: bool, text: str) -> None:
         out.append(Finding(name, "failed" if is_failed else "passed", text))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
-import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import FixerCache
 from alpasim_plugin.alpasim.server.history import HistoryTree, Node
@@ -163,7 +162,7 @@ def enlarged(image: U8, size: tuple[int, int]) -> U8:
     """
     if image.shape[1::-1] == size:
         return image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+    return cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
 
 
 def encode(image: U8, form: tuple[int, float]) -> bytes:

@@ -214,4 +214,4 @@ def _brightest(markings: U8, row: np.ndarray, first: np.ndarray, end: np.ndarray
     places = np.stack(
         [row * markings.shape[1] + first, row * markings.shape[1] + end], axis=1
     ).ravel()
-    return np.asarray(np.maximum.reduceat(flat, places)[::2])
+    return np.maximum.reduceat(flat, places)[::2]

@@ -72,10 +72,7 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
     Raises:
         InputError: A file that is no image.
     """
-    return {
-        camera: np.asarray(read_image(path, flag=cv2.IMREAD_GRAYSCALE))
-        for camera, path in named.items()
-    }
+    return {camera: read_image(path, flag=cv2.IMREAD_GRAYSCALE) for camera, path in named.items()}
 
 
 def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F32:

@@ -33,7 +33,7 @@ def parse_npy(data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> Arr
         InputError: No NumPy array, one of objects, or less data than its header announces.
     """
     with parsing(where, do_this, NO_ARRAY):
-        return np.asarray(npy_format.read_array(io.BytesIO(data), allow_pickle=False))
+        return npy_format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def open_npy(path: Path | str, do_this: str = FETCH_AGAIN) -> Array:

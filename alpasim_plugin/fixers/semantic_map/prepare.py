@@ -249,4 +249,4 @@ def triangulate(name: str, ring: F64) -> F64:
     corners = shapely.get_coordinates(parts, include_z=True).reshape(
         -1, 4, 3
     )  # closed: the last corner repeats the first
-    return np.asarray(corners[:, :3])
+    return corners[:, :3]

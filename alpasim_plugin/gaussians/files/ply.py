@@ -363,8 +363,8 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     path = Path(path)
     lines, body_offset = _header_lines(path)
     form = ""
-    comments: list[str] = []
-    found: list[tuple[str, int, list[tuple[str, str] | None]]] = []
+    comments = []
+    found = []
     for number, line in enumerate(lines, start=1):
         match line.split():
             case [] | ["ply" | "end_header", *_]:
@@ -391,7 +391,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     if not form:
         raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
     text = form == "ascii"
-    elements: list[PlyElement] = []
+    elements = []
     offset: int | None = 0 if text else body_offset
     for name, rows, fields in found:
         scalars = [field for field in fields if field is not None]

@@ -144,7 +144,7 @@ def _plane(data: bytes, where: str) -> U8:
     if image is None or image.ndim != 3:
         raise InputError(f"{where}: a plane that does not decode", DO_THIS)
     code = cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-    return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+    return cv2.cvtColor(image, code)
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
@@ -174,4 +174,4 @@ def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -
     centroids = plane(facts["files"][0], rows * PALETTE_WIDTH * coefficients)[:, :3]
     palette = codebook[centroids].reshape(rows * PALETTE_WIDTH, coefficients, 3)
     labels = plane(facts["files"][1], n).astype(np.int64)
-    return np.asarray(palette[np.minimum(labels[:, 0] + 256 * labels[:, 1], count - 1)])
+    return palette[np.minimum(labels[:, 0] + 256 * labels[:, 1], count - 1)]

@@ -51,7 +51,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
         tracks: Over the same views.
         placed: Their points.
     """
-    greys = [np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for view in views]
+    greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
     flow.setFinestScale(1)
     out = []
@@ -89,10 +89,7 @@ def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int
     inside = scipy.interpolate.LinearNDInterpolator(at, q)(u, v)
     outside = scipy.interpolate.NearestNDInterpolator(at, q)(u, v)
     coarse = np.where(np.isnan(inside), outside, inside).astype(np.float32)
-    return np.asarray(
-        cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR),
-        np.float32,
-    )
+    return cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,16 +144,14 @@ class _Seen:
             & (at[..., 1] <= h)
             & (p[::STRIDE, ::STRIDE, 2] > 0.1)
         )
-        return cls(a[::STRIDE, ::STRIDE], b, at, np.asarray(ok))
+        return cls(a[::STRIDE, ::STRIDE], b, at, ok)
 
     def error(self, q: F32) -> tuple[F32, F32]:
         """Return projection minus flow ``(h, w, 2)`` and its derivative by q."""
         p = self.a + q[..., None] * self.b
         z = np.maximum(p[..., 2:], 1e-3)
         uv = p[..., :2] / z
-        return np.asarray(uv - self.at, np.float32), np.asarray(
-            (self.b[:2] - uv * self.b[2]) / z, np.float32
-        )
+        return uv - self.at, (self.b[:2] - uv * self.b[2]) / z
 
 
 def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
@@ -196,7 +191,7 @@ def _textured(view: PosedView) -> Bool:
     """
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
-    return np.asarray(cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)
+    return cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP
 
 
 def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
@@ -232,9 +227,7 @@ def _confirms(
     inside = (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
     found = np.zeros(len(z))
     found[inside] = small[y[inside], x[inside]]
-    return np.asarray((found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])), np.asarray(
-        found > 0
-    )
+    return (found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2]), found > 0
 
 
 I32 = npt.NDArray[np.int32]
@@ -305,4 +298,4 @@ def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
             out |= (
                 (label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)
             ).astype(np.uint8)
-    return np.asarray(cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
+    return cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0

@@ -120,8 +120,8 @@ def prepared_views(
         Views with depth, sky and gain; and for each of them depth ``(H, W)`` interpolated between
         the points that tracks place, None where there are too few.
     """
-    ordered: list[PosedView] = []
-    guesses: list[F32 | None] = []
+    ordered = []
+    guesses = []
     cameras = {view.camera_name for view in views}
     for number, camera in enumerate(sorted(cameras)):
         tell("measuring depth, sky and exposure", number, len(cameras), {})
@@ -153,8 +153,8 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         else 0.0
     )
     masks = sky_masks(measured) if way > LEAST_WAY_M else [None] * len(views)
-    done: list[PosedView] = []
-    guesses: list[F32 | None] = []
+    done = []
+    guesses = []
     for i, (view, mask, gain) in enumerate(
         zip(measured, masks, balances(views, tracks), strict=True)
     ):
@@ -164,7 +164,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         red, green, blue = gain.tolist()
         done.append(replace(view, sky=sky, depth=depth, gain=(red, green, blue)))
         q = between_points(view.camera, tracks, placed, i)
-        guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32))
+        guesses.append(None if q is None else (1 / np.maximum(q, 1e-3)))
     return done, guesses
 
 

@@ -76,7 +76,7 @@ class Lens:
         whole, _ = cv2.getOptimalNewCameraMatrix(
             self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0
         )
-        straight: F64 = np.asarray(whole, dtype=np.float64) + _FROM_CORNER
+        straight: F64 = whole + _FROM_CORNER
         return straight
 
     def straightened(self, image: U8) -> U8:
@@ -91,7 +91,7 @@ class Lens:
             (self.width, self.height),
             cv2.CV_32FC1,
         )
-        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), dtype=np.uint8)
+        return cv2.remap(image, x, y, cv2.INTER_LINEAR)
 
     def resized(self, width: int) -> Lens:
         """Return the lens of the same photograph at another width, pixels."""
@@ -177,7 +177,7 @@ def gain_between(centres: F64, gains: F64, place: F64) -> F32:
 
 def _patch(rgb: U8, at: F64) -> F64:
     patch = cv2.getRectSubPix(rgb, (PATCH_PX, PATCH_PX), (float(at[0] - 0.5), float(at[1] - 0.5)))
-    return np.asarray(patch.reshape(-1, 3).mean(axis=0), dtype=np.float64)
+    return patch.reshape(-1, 3).mean(axis=0)
 
 
 def _solved(value: F64, view: I64, point: I64, views: int, points: int) -> F64:

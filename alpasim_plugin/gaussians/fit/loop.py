@@ -123,7 +123,7 @@ class SplatFit:
         folder: Path | None,
     ) -> None:
         centres = np.array([view.camera.centre_world for view in views])
-        origin = np.asarray(centres.mean(axis=0))
+        origin = centres.mean(axis=0)
         self.recipe, self.scene_id, self.threads, self.folder = recipe, scene_id, threads, folder
         self.extent_m = max(
             1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M

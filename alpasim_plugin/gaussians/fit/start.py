@@ -82,7 +82,7 @@ def start_from_depth(
         InputError: No view has depth.
     """
     owned: dict[str, list[_Points]] = {name: [] for name in sorted(boxes)}
-    rest: list[_Points] = []
+    rest = []
     for i, view in enumerate(views):
         share = count * (i + 1) // len(views) - count * i // len(views)
         points, rgb = _sample(
@@ -208,7 +208,7 @@ def _joined(parts: Sequence[_Points]) -> _Points:
 def _inside(local: F64, box: Box) -> Bool:
     half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
     above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
-    return np.asarray(np.all(np.abs(local) <= half, axis=1) & above_ground)
+    return np.all(np.abs(local) <= half, axis=1) & above_ground
 
 
 class Match(NamedTuple):

@@ -80,20 +80,18 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     pixels left out.
     """
     greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
-    rows: list[tuple[I64, I64, F64]] = []
+    rows = []
     points = np.zeros((0, 2), np.float32)
     ids = np.zeros(0, np.int64)
     count = 0
     for i, grey in enumerate(greys):
-        fresh = _corners(np.asarray(grey, np.uint8), points, views[i].mask)
+        fresh = _corners(grey, points, views[i].mask)
         points = np.concatenate([points, fresh])
         ids = np.concatenate([ids, count + np.arange(len(fresh))])
         count += len(fresh)
         rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
         if i + 1 < len(views) and len(points):
-            points, kept = _followed(
-                np.asarray(grey, np.uint8), np.asarray(greys[i + 1], np.uint8), points
-            )
+            points, kept = _followed(grey, greys[i + 1], points)
             points, ids = points[kept], ids[kept]
     view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
@@ -108,11 +106,7 @@ def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
     found = cv2.goodFeaturesToTrack(
         grey, max(CORNERS - len(taken), 1), QUALITY, APART_PX, mask=free
     )
-    return (
-        np.zeros((0, 2), np.float32)
-        if found is None
-        else np.asarray(found, np.float32).reshape(-1, 2)
-    )
+    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
 
 def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
@@ -126,7 +120,7 @@ def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
         & (moved[:, 0] <= a.shape[1] - 1)
         & (moved[:, 1] <= a.shape[0] - 1)
     )
-    return moved, np.asarray((ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside)
+    return moved, (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +156,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         summed(values, tracks.point, tracks.count)
         for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view]))
     )
-    xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
+    xyz: F64 = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
     for _ in range(ROUNDS):
         e, slope, _ = residuals(xyz, tracks, R, t, K)
         J = slope @ R[tracks.view]
@@ -177,9 +171,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         )[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
-        xyz = np.asarray(
-            xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12)), np.float64
-        )
+        xyz = xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12))
     e, _, local = residuals(xyz, tracks, R, t, K)
     error = np.where(local[:, 2] > 1e-3, np.linalg.norm(e, axis=1), np.inf)
     return Placed(xyz, error, _angles(xyz, tracks, centre))
@@ -215,14 +207,14 @@ def summed(values: F64, index: I64, count: int) -> F64:
         (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
     )
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-    return np.asarray(gather @ flat, np.float64).reshape(count, *values.shape[1:])
+    return (gather @ flat).reshape(count, *values.shape[1:])
 
 
 def huber(e: F64) -> F64:
     """Return the weights ``(M,)`` of errors ``(M, 2)``: 1 up to `HUBER_PX`, then falling as the
     error grows.
     """
-    return np.asarray(HUBER_PX / np.maximum(np.linalg.norm(e, axis=1), HUBER_PX))
+    return HUBER_PX / np.maximum(np.linalg.norm(e, axis=1), HUBER_PX)
 
 
 def _angles(xyz: F64, tracks: Tracks, centre: F64) -> F64:
@@ -231,7 +223,7 @@ def _angles(xyz: F64, tracks: Tracks, centre: F64) -> F64:
     last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
     a, b = (xyz - centre[tracks.view[i]] for i in (first, last))
     cross = np.linalg.norm(np.cross(a, b), axis=1)
-    return np.asarray(np.arctan2(cross, np.einsum("ij,ij->i", a, b)))
+    return np.arctan2(cross, np.einsum("ij,ij->i", a, b))
 
 
 class Adjusted(NamedTuple):
@@ -262,9 +254,7 @@ def corrected(views: Sequence[PosedView]) -> Adjusted:
 
 
 def _good(tracks: Tracks, placed: Placed, error_px: float) -> Bool:
-    return np.asarray(
-        (placed.error_px < error_px) & (placed.angle_rad[tracks.point] > LEAST_ANGLE_RAD)
-    )
+    return (placed.error_px < error_px) & (placed.angle_rad[tracks.point] > LEAST_ANGLE_RAD)
 
 
 def _solve(
@@ -314,11 +304,11 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     of_poses += np.diag(prior)
     pull_poses += prior * _from_given(R, t, R0, t0)
     between = weighted_pose @ by_point  # (M, 6, 3)
-    inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
+    inverse: F64 = np.linalg.inv(of_points + 1e-6 * np.eye(3))
     H, g = _reduced(of_poses, pull_poses, between, inverse, pull_points, view, point)
-    step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
+    step: F64 = -np.linalg.solve(H, g).reshape(views, 6)
     back = summed(np.einsum("nij,ni->nj", between, step[view]), point, points)
-    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), np.float64)
+    return step, -np.einsum("nij,nj->ni", inverse, pull_points + back)
 
 
 def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:
@@ -334,7 +324,7 @@ def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> 
     for i in range(views):
         H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += U[i]
     g = ga.ravel() - blocks @ (middle @ gb.ravel())
-    return np.asarray(H), np.asarray(g)
+    return H, g
 
 
 def _cross(a: F64) -> F64:

@@ -143,11 +143,7 @@ def halved(view: PosedView) -> PosedView:
 
     def all_four(flags: Bool | None) -> Bool | None:
         return (
-            None
-            if flags is None
-            else np.asarray(
-                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
-            )
+            None if flags is None else flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3))
         )
 
     depth = (
@@ -157,7 +153,7 @@ def halved(view: PosedView) -> PosedView:
     return replace(
         view,
         camera=small,
-        rgb=np.asarray(rgb, np.uint8),
+        rgb=rgb,
         sky=all_four(view.sky),
         mask=all_four(view.mask),
         depth=depth,

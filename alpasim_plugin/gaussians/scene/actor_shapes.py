@@ -65,9 +65,9 @@ class Loft:
             Corners ``(M, 4, 3)`` as shares of length, width and height (z from the ground), colours
             ``(M, 3)`` and gloss ``(M,)``.
         """
-        faces: list[list[list[float]]] = []
-        colours: list[F64] = []
-        gloss: list[float] = []
+        faces = []
+        colours = []
+        gloss = []
 
         def add(corners: list[list[float]], rgb: F64, shine: float) -> None:
             faces.append(corners)

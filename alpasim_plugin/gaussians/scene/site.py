@@ -113,7 +113,7 @@ class Site:
         first, cells = round(HORIZON_M / TILE_M), round(TILE_M / CELL_M)
         h, w = self.road.shape
         tiles = self.owned[first:, first:]
-        return np.asarray(np.repeat(np.repeat(tiles, cells, axis=0), cells, axis=1)[:h, :w])
+        return np.repeat(np.repeat(tiles, cells, axis=0), cells, axis=1)[:h, :w]
 
     @cached_property
     def off_road_m(self) -> F32:
@@ -229,7 +229,7 @@ def _owned_tiles(path: F64, low: F64, high: F64, section: int | None) -> Bool:
         return np.ones(count[::-1], dtype=bool)
     grid = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1])), axis=-1)
     _, nearest = scipy.spatial.KDTree(path).query(low - HORIZON_M + (grid + 0.5) * TILE_M)
-    return np.asarray(section_of(nearest) == section)
+    return section_of(nearest) == section
 
 
 def section_of(point: I64) -> I64:
@@ -258,7 +258,7 @@ def path_of(scenario: Scenario) -> F64:
 
 
 def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
-    rings: list[F64] = []
+    rings = []
     for lane in lanes:
         areas = [
             p
@@ -331,7 +331,7 @@ def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
     mask = (off > beyond_m).astype(np.uint8)
     found, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     near = site.path_m < within_path_m
-    lines: list[F64] = []
+    lines = []
     for ring in found:
         pixels = ring[:, 0, :]
         if len(pixels) < 4 * SMOOTH:

@@ -125,7 +125,7 @@ def columns_of(metrics: Iterable[str]) -> list[Column]:
     """Return the columns of metrics: a number, and a flag that tells whether it is valid; null
     where a rollout failed.
     """
-    out: list[Column] = []
+    out = []
     for name in metrics:
         out += [Column(name, "number"), Column(name + VALID, "flag")]
     return out

@@ -200,7 +200,7 @@ def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
         atomic_file(path) as partial,
         pq.ParquetWriter(partial, schema, compression="zstd", write_page_checksum=True) as writer,
     ):
-        held: list[pa.Table] = []
+        held = []
         rows = 0
         for part in parts:
             held.append(read_parquet(part, {}))  # a few kilobytes each
