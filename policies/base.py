@@ -46,8 +46,7 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
         InputError: The name is unknown, the import fails, or what it makes is not a policy.
         PolicyError: The policy raised while it was made.
     """
-    policy: Policy = build(unidentified("policy", name), scenario=scenario)
-    return policy
+    return build(unidentified("policy", name), scenario=scenario)
 
 
 def plan_times(t_us: int) -> I64:

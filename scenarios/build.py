@@ -199,10 +199,7 @@ def _footprints(track: Trajectory, t_us: I64, box: Box, ahead_m: float = 0.0) ->
     poses = interpolate(track, t_us)
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     xy = poses[:, :2, 3] + ahead_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    rings: F64 = shapely.polygons(
-        rectangle_corners(xy, yaw, np.array([[box.length_m, box.width_m]]))
-    )
-    return rings
+    return shapely.polygons(rectangle_corners(xy, yaw, np.array([[box.length_m, box.width_m]])))
 
 
 def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:

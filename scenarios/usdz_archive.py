@@ -96,5 +96,4 @@ class Archive:
         """Read a parquet member as rows."""
         where = f"{self.path}, {member}"
         with parsing(where, "fetch the file again", "no readable parquet"):
-            rows: list[JsonObject] = parse_parquet(self.read(member), where).to_pylist()
-            return rows
+            return parse_parquet(self.read(member), where).to_pylist()

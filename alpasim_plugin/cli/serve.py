@@ -153,8 +153,7 @@ def _serve_policy(
     spec = resolve("policy", policy)
 
     def make(scenario: Scenario) -> Policy:
-        made: Policy = build(spec, scenario=scenario)
-        return made
+        return build(spec, scenario=scenario)
 
     finder = scenario_finder(scenes)
     service = DriverService(

@@ -19,5 +19,4 @@ def make_controller(name: str, vehicle: Vehicle) -> Controller:
     Raises:
         InputError: No controller has that name.
     """
-    controller: Controller = build(unidentified("controller", name), vehicle=vehicle)
-    return controller
+    return build(unidentified("controller", name), vehicle=vehicle)

@@ -90,15 +90,13 @@ class Lens:
         """Return the lens's image ``(height, width, 3)`` of a covering one; black where that does
         not show it.
         """
-        out: U8 = self._through(covering, 0)
-        return out
+        return self._through(covering, 0)
 
     def plane(self, covering: F32, outside: float) -> F32:
         """Return one value a pixel ``(height, width)``, ``outside`` where the pinhole does not show
         the lens.
         """
-        out: F32 = self._through(covering, outside)
-        return out
+        return self._through(covering, outside)
 
     def _through(self, covering: Any, outside: float) -> Any:
         if self.resample is None:

@@ -274,8 +274,7 @@ def finished(out: Path, key: str) -> JsonObject:
             f"{out}: it holds another import",
             "name another folder, or remove this one first",
         )
-    quality: JsonObject = read_json(out / "quality.json")
-    return quality
+    return read_json(out / "quality.json")
 
 
 def begin(work: Path, key: str) -> None:

@@ -35,14 +35,13 @@ def make_fixer(
         InputError: Unknown name, bad settings, or weights that are missing or wrong.
     """
     spec = unidentified("fixer", name)
-    fixer: Fixer = build(
+    return build(
         spec if settings is None else replace(spec, settings=settings),
         scene_id=scene_id,
         seed=seed,
         device=device,
         threads=threads,
     )
-    return fixer
 
 
 def fixer_settings(name: str, overrides: Sequence[str] = ()) -> FixerSettings:

@@ -240,5 +240,4 @@ def fixed_renderer(
             f"{settings.name}, fixer.mode={settings.mode}: no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}",
             "install simrun with its block fixers, or take a fixer of single frames, such as onefixer",
         )
-    renderer: Renderer = modes[settings.mode].load()(runner, settings, first)
-    return renderer
+    return modes[settings.mode].load()(runner, settings, first)

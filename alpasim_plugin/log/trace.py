@@ -55,8 +55,7 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     Raises:
         InputError: Missing file, or a line that is no JSON object.
     """
-    rows: list[dict[str, Fact]] = read_json_lines(path, do_this="run the rollout again")
-    return rows
+    return read_json_lines(path, do_this="run the rollout again")
 
 
 def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> Trace:

@@ -61,8 +61,7 @@ def _child(name: str, device: str, left_s: float) -> Facts:
         return _failed(f"it did not end within {left_s:.0f} s")
     if done.returncode != 0:
         return _failed((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
-    facts: Facts = json.loads(done.stdout.splitlines()[-1])
-    return facts
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def _failed(why: str) -> Facts:

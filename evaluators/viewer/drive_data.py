@@ -55,10 +55,9 @@ class Place:
 
     def ms(self, t_us: I64 | Sequence[int]) -> list[int]:
         """Return times ``(N,)`` in whole milliseconds."""
-        ms: list[int] = (
+        return (
             np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
         )
-        return ms
 
     def track(self, trajectory: Trajectory) -> dict[str, list[int]]:
         """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can
@@ -75,10 +74,7 @@ class Place:
 
 def mrad(yaw: npt.ArrayLike) -> list[int]:
     """Return headings ``(N,)`` in radians as continuous whole milliradians."""
-    out: list[int] = (
-        np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
-    )
-    return out
+    return np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
 
 
 def rounded(values: F64) -> list[float | None]:

@@ -48,10 +48,7 @@ class RendererClient:
 
     def version(self, wait_s: float = 30.0) -> common_pb2.VersionId:
         """Return the version triple; waits for the server."""
-        answer: common_pb2.VersionId = self.stub.get_version(
-            common_pb2.Empty(), timeout=wait_s, wait_for_ready=True
-        )
-        return answer
+        return self.stub.get_version(common_pb2.Empty(), timeout=wait_s, wait_for_ready=True)
 
     def scenes(self) -> list[str]:
         """Return the scene ids."""

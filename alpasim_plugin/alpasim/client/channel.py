@@ -133,8 +133,7 @@ class Service:
     def version(self) -> common_pb2.VersionId:
         """Return the service's version triple, once it is ready."""
         self.wait_ready()
-        answer: common_pb2.VersionId = self.call("get_version", common_pb2.Empty(), READY_S)
-        return answer
+        return self.call("get_version", common_pb2.Empty(), READY_S)
 
     def close(self) -> None:
         """Close the channel; harmless if closed."""

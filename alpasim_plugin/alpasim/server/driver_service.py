@@ -431,10 +431,9 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
     name = getattr(factory, "__name__", type(factory).__name__)
 
     def make(scenario: Scenario) -> Policy:
-        made: Policy = complete(
+        return complete(
             factory(scenario=scenario) if takes_scenario else factory(), Policy, f"policy {name!r}"
         )
-        return made
 
     service = _Serving(name, None, make, _unknown_scene)
     with Host({"EgodriverService": service}, place, every=service.sessions.expire) as host:

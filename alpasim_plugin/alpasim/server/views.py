@@ -160,10 +160,7 @@ class Straight:
         """
         if self.place is None:
             return seen
-        out: Any = cv2.remap(
-            seen, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-        )
-        return out
+        return cv2.remap(seen, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:

@@ -330,8 +330,7 @@ def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
     of the same names as `Declaration`'s.
     """
     if hasattr(factory, "describe"):
-        declared: Declaration = factory.describe(settings)
-        return declared
+        return factory.describe(settings)
     files = getattr(factory, "files", {})
     if not isinstance(files, Mapping):
         files = {str(path): Path(path) for path in files}
@@ -417,9 +416,5 @@ def _settings(
     if model is None:
         return None
     if hasattr(model, "load"):
-        settings: BaseModel = model.load(name, overrides)
-        return settings
-    validated: BaseModel = validate(
-        model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides)
-    )
-    return validated
+        return model.load(name, overrides)
+    return validate(model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides))

@@ -76,8 +76,7 @@ class Lens:
         whole, _ = cv2.getOptimalNewCameraMatrix(
             self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0
         )
-        straight: F64 = whole + _FROM_CORNER
-        return straight
+        return whole + _FROM_CORNER
 
     def straightened(self, image: U8) -> U8:
         """Return an image ``(H, W[, 3])`` freed of the distortion."""

@@ -77,11 +77,10 @@ class SkyMask:
             @ half
         )
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        warped = cv2.warpPerspective(
+        return cv2.warpPerspective(
             view.sky,
             to_view,
             (camera.width, camera.height),
             flags=flags,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        return warped

@@ -303,8 +303,7 @@ def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> JsonObject:
 
 
 def _xy(line: F64) -> list[list[float]]:
-    rounded: list[list[float]] = np.round(line[:, :2], 2).tolist()
-    return rounded
+    return np.round(line[:, :2], 2).tolist()
 
 
 def _is_running(pid: int) -> bool:
