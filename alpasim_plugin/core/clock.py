@@ -15,7 +15,6 @@ class Tick:
 
     step: int
     t_us: int
-    camera_due: bool
     policy_due: bool
     is_last: bool  # the world is observed once more but not advanced
 
@@ -64,7 +63,6 @@ class Clock:
             yield Tick(
                 step=step,
                 t_us=self.start_us + elapsed,
-                camera_due=elapsed % self.rates.camera_us == 0,
                 policy_due=elapsed % self.rates.policy_us == 0,
                 is_last=step == self.n_steps,
             )

@@ -341,7 +341,7 @@ def validate(model: type[M], document: Document) -> M:
         problems = error.errors(include_url=False)
     # Wrong items make a list too short, and a misspelt key leaves the right one missing.
     problems = [p for p in problems if p["type"] != "too_short"] or problems
-    placed = []
+    placed: list[tuple[bool, Mark, int, Key, Any]] = []
     for problem in problems[:MOST_PROBLEMS]:
         # The tag of a union of forms is in brackets and leads to no model.
         problem["loc"] = tuple(part for part in problem["loc"] if not str(part).startswith("("))

@@ -104,7 +104,7 @@ def _points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     from importlib.metadata import distributions
 
     seen = set[str]()
-    found = []
+    found: list[EntryPoint] = []
     for one in distributions(path=list(path)):
         points = one.entry_points.select(group=group)
         if points and one.name not in seen:  # the name takes long to read

@@ -429,9 +429,8 @@ class BackgroundFile:
     keep_road: bool = False  # whether the built road is drawn with it
 
 
-Standing = Literal[
-    "known", "found", "unknown"
-]  # what stands there: all among the actors; found in a reconstruction; not looked for
+# What stands there: all of it among the actors, or found in a reconstruction.
+Standing = Literal["known", "found"]
 
 # ids of actors found in a reconstruction begin so: it shows them, nobody draws them once more
 STANDING_ID = "obstacle-"

@@ -17,7 +17,6 @@ from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries,
 from evaluators.metrics.contact import (
     FRONT,
     LATERAL,
-    NOT_LOOKED_FOR,
     REAR,
     SweptContacts,
     find_contacts,
@@ -93,7 +92,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     where motion is searched too.
 
     In a recorded drive whose standing obstacles were found in its reconstruction, contact with them
-    is also reported apart; where they were not looked for, only contact is known, not its absence.
+    is also reported apart.
     """
     origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
@@ -126,13 +125,8 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
         at_fault[step[guilty]] = True
 
     def flag(name: str, fired: Bool) -> MetricSeries:
-        return series(name, t_us, fired, fired | (scene.standing != "unknown"), NOT_LOOKED_FOR)
+        return series(name, t_us, fired)
 
-    gap_known, why = (
-        (is_present, "no other actor is present")
-        if scene.standing != "unknown"
-        else (is_present & (gap_m == 0), NOT_LOOKED_FOR)
-    )
     return [
         flag("collision_any", front | rear | lateral),
         *([] if preset.hits == "last" else [flag("collision_at_fault", at_fault)]),
@@ -141,15 +135,15 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
         flag("collision_rear", rear),
         *(
             [flag("collision_standing", _standing(actors, actor, step, len(t_us)))]
-            if scene.standing != "known"
+            if scene.standing == "found"
             else []
         ),
         series(
             "min_distance_to_obstacle_m",
             t_us,
             gap_m,
-            gap_known,
-            why,
+            is_present,
+            "no other actor is present",
             keep_values=not preset.honour_valid,
         ),
         *first,

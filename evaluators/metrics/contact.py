@@ -34,7 +34,6 @@ LATERAL = 2
 # rules out a touching pair.
 _SLACK_M = 1e-6
 _SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
-NOT_LOOKED_FOR = "standing obstacles were not looked for: no contact with a tracked road user does not mean no contact"
 # Where two bodies touch is read off their overlap when the ego is this much larger on every side.
 PLACE_M = 1e-6
 

@@ -241,9 +241,6 @@ LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
 FOOTPRINT, CENTRE = "footprint, plan view", "box centre, plan view"
 UNKNOWN = MetricInfo("", "none", "last", "")
 _SIGNED = (None, None)
-_NOT_LOOKED_FOR = (
-    "nothing is touched in a recorded drive whose standing obstacles were not looked for"
-)
 _FEW = "three steps or fewer"
 _NO_LANES = "no lanes"
 _NO_CONTACT = "steps without contact"
@@ -261,7 +258,6 @@ METRICS = MetricTable(
             label="at-fault collisions",
             reference=FOOTPRINT,
             formula="`collision_front` or `collision_lateral`; `strict`: [at fault](metrics.md#contact-in-preset-strict)",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "collision_any": _flag(
             "any contact with another actor",
@@ -269,31 +265,26 @@ METRICS = MetricTable(
             label="collisions",
             reference=FOOTPRINT,
             formula="front, rear or lateral",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "collision_front": _flag(
             "an actor touches the front bumper",
             reference=FOOTPRINT,
             formula="an actor's rectangle touches `F` and its front side",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "collision_lateral": _flag(
             "an actor touches the ego at neither bumper",
             reference=FOOTPRINT,
             formula="an actor's rectangle touches `F` and neither its front nor its rear side",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "collision_rear": _flag(
             "an actor touches the rear bumper and not the front one",
             reference=FOOTPRINT,
             formula="an actor's rectangle touches `F` and its rear side, not its front side",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "collision_standing": _flag(
             "the ego touches something that stands in the reconstruction of a recorded drive",
             reference=FOOTPRINT,
             formula="`F` touches the box of a standing obstacle, whose name says how exactly it is known; recorded drives only",
-            invalid=_NOT_LOOKED_FOR,
         ),
         "min_distance_to_obstacle_m": _metres(
             "least plan-view gap between the ego and any actor",

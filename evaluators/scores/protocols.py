@@ -87,7 +87,7 @@ def _nuplan(
     if not isinstance(progress, str):
         is_made = float(progress >= nuplan.PROGRESS_SHARE)
     return {
-        "no_at_fault_collision": ego.contact(),
+        "no_at_fault_collision": nuplan.collision_score(ego.hits),
         "drivable_area": ego.drivable(nuplan.OFF_AREA_M),
         "making_progress": is_made,
         "driving_direction": ego.direction(),
@@ -103,7 +103,7 @@ def _navsim(
 ) -> dict[str, Part]:
     ego = ScoredRollout(rollout, scene, preset, centre)
     return {
-        "nc": ego.contact(),
+        "nc": nuplan.collision_score(ego.hits),
         "dac": ego.drivable(MARGIN_M),
         "ddc": ego.direction(),
         "tlc": ego.traffic_lights(),

@@ -10,7 +10,6 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Scene, Trajectory
-from evaluators.metrics.contact import NOT_LOOKED_FOR
 from evaluators.metrics.footprint import Footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.road import Road, road_of
@@ -39,7 +38,6 @@ class ScoredRollout:
         self._xyz = centre.xyz - origin
         self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
         self._signals, self._origin = scene.lane_map.signals, origin
-        self._looked_for = scene.standing != "unknown"
 
     @property
     def road(self) -> Road:
@@ -90,11 +88,6 @@ class ScoredRollout:
     def hits(self) -> list[nuplan.Collision]:
         """Its collisions."""
         return nuplan.collisions(self.ego, self.tracks, self.astray)
-
-    def contact(self) -> Part:
-        """Return nuPlan's score of contacts at fault."""
-        value = nuplan.collision_score(self.hits)
-        return value if value == 0 or self._looked_for else NOT_LOOKED_FOR
 
     @cached_property
     def ttc_s(self) -> F64:

@@ -20,7 +20,6 @@ from alpasim_plugin.core.types import Rates
 def test_clock_ticks_in_whole_periods_and_marks_the_last():
     ticks = list(Clock(7, 1_000_007, Rates(100_000, 200_000, 500_000)).ticks())
     assert [t.t_us for t in ticks] == [7 + 100_000 * i for i in range(11)]
-    assert [t.step for t in ticks if t.camera_due] == [0, 2, 4, 6, 8, 10]
     assert [t.step for t in ticks if t.policy_due] == [0, 5, 10]
     assert [t.is_last for t in ticks] == [False] * 10 + [True]
 

@@ -159,7 +159,6 @@ class Assembled:
     scenes: SceneCache | None
     fixers: FixerCache | None
     tree: HistoryTree[Answered]
-    busy: threading.Lock
     spec: RendererSpec
     channel: Any
 
@@ -246,4 +245,4 @@ def assemble(settings: Settings) -> Assembled:
         stub,
         verbatim=stub is not None and fixers is None,
     )
-    return Assembled(service, scenes, fixers, tree, busy, spec, channel)
+    return Assembled(service, scenes, fixers, tree, spec, channel)
