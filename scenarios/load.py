@@ -33,7 +33,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     Vehicle,
 )
-from alpasim_plugin.world.paint import with_default_paint
+from alpasim_plugin.world.markings import with_default_markings
 from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_record, check_scenario
 from scenarios.build import built_drive
@@ -121,7 +121,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
     recorded = drive.source in RECORDED_STREETS or (
         background is not None and not background.keep_road
     )
-    lane_map = drive.lane_map if recorded else with_default_paint(drive.lane_map)
+    lane_map = drive.lane_map if recorded else with_default_markings(drive.lane_map)
     return Scenario(
         scene_id=f"{scene_id}-seed{spec.seed}" if drawn.reseeded else scene_id,
         source=drive.source,

@@ -79,7 +79,7 @@ def compare(
             joined["paired"],
             with_base=joined["paired_with_base"],
             metrics=joined_metrics(folders),
-            policies=joined["paired_arms"],
+            policies=joined["paired_policies"],
         )
         means = joined
         whole = [rollout for run in opened for rollout in run.rollouts]
@@ -99,7 +99,7 @@ def compare(
         "notes": list(result.notes),
         "paired": result.paired,
         "paired_with_base": result.with_base,
-        "paired_arms": result.policies,
+        "paired_policies": result.policies,
     }
     lines = []
     if means is not None:

@@ -195,7 +195,7 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObj
             first run's.
 
     Returns:
-        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_arms``,
+        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_policies``,
         ``failures`` (docs/statistics.md).
 
     Raises:

@@ -87,10 +87,10 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
     compared = 0
     for rollout in run.rollouts:
         for base in bases if has_ended(rollout) else ():
-            arm = Variant(rollout.renderer, rollout.policy)
-            other = base.of(arm)
+            variant = Variant(rollout.renderer, rollout.policy)
+            other = base.of(variant)
             partner = known.get((other.renderer, other.policy, rollout.scene, rollout.seed))
-            if other == arm or partner is None or not (rollout.ok or partner.ok):
+            if other == variant or partner is None or not (rollout.ok or partner.ok):
                 continue
             compared += 1
             was, now = outcomes_of(partner), outcomes_of(rollout)

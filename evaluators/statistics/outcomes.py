@@ -55,13 +55,13 @@ def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> di
         ``seed``, ``t_s`` or None); ``endings``: the one way in which each rollout ended, counted;
         ``lateral_distance_m_median`` over rollouts, None without a value.
     """
-    arms: dict[str, list[Rollout]] = {}
+    variants: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
-        arms.setdefault(rollout.variant, []).append(rollout)
-    return {name: _of_arm(own, times or {}) for name, own in arms.items()}
+        variants.setdefault(rollout.variant, []).append(rollout)
+    return {name: _of_variant(own, times or {}) for name, own in variants.items()}
 
 
-def _of_arm(rollouts: Sequence[Rollout], times: Times) -> JsonObject:
+def _of_variant(rollouts: Sequence[Rollout], times: Times) -> JsonObject:
     ended = [r for r in rollouts if has_ended(r)]
     known = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
     endings = Counter(map(ending_of, rollouts))

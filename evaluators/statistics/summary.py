@@ -246,7 +246,7 @@ def numbers(
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
 ) -> JsonObject:
-    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of
+    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_policies`` of
     ``summary.json`` (docs/statistics.md).
 
     Args:
@@ -268,7 +268,7 @@ def numbers(
         "metrics": by_policy(metrics, dict),
         "paired": paired,
         "paired_with_base": with_base,
-        "paired_arms": policies,
+        "paired_policies": policies,
     }
 
 

@@ -313,14 +313,14 @@ def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_p
     assert run_command(["compare", str(run), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert {
-        name: entries["progress"]["baseline"] for name, entries in said["paired_arms"].items()
+        name: entries["progress"]["baseline"] for name, entries in said["paired_policies"].items()
     } == {
         "clean/b": "clean/a",
         "clean/c": "clean/a",
     }
     turned = _compare(capsys, str(run), "--baseline", "c")
     assert set(turned) == {"clean/a", "clean/b"}
-    forward = said["paired_arms"]["clean/c"]["lateral_distance_m"]["diff"]
+    forward = said["paired_policies"]["clean/c"]["lateral_distance_m"]["diff"]
     assert turned["clean/a"]["lateral_distance_m"]["diff"] == pytest.approx(-forward)
     gate = tmp_path / "gate.yaml"
     gate.write_text("version: 1\nbaseline: b\nmetrics:\n  progress: {margin: 0.9}\n")

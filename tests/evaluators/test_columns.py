@@ -122,7 +122,7 @@ def test_columns_give_what_rows_give(
         return {
             block: part
             for block, part in numbers(table, baseline, bases).items()
-            if block != "paired_arms"
+            if block != "paired_policies"
         }
 
     assert numbers_by_renderer(RolloutTable.of_table(table_of(rows))) == wanted

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.core.types import Lane, LaneMap, Marking
 from alpasim_plugin.fixers.semantic_map.prepare import cut_dashes, prepare_map, triangulate
 from alpasim_plugin.fixers.semantic_map.style import COLOURS, box_class
-from alpasim_plugin.world.paint import painted_lines
+from alpasim_plugin.world.markings import marking_lines
 from tests.examples import examples
 
 
@@ -24,7 +24,7 @@ def lane(key, y, left_paint="unknown", right_paint="unknown", reverse=False, **m
 
 def drawn(*lanes, **more):
     lane_map = LaneMap({k.lane_id: k for k in lanes}, **more)
-    return [(float(xyz[0, 1]), paint) for xyz, paint in painted_lines(lane_map)]
+    return [(float(xyz[0, 1]), paint) for xyz, paint in marking_lines(lane_map)]
 
 
 def test_edge_shared_by_two_lanes_is_drawn_once_with_the_paint_that_is_known():

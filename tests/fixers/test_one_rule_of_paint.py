@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
-from alpasim_plugin.gaussians.scene.paint import paint_strokes
+from alpasim_plugin.gaussians.scene.markings import marking_strokes
 from alpasim_plugin.gaussians.scene.site import make_site
 from alpasim_plugin.world.ground import height_at
-from alpasim_plugin.world.paint import painted_lines
+from alpasim_plugin.world.markings import marking_lines
 from scenarios.load import load_scenario
 
 COMMONROAD = Path(str(resources.files("scenarios"))) / "data" / "USA_US101-3_3_T-1.xml"
@@ -22,9 +22,9 @@ COMMONROAD = Path(str(resources.files("scenarios"))) / "data" / "USA_US101-3_3_T
 def test_every_stroke_of_paint_lies_on_a_line_of_the_map(name):
     scenario = load_scenario(name)
     site = make_site(scenario, lambda xy: height_at(scenario.ground, xy))
-    strokes = paint_strokes(site)
+    strokes = marking_strokes(site)
     on_walks = len(scenario.lane_map.crosswalks) or len(scenario.lane_map.stop_lines)
-    lines = [site.frame.to_ground(xyz) for xyz, _ in painted_lines(scenario.lane_map)]
+    lines = [site.frame.to_ground(xyz) for xyz, _ in marking_lines(scenario.lane_map)]
     dense = np.concatenate(
         [resample(line, np.arange(0, arc_lengths(line)[-1], 0.2)) for line in lines]
     )

@@ -24,7 +24,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.world.ground import flat
-from alpasim_plugin.world.paint import with_default_paint
+from alpasim_plugin.world.markings import with_default_markings
 
 LANE_M = 3.6
 
@@ -155,7 +155,7 @@ def straight(**kwargs):
     walk = np.array([[78.0, -7.2, 0], [81.0, -7.2, 0], [81.0, 7.2, 0], [78.0, 7.2, 0]])
     stop = np.array([[76.5, -7.2, 0], [76.5, 0.0, 0]])
     kwargs.setdefault("actors", STREET_ACTORS)
-    lane_map = with_default_paint(
+    lane_map = with_default_markings(
         LaneMap(lanes, crosswalks=(walk,), stop_lines=(stop,))
     )  # as a scenario is when it is loaded
     return make_scenario(lane_map, line((0, -1.8), (100, -1.8)), **kwargs)  # type: ignore[arg-type]

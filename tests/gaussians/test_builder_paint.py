@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import LaneMap, Marking
-from alpasim_plugin.gaussians.scene.paint import (
+from alpasim_plugin.gaussians.scene.markings import (
     GAP_M,
     LINE_M,
     WHITE,
     YELLOW,
-    paint_strokes,
+    marking_strokes,
 )
 from alpasim_plugin.gaussians.scene.site import make_site
-from alpasim_plugin.world.paint import with_default_paint
+from alpasim_plugin.world.markings import with_default_markings
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 
 PATH = line((0, -1.8), (60, -1.8))
@@ -21,7 +21,7 @@ PATH = line((0, -1.8), (60, -1.8))
 def strokes_of(scenario):
     """Return strokes and the world positions of their middles."""
     site = make_site(scenario, lambda xy: np.zeros(len(xy)))
-    strokes = paint_strokes(site)
+    strokes = marking_strokes(site)
     return strokes, site.frame.to_world((strokes.start + strokes.end) / 2)
 
 
@@ -36,7 +36,9 @@ def length(strokes, chosen):
 @pytest.fixture(scope="module")
 def two_by_two():
     return strokes_of(
-        make_scenario(with_default_paint(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH)
+        make_scenario(
+            with_default_markings(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH
+        )
     )
 
 
@@ -82,7 +84,7 @@ def test_dashes_run_on_from_lane_to_lane():
     lanes = {}
     for i in range(4):
         lanes |= road_lanes(line((i * 17.0, 0), (i * 17.0 + 17.0, 0)), f"r{i}", 2)
-    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
+    strokes, middle = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
     x = np.sort(np.concatenate([strokes.start[chosen, 0], strokes.end[chosen, 0]]))
     assert np.diff(x).max() == pytest.approx(GAP_M, abs=0.1)
@@ -93,7 +95,7 @@ def test_known_paint_is_believed_and_shared_edges_are_painted_once():
     lanes["r-a0"] = replace(
         lanes["r-a0"], right_paint="solid_yellow"
     )  # the same place is r-a1's unknown left edge
-    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
+    strokes, middle = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
     assert set(strokes.colour[chosen]) == {YELLOW}
     assert length(strokes, chosen) == pytest.approx(80, rel=0.02)
@@ -101,7 +103,7 @@ def test_known_paint_is_believed_and_shared_edges_are_painted_once():
 
 def test_nothing_unknown_is_painted_inside_an_intersection():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 1, is_intersection=True)
-    strokes, _ = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
+    strokes, _ = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     assert len(strokes.start) == 0
 
 
@@ -109,7 +111,7 @@ def test_map_with_marking_lines_keeps_unknown_lane_edges_bare():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     marking = Marking(line((0, -LANE_M), (80, -LANE_M)), "solid_white")
     strokes, middle = strokes_of(
-        make_scenario(with_default_paint(LaneMap(lanes, markings=(marking,))), PATH)
+        make_scenario(with_default_markings(LaneMap(lanes, markings=(marking,))), PATH)
     )
     assert at(middle, -LANE_M).all()
     assert length(strokes, at(middle, -LANE_M)) == pytest.approx(80, rel=0.02)
@@ -129,7 +131,7 @@ def test_zebra_bars_lie_along_the_road_across_the_walk():
 def test_edge_known_to_be_bare_stays_bare():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     lanes["r-a1"] = replace(lanes["r-a1"], left_paint="none")
-    _, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
+    _, middle = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     assert not at(middle, -LANE_M).any()
     assert at(middle, LANE_M).any()
 

@@ -1,7 +1,7 @@
 """The layers of the semantic map, and their conversion to arrays: straight segments with width and
 colour, and flat triangles.
 
-What is painted is the rule of `world.paint`: marking lines and lane edges of a
+What is painted is the rule of `world.markings`: marking lines and lane edges of a
 known kind, each once; unknown lane markings are not drawn.
 """
 
@@ -24,7 +24,7 @@ from alpasim_plugin.fixers.semantic_map.style import (
     POLE_PX,
 )
 from alpasim_plugin.gaussians.cloud import require_rigid
-from alpasim_plugin.world.paint import painted_lines
+from alpasim_plugin.world.markings import marking_lines
 
 POLE_HEIGHT_M = 3.0  # of poles given as one point
 # Depth bias of a crosswalk, so that lines on it stay visible.
@@ -107,7 +107,7 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
         InputError: A coordinate that is not finite, an area without three corners, or a pose that
             is not rigid.
     """
-    painted = painted_lines(lane_map)
+    painted = marking_lines(lane_map)
     lines = [("road_boundary", LINE_PX, line) for line in lane_map.road_edges]
     lines += [("stop_line", LINE_PX, line) for line in lane_map.stop_lines]
     lines += [("pole", POLE_PX, _pole(line)) for line in lane_map.poles]

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
+from alpasim_plugin.gaussians.scene.markings import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.gaussians.scene.site import (
     CELL_M,

@@ -18,7 +18,7 @@ from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades
 from alpasim_plugin.gaussians.scene.build_road import build_road
 from alpasim_plugin.gaussians.scene.build_street import build_street
-from alpasim_plugin.gaussians.scene.paint import paint_strokes
+from alpasim_plugin.gaussians.scene.markings import marking_strokes
 from alpasim_plugin.gaussians.scene.scene_graph import (
     Level,
     SceneGraph,
@@ -55,7 +55,7 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
         return SceneGraph([], actors, sky)
     if scenario.background is not None:
         site = make_site(scenario, height_at)
-        nodes = build_road(site, paint_strokes(site))
+        nodes = build_road(site, marking_strokes(site))
         return SceneGraph([finished(node, scenario) for node in nodes], actors, sky)
     if len(path_of(scenario)) > BUILT_WHOLE_M:
         return LongScene(scenario, height_at, actors, sky)
@@ -67,7 +67,7 @@ def build_surroundings(
 ) -> list[SceneNode]:
     """Build everything that does not move, or a section of it: see `make_site`."""
     site = make_site(scenario, height_at, section)
-    road = build_road(site, paint_strokes(site))
+    road = build_road(site, marking_strokes(site))
     facades, houses = build_facades(site)
     return [finished(node, scenario) for node in (*road, *facades, *build_street(site, houses))]
 

@@ -102,7 +102,7 @@ class Summary(TypedDict, total=False):
     metrics: dict[str, dict[str, Facts]]
     paired: dict[str, dict[str, Facts]]
     paired_with_base: dict[str, dict[str, Facts]]
-    paired_arms: dict[str, dict[str, Facts]]
+    paired_policies: dict[str, dict[str, Facts]]
     censoring: dict[str, Facts]
     failures: Facts
     speed: dict[str, Facts]
@@ -130,6 +130,6 @@ def pair_tables(summary: JsonView) -> list[tuple[str, JsonView]]:
     their base, then policies.
     """
     tables = []
-    for key in ("paired", "paired_with_base", "paired_arms"):
+    for key in ("paired", "paired_with_base", "paired_policies"):
         tables += [item for item in (summary.get(key) or {}).items() if item[1]]
     return tables

@@ -1,6 +1,6 @@
 """Lane markings as short strokes, from lane edges, marking lines, crosswalks and stop lines.
 
-Which lines are painted is the rule of `world.paint`.
+Which lines are painted is the rule of `world.markings`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import scipy  # its submodules load on first use
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Paint
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site, left_of, unit
-from alpasim_plugin.world.paint import painted_lines
+from alpasim_plugin.world.markings import marking_lines
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
 LINE_WIDTH_M = 0.14
@@ -35,11 +35,11 @@ class Strokes(NamedTuple):
     colour: I64  # (M,) WHITE or YELLOW
 
 
-def paint_strokes(site: Site) -> Strokes:
+def marking_strokes(site: Site) -> Strokes:
     """Return all lane markings near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    painted = [(site.frame.to_ground(line), paint) for line, paint in painted_lines(lane_map)]
+    painted = [(site.frame.to_ground(line), paint) for line, paint in marking_lines(lane_map)]
     lines = [
         edge
         for edge in painted

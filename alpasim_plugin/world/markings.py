@@ -3,7 +3,7 @@ and the learned metrics share.
 
 A line is painted where the map says so: its marking lines, and the edges of lanes whose markings
 it knows. A line that nobody has seen is not drawn. Where the road itself is built, its lane
-markings are a choice, and `with_default_paint` makes it before anything is drawn.
+markings are a choice, and `with_default_markings` makes it before anything is drawn.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class _Edges:
         ]
 
 
-def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
+def marking_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     """Return what is painted along lanes, each place once.
 
     Returns:
@@ -101,7 +101,7 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     return [(edges.all[i].line, edges.all[i].paint) for i in sorted(taken)]
 
 
-def with_default_paint(lane_map: LaneMap) -> LaneMap:
+def with_default_markings(lane_map: LaneMap) -> LaneMap:
     """Return a map whose unknown lane markings are chosen, for a road that is built from it.
 
     An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes
@@ -120,7 +120,7 @@ def with_default_paint(lane_map: LaneMap) -> LaneMap:
     for i, edge in enumerate(edges.all):
         if edge.paint == "unknown":
             chosen[edge.lane_id, edge.side] = "none" if edge.in_junction else _default(edges, i)
-    lanes = {name: _repainted(lane, chosen) for name, lane in lane_map.lanes.items()}
+    lanes = {name: _marked(lane, chosen) for name, lane in lane_map.lanes.items()}
     return replace(lane_map, lanes=lanes)
 
 
@@ -159,7 +159,7 @@ def _edges_of(lane_map: LaneMap) -> list[_Edge]:
     return out
 
 
-def _repainted(lane: Lane, chosen: dict[tuple[str, int], Paint]) -> Lane:
+def _marked(lane: Lane, chosen: dict[tuple[str, int], Paint]) -> Lane:
     left = chosen.get((lane.lane_id, 1), lane.left_paint)
     return replace(
         lane, left_paint=left, right_paint=chosen.get((lane.lane_id, -1), lane.right_paint)
