@@ -143,7 +143,7 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
     return LaneState(
         mean,
-        np.linalg.inv(total),
+        np.asarray(np.linalg.inv(total)),
         left,
         right,
         max(far, 0.0),

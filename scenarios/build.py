@@ -109,7 +109,7 @@ def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:
 
 def elements(spec: RoadSpec) -> list[Element]:
     """Return the road's elements."""
-    out = []
+    out: list[Element] = []
     for segment in spec.segments:
         match segment:
             case StraightSegment() | NarrowGapSegment():

@@ -72,8 +72,8 @@ class ScriptedTracks:
     def __init__(self, scripts: Sequence[Actor], end_us: int) -> None:
         lookahead_us = int(TIMES_S[-1] * 1e6)
         self.times = np.arange(0, end_us + lookahead_us + DECISION_US, DECISION_US)
-        still = []
-        going = []
+        still: list[Actor] = []
+        going: list[Actor] = []
         for script in scripts:
             reach_m = np.ptp(script.track.xyz[:, :2], axis=0).max()
             stands = reach_m < STANDING_M and script.track.t_us[-1] >= end_us

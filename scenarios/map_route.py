@@ -128,7 +128,7 @@ class LaneGraph:
 
     def line(self, way: Way) -> Path:
         """Return the smooth line of a way, from its start to the end of its last lane."""
-        parts = []
+        parts: list[F64] = []
         begin_m, ids = way.start_m, list(way.lane_ids)
         while ids:
             key = ids.pop(0)

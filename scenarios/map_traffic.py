@@ -62,7 +62,7 @@ def place_followers(
         lights = lights_on(path, lane_map.signals)
         return _Drawn(of_way, path, lights, lights_on(path, lane_map.give_way))
 
-    followers = []
+    followers: list[Follower] = []
     taken = [drawn(way, line)]
     for _ in range(TRIES * count):
         if len(followers) == count:

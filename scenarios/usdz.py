@@ -296,7 +296,7 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
     line = _stations(road)
     if not len(line) or not road.sections:
         return
-    s = STEP_M * np.arange(len(line))
+    s = np.asarray(STEP_M * np.arange(len(line)), dtype=np.float64)
     line[:, :2] = beside(line[:, :3], cubics_at(road.lane_offset, s))
     z = line[:, 3]
     by_id: dict[int, list[F64]] = {}

@@ -208,7 +208,7 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject
     it is missing.
     """
     before = predecessors(lanes)
-    out = []
+    out: list[JsonObject] = []
 
     def add(kind: str, subject: str, objects: list[str]) -> None:
         own = {"subjects": subject, "objects": objects}

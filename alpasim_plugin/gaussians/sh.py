@@ -91,7 +91,9 @@ def _sample_directions() -> tuple[F64, tuple[F64, ...]]:
     r = np.sqrt(1 - z * z)
     directions = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
     basis = sh_basis(directions)
-    return directions, tuple(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]) for d in range(4))
+    return directions, tuple(
+        np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2])) for d in range(4)
+    )
 
 
 def sh_rotation(rotation: F64, degree: int) -> F64:

@@ -249,7 +249,7 @@ def refine_video(
         for role, path in files.results.items():
             writers[role] = _writer(path, readers["input"])
             stack.enter_context(writers[role])
-        timing = []  # of the current block
+        timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer, limit):
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
@@ -379,7 +379,7 @@ def _joined(
 ) -> Iterator[tuple[Frame, U8 | None]]:
     """Yield the source's frames with opacity and map, and append their times to ``timing``."""
     roles = list(readers)
-    starts = []
+    starts: list[Fraction] = []
     for index, row in enumerate(zip_longest(*readers.values())):
         ended = [role for role, timed in zip(roles, row, strict=True) if timed is None]
         if ended:

@@ -161,7 +161,7 @@ class Path:
         """Return points ``(..., 3)`` and headings ``(...)`` at arc lengths, moved left by
         ``offset_m``; clamped to the ends.
         """
-        yaw = np.interp(s_m, self.s, self.yaw)
+        yaw = np.asarray(np.interp(s_m, self.s, self.yaw))
         x = np.interp(s_m, self.s, self.xyz[:, 0]) - offset_m * np.sin(yaw)
         y = np.interp(s_m, self.s, self.xyz[:, 1]) + offset_m * np.cos(yaw)
         return np.stack([x, y, np.interp(s_m, self.s, self.xyz[:, 2])], axis=-1), yaw

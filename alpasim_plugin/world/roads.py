@@ -242,7 +242,7 @@ class Road:
         """Return the oncoming lane ids in *their* driving direction, from the far end of the main
         road.
         """
-        out = []
+        out: list[str] = []
         for stretch in reversed(self.stretches):
             if lane >= len(stretch.backward) or stretch.backward[lane] is None:
                 out.clear()  # the lane starts nearer than this

@@ -234,7 +234,7 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
         ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - behind
         headings = np.arctan2(ahead[:, 1], ahead[:, 0])
     inside = index.containing_many(points)
-    layers = []
+    layers: list[dict[str, tuple[float, str | None]]] = []
     for point, heading, lanes in zip(points, headings, inside, strict=True):
         local = _local_costs(index, point, float(heading), lanes)
         if not local:
@@ -249,7 +249,7 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     if not layers:
         return ()
     lane: str | None = min(layers[-1], key=lambda name: layers[-1][name][0])
-    chain = []
+    chain: list[str] = []
     for layer in reversed(layers):
         assert lane is not None
         if not chain or chain[-1] != lane:

@@ -363,8 +363,8 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     path = Path(path)
     lines, body_offset = _header_lines(path)
     form = ""
-    comments = []
-    found = []
+    comments: list[str] = []
+    found: list[tuple[str, int, list[tuple[str, str] | None]]] = []
     for number, line in enumerate(lines, start=1):
         match line.split():
             case [] | ["ply" | "end_header", *_]:

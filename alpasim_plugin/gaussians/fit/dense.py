@@ -151,7 +151,9 @@ class _Seen:
         p = self.a + q[..., None] * self.b
         z = np.maximum(p[..., 2:], 1e-3)
         uv = p[..., :2] / z
-        return uv - self.at, (self.b[:2] - uv * self.b[2]) / z
+        return np.asarray(uv - self.at, np.float32), np.asarray(
+            (self.b[:2] - uv * self.b[2]) / z, np.float32
+        )
 
 
 def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:

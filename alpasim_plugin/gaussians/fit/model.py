@@ -161,7 +161,7 @@ class SplatModel:
         p = {name: t.detach().double().numpy() for name, t in self.params.items()}
         sh = np.concatenate([p["sh_dc"], p["sh_rest"]], axis=1).astype(np.float32)
         first = np.searchsorted(self.node.numpy(), np.arange(len(self.actors) + 2))
-        out = []
+        out: list[GaussianCloud] = []
         for low, high in pairwise(first.tolist()):
             part = slice(low, high)
             opacities = 1 / (1 + np.exp(-p["logit_opacities"][part]))

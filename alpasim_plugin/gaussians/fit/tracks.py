@@ -156,7 +156,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         summed(values, tracks.point, tracks.count)
         for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view]))
     )
-    xyz: F64 = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
+    xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
     for _ in range(ROUNDS):
         e, slope, _ = residuals(xyz, tracks, R, t, K)
         J = slope @ R[tracks.view]
@@ -304,11 +304,11 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     of_poses += np.diag(prior)
     pull_poses += prior * _from_given(R, t, R0, t0)
     between = weighted_pose @ by_point  # (M, 6, 3)
-    inverse: F64 = np.linalg.inv(of_points + 1e-6 * np.eye(3))
+    inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
     H, g = _reduced(of_poses, pull_poses, between, inverse, pull_points, view, point)
-    step: F64 = -np.linalg.solve(H, g).reshape(views, 6)
+    step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
     back = summed(np.einsum("nij,ni->nj", between, step[view]), point, points)
-    return step, -np.einsum("nij,nj->ni", inverse, pull_points + back)
+    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), np.float64)
 
 
 def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:

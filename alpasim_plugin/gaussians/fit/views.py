@@ -143,7 +143,11 @@ def halved(view: PosedView) -> PosedView:
 
     def all_four(flags: Bool | None) -> Bool | None:
         return (
-            None if flags is None else flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3))
+            None
+            if flags is None
+            else np.asarray(
+                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
+            )
         )
 
     depth = (
