@@ -355,7 +355,7 @@ def _checked(policy: Policy, scenario: Scenario) -> Report:
     if not replays:
         situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK, *(IMAGES if cameras else ())]
     plans: dict[str, list[Plan]] = {}
-    durations_ms = []
+    durations_ms: list[float] = []
     for situation in situations:
         driven = _drive(policy, situation, cameras, durations_ms)
         if not isinstance(driven, str):

@@ -232,7 +232,7 @@ def usual(args: list[str]) -> list[str]:
         >>> usual(["help", "list"]), usual(["--renderer", "clean,", "3dgs", "smoke/curve"])
         (['list', '--help'], ['--renderer', 'clean,3dgs', 'smoke/curve'])
     """
-    words = []
+    words: list[str] = []
     for word in args:
         is_seeds = words[-2:-1] == ["--seeds"] and not word.strip(",").isdecimal()
         if words and not is_seeds and (words[-1].endswith(",") or word.startswith(",")):

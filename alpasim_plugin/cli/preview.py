@@ -68,7 +68,7 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) ->
     session = make_renderer(renderer or ("3dgs" if scenario.model else "clean"), scenario)
     figure = Figure(SIZE, dpi=100, layout="constrained")
     figure.suptitle("\n".join(line[:190] for line in facts), fontsize=9, x=0.01, ha="left")
-    above, below = figure.subfigures(2, 1, height_ratios=[2, 1])
+    above, below = np.asarray(figure.subfigures(2, 1, height_ratios=[2, 1]))
     _draw_map(above.subplots(), scenario, actors, times)
     for axes, t_us in zip(below.subplots(1, MOMENTS), times, strict=True):
         axes.imshow(checked_frames(session, recorded_requests(scenario, t_us)[:1])[0].rgb)

@@ -302,7 +302,9 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
         return points
     T = rough.T_world_source
     return points.joined(
-        road_points(front, rough.poses[drive.front], rough.strip).moved(np.linalg.inv(T))
+        road_points(front, rough.poses[drive.front], rough.strip).moved(
+            np.asarray(np.linalg.inv(T), dtype=np.float64)
+        )
     )
 
 

@@ -156,7 +156,7 @@ def _boxes(
     )
     count, label = scipy.sparse.csgraph.connected_components(near, directed=False)
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
-    out = []
+    out: list[Obstacle] = []
     for number in range(count):
         mine = label == number
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))

@@ -112,7 +112,7 @@ def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F
     J = slope @ R[tracks.view]
     H = np.zeros((tracks.count, 3, 3))
     np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
-    return np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2
+    return np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64)
 
 
 def _matched(views: Sequence[PosedView]) -> Tracks:

@@ -137,7 +137,10 @@ def _in_frame(
     frames = {"as it is": np.eye(4)}
     if stated is not None:
         frames |= _T_trained_source(stated, drive)
-    models = {name: placed_cloud(cloud, np.linalg.inv(T)) for name, T in frames.items()}
+    models = {
+        name: placed_cloud(cloud, np.asarray(np.linalg.inv(T), np.float64))
+        for name, T in frames.items()
+    }
     shares = {name: _covered(model, drive) for name, model in models.items()}
     best = max(shares, key=lambda name: shares[name])
     covered, moved = shares[best], models[best]

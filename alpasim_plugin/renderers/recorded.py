@@ -64,7 +64,7 @@ def built_recording(
     T_rig_offset = np.eye(4)
     T_rig_offset[1, 3] = recipe.lateral_offset_m if recipe else 0.0
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
-    shots = []
+    shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
 
     @lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))
     def read(number: int) -> tuple[U8, F32]:

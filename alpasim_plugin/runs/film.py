@@ -35,7 +35,7 @@ def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
     times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
     requests = [logged_request(log, camera, t_us) for t_us in times]
     rule = renderer.block or BlockRule(1, 1)
-    images = []
+    images: list[U8] = []
     for number in count():
         end = len(images) + rule.frames(number)
         if end > len(requests):

@@ -88,9 +88,9 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
         for rollout in cell.rollouts
         if not rollout.ok
     ]
-    recorded = []
-    labels = []
-    items = []
+    recorded: list[RolloutLog] = []
+    labels: list[str] = []
+    items: list[Item] = []
     for rollout in cell.rollouts:
         log = logs.get(rollout.path)
         if isinstance(log, SimrunError):
@@ -259,7 +259,7 @@ def _boxes(renderer: str, log: RolloutLog, label: str, color: Rgb) -> Iterator[I
         name: {t_us: i for i, t_us in enumerate(actor.track.t_us.tolist())}
         for name, actor in log.actors.items()
     }
-    before = []
+    before: list[str] = []
     for k, t_us in enumerate(log.ego.t_us.tolist()):
         ego = _cube(log.ego_box, log.ego, k, color)
         entities = [_entity(t_us, "ego", cubes=[ego], facts={"renderer": renderer})]

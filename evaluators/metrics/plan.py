@@ -252,7 +252,7 @@ def _errors(
     """Return the distances ``(M,)`` of each sample from a target ``(M, 3)`` at times ``(M,)``; None
     of one that does not cover them.
     """
-    out = []
+    out: list[F64 | None] = []
     for k in range(len(samples.start) - 1):
         t = samples.t_us[samples.rows(k)]
         if not len(t) or (len(t_us) and (t[0] > t_us[0] or t_us[-1] > t[-1])):

@@ -240,7 +240,7 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
     is_bad: Bool = log_bad >= bar
     binding = [asked.binding for asked in question.metrics]
     all_good = is_good[binding].all(axis=0) & any(binding)
-    answer = _first(all_good, is_bad.any(axis=0))
+    answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
     states: dict[str, MetricLook] = {}
     for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
         x = values[asked.metric]

@@ -120,9 +120,9 @@ def pairs_within(
     """
     variants = variants_in(table)
     by_renderer_base, by_policy_base = axis_bases(variants, baseline)
-    of_renderers = []
-    of_fixers = []
-    of_policies = []
+    of_renderers: list[Pair] = []
+    of_fixers: list[Pair] = []
+    of_policies: list[Pair] = []
     for policy in table.policies:
         own = {variant.renderer: variant for variant in variants if variant.policy == policy}
         base = next(iter(own))

@@ -306,7 +306,7 @@ class Lidar:
         """Return the cameras of the images, 90 degrees wide, placed on the sensor."""
         width, height = SCAN_PX
         K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
-        out = []
+        out: list[CameraSpec] = []
         for look in np.deg2rad(self.looks_deg):
             T = np.eye(4)
             c = np.cos(look)

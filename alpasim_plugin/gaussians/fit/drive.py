@@ -164,7 +164,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         red, green, blue = gain.tolist()
         done.append(replace(view, sky=sky, depth=depth, gain=(red, green, blue)))
         q = between_points(view.camera, tracks, placed, i)
-        guesses.append(None if q is None else (1 / np.maximum(q, 1e-3)))
+        guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32))
     return done, guesses
 
 

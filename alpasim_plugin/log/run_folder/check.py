@@ -55,7 +55,7 @@ def inspect_run(root: Path, full: bool = False) -> Inspection:
     if not os.path.exists(root / ROLLOUTS_FOLDER):
         return Inspection(cells, (), (), (), tables_only=True)
     manifests = []
-    damage = []
+    damage: list[Damage] = []
     unfinished = []
     for cell in cells:
         state = inspect_rollout(root, cell, full)
