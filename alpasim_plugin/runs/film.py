@@ -6,7 +6,7 @@ from itertools import count
 from pathlib import Path
 
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import Scenario, SensorSpec
+from alpasim_plugin.core.types import U8, Scenario, SensorSpec
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, VIDEO_NAME
 from alpasim_plugin.runs.cameras import logged_request
