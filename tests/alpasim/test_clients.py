@@ -9,6 +9,7 @@ import grpc
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
@@ -108,8 +109,8 @@ def test_a_driver_over_sockets_drives_as_the_policy_in_the_process(scenario, ins
         len(plan.samples) for plan in inside.plans
     ]
     for one, other in zip(outside.plans, inside.plans, strict=True):
-        np.testing.assert_array_equal(one.trajectory.t_us, other.trajectory.t_us)
-        np.testing.assert_allclose(one.trajectory.xyz, other.trajectory.xyz, atol=1e-3)
+        assert_array_equal(one.trajectory.t_us, other.trajectory.t_us)
+        assert_allclose(one.trajectory.xyz, other.trajectory.xyz, atol=1e-3)
     each = ["submit_image_observation", "submit_egomotion_observation", "submit_route", "drive"]
     assert calls.made == ["get_version", "start_session", *each * 12, "close_session"]
     assert service.counts == {"start_session": 1, "drive": 12}

@@ -13,6 +13,7 @@ import grpc
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
@@ -208,8 +209,8 @@ def both(
 
 
 def assert_equal(one, other, scene):
-    np.testing.assert_array_equal(one.ego.xyz, other.ego.xyz)
-    np.testing.assert_array_equal(one.ego.quat, other.ego.quat)
+    assert_array_equal(one.ego.xyz, other.ego.xyz)
+    assert_array_equal(one.ego.quat, other.ego.quat)
     assert [image.data for image in one.images] == [image.data for image in other.images]
     assert measured(one, scene) == measured(other, scene)
 
@@ -248,4 +249,4 @@ def test_the_chain_over_sockets_equals_the_chain_in_one_process(
         jpeg.images[:3], served.images[:3], strict=True
     ):  # in the warm-up, at equal poses: the codec alone
         coded = decode_image(encode_image(decode_image(other.data), "jpeg"))
-        np.testing.assert_array_equal(decode_image(one.data), coded)
+        assert_array_equal(decode_image(one.data), coded)

@@ -5,6 +5,7 @@ model puts it.
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.alpasim.server import views
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
@@ -126,7 +127,7 @@ def test_each_direction_is_shown_where_the_lens_puts_it(spec, project):
     for ray, pixel in zip(RAYS, project(spec), strict=True):
         assert 1 < pixel[0] < 319
         assert 1 < pixel[1] < 179
-        np.testing.assert_allclose(shown_at(lens, pixel), ray, atol=2e-4)
+        assert_allclose(shown_at(lens, pixel), ray, atol=2e-4)
 
 
 @pytest.mark.parametrize("size", [(320, 180), (640, 360)])
@@ -145,7 +146,7 @@ def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
         found = cv2.remap(
             straight.place, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR
         )[0, 0]
-        np.testing.assert_allclose(found + 0.5, pixel, atol=0.05)
+        assert_allclose(found + 0.5, pixel, atol=0.05)
 
 
 def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black():
@@ -168,7 +169,7 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
         np.stack([128 + 100 * x, 128 + 100 * y, 0 * x], axis=-1).clip(0, 255).astype(np.uint8)
     )
     image = lens.image(covering)
-    np.testing.assert_allclose(image[90, 160, :2].astype(int), 128, atol=1)
+    assert_allclose(image[90, 160, :2].astype(int), 128, atol=1)
     assert image[0, 0].tolist() == [0, 0, 0]
     assert lens.plane(np.zeros((height, width), np.float32), 1.0)[0, 0] == 1.0
 
@@ -214,9 +215,9 @@ def test_what_is_kept_of_lenses_has_an_end(monkeypatch):
 
 def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean():
     K = read_lens(pinhole(64, 32), 32, 32).K
-    np.testing.assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
+    assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
     spec = ftheta(False)
     whole, half = read_lens(spec, 320, 180), read_lens(spec, 160, 90)
-    np.testing.assert_allclose(
+    assert_allclose(
         shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
     )

@@ -1,7 +1,7 @@
 """The tiny decoder against numbers that the original code produced."""
 
 import pytest
-import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_last, run_layers
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
@@ -23,7 +23,7 @@ def test_latents_decode_to_the_original_frames(numbers, name, latents_per_pass):
     decoder.latents_per_pass = latents_per_pass
     video = decoder(numbers[1][f"in.{name}"].transpose(1, 2))
     expected = numbers[1][f"out.{name}.decode_parallel"].transpose(1, 2) * 2 - 1
-    torch.testing.assert_close(video, expected, atol=TOLERANCE, rtol=0)
+    assert_close(video, expected, atol=TOLERANCE, rtol=0)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -35,7 +35,7 @@ def test_frames_that_are_dropped_are_the_original_ones_too(numbers, name):
         StreamingState(None),
     )
     expected = numbers[1][f"out.{name}.decoder_raw_all_frames_unclamped"].permute(0, 1, 3, 4, 2)
-    torch.testing.assert_close(frames, expected, atol=TOLERANCE, rtol=0)
+    assert_close(frames, expected, atol=TOLERANCE, rtol=0)
 
 
 def test_lighttae_convention_takes_the_denormalised_latent(numbers):
@@ -43,7 +43,7 @@ def test_lighttae_convention_takes_the_denormalised_latent(numbers):
         numbers[1]["in.latent_n1_t3_4x6"].transpose(1, 2),
         numbers[1]["out.latent_n1_t3_4x6.lighttae_decode_BCTHW_minus1_1"],
     )
-    torch.testing.assert_close(
+    assert_close(
         TinyDecoder.from_state_dict(numbers[0], scaled=True)(z), expected, atol=TOLERANCE, rtol=0
     )
     assert (TinyDecoder.from_state_dict(numbers[0])(z) - expected).abs().max() > 0.05

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.networks import at_precision
@@ -47,16 +48,16 @@ def vae():
 
 def test_components_are_orthonormal():
     kernel = CosineTransform().kernel.flatten(1).double()
-    torch.testing.assert_close(
+    assert_close(
         kernel @ kernel.T, torch.eye(len(COMPONENTS), dtype=torch.float64), atol=1e-6, rtol=0
     )
 
 
 def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest():
     transform, z = CosineTransform(), noise(2, 3, 2, 3, 16)
-    torch.testing.assert_close(transform.analyse(transform.synthesise(z)), z, atol=1e-5, rtol=0)
+    assert_close(transform.analyse(transform.synthesise(z)), z, atol=1e-5, rtol=0)
     grid = to_grid(clip(8, 16, 24))
-    torch.testing.assert_close(
+    assert_close(
         transform.synthesise(transform.analyse(grid)) + transform.residue(grid),
         grid,
         atol=1e-5,
@@ -76,9 +77,7 @@ def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest():
 
 def test_untrained_decoding_with_its_own_render_returns_the_render():
     untrained, video = TinyVAE.random(SIZES), clip(9, 16, 24)
-    torch.testing.assert_close(
-        untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0
-    )
+    assert_close(untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0)
 
 
 def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred():
@@ -93,13 +92,13 @@ def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred(
 def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail():
     untrained, video = TinyVAE.random(SIZES), clip(5, 16, 16)
     z, cover = untrained.encode(video), torch.ones(1, 1, 5, 16, 16)
-    torch.testing.assert_close(
+    assert_close(
         untrained.decode(z, render=video, opacity=cover),
         untrained.decode(z, render=video),
         atol=1e-6,
         rtol=0,
     )
-    torch.testing.assert_close(
+    assert_close(
         untrained.decode(z, render=video, opacity=0 * cover), untrained.decode(z), atol=1e-6, rtol=0
     )
 
@@ -110,8 +109,8 @@ def test_a_hole_in_the_render_is_filled_by_the_latent_alone():
     cover[..., 16:] = 0
     z = untrained.encode(truth)
     out = untrained.decode(z, render=truth * cover, opacity=cover)
-    torch.testing.assert_close(out[..., :16], truth[..., :16], atol=1e-5, rtol=0)
-    torch.testing.assert_close(out[..., 16:], untrained.decode(z)[..., 16:], atol=1e-5, rtol=0)
+    assert_close(out[..., :16], truth[..., :16], atol=1e-5, rtol=0)
+    assert_close(out[..., 16:], untrained.decode(z)[..., 16:], atol=1e-5, rtol=0)
 
 
 # Streams
@@ -279,6 +278,6 @@ def test_components_follow_their_names():
 def test_full_opacity_is_as_none_for_a_trained_network(vae):
     video = clip(5, 16, 16)
     z, cover = vae.encode(video), torch.ones(1, 1, 5, 16, 16)
-    torch.testing.assert_close(
+    assert_close(
         vae.decode(z, render=video, opacity=cover), vae.decode(z, render=video), atol=1e-5, rtol=0
     )

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.networks import at_precision
@@ -61,10 +62,8 @@ def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass():
     whole, steps = WanVAE.random(SMALL), WanVAE.random(SMALL)
     whole.latents_per_pass = None
     video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
-    torch.testing.assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
-    torch.testing.assert_close(
-        whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0
-    )
+    assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
+    assert_close(whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0)
 
 
 def test_a_state_holds_no_more_than_its_own_frames(vae):
@@ -174,9 +173,7 @@ def test_summed_2d_convolutions_equal_the_3d_one(past, frames, inputs, outputs, 
     expected = F.conv3d(past_and_padding, weight, bias, padding=(0, pad, pad)).permute(
         0, 2, 3, 4, 1
     )
-    torch.testing.assert_close(
-        causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5
-    )
+    assert_close(causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5)
 
 
 # Checkpoints

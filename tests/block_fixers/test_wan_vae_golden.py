@@ -1,7 +1,7 @@
 """The Wan autoencoder against numbers that the original code produced."""
 
 import pytest
-import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_first, channels_last
@@ -27,9 +27,7 @@ def vae(numbers):
 def test_clip_encodes_to_the_original_latents(vae, numbers, name, latents_per_pass):
     vae.latents_per_pass = latents_per_pass
     z = vae.encode(numbers[1][f"in.{name}"])
-    torch.testing.assert_close(
-        z, numbers[1][f"out.{name}.latent_normalised"], atol=TOLERANCE, rtol=0
-    )
+    assert_close(z, numbers[1][f"out.{name}.latent_normalised"], atol=TOLERANCE, rtol=0)
 
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
@@ -37,24 +35,18 @@ def test_clip_encodes_to_the_original_latents(vae, numbers, name, latents_per_pa
 def test_latents_decode_to_the_original_frames(vae, numbers, name, latents_per_pass):
     vae.latents_per_pass = latents_per_pass
     video = vae.decode(numbers[1][f"out.{name}.latent_normalised"], clamp=False)
-    torch.testing.assert_close(
-        video, numbers[1][f"out.{name}.recon_unclamped"], atol=TOLERANCE, rtol=0
-    )
+    assert_close(video, numbers[1][f"out.{name}.recon_unclamped"], atol=TOLERANCE, rtol=0)
 
 
 @pytest.mark.parametrize(("clamp", "what"), [(True, "decode_clamped"), (False, "decode_unclamped")])
 def test_random_latents_decode_to_the_original_frames(vae, numbers, clamp, what):
     video = vae.decode(numbers[1]["in.latent_b1_t4_4x6"], clamp=clamp)
-    torch.testing.assert_close(
-        video, numbers[1][f"out.latent_b1_t4_4x6.{what}"], atol=TOLERANCE, rtol=0
-    )
+    assert_close(video, numbers[1][f"out.latent_b1_t4_4x6.{what}"], atol=TOLERANCE, rtol=0)
 
 
 def test_unnormalised_means_are_the_original_ones(vae, numbers):
     mu = vae.stats.denormalise(vae.encode(numbers[1]["in.clip_b1_t9_32x48"]))
-    torch.testing.assert_close(
-        mu, numbers[1]["out.clip_b1_t9_32x48.latent_raw_mu"], atol=TOLERANCE, rtol=0
-    )
+    assert_close(mu, numbers[1]["out.clip_b1_t9_32x48.latent_raw_mu"], atol=TOLERANCE, rtol=0)
 
 
 def test_every_chunk_leaves_the_original_encoder_output_and_state(vae, numbers):
@@ -68,9 +60,7 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(vae, numbers):
         out = channels_first(
             vae.encoder.next(channels_last(video[:, :, start : start + count]), streaming)
         )
-        torch.testing.assert_close(
-            out, io[f"out.{name}.encoder_chunk{index}"], atol=TOLERANCE, rtol=0
-        )
+        assert_close(out, io[f"out.{name}.encoder_chunk{index}"], atol=TOLERANCE, rtol=0)
         slots = [
             tuple(slot)
             for slot in config["cases"][name]["encoder_cache_slots_after_each_chunk"][index]

@@ -6,6 +6,7 @@ from fractions import Fraction
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.video import VideoReader, VideoWriter
@@ -179,8 +180,8 @@ def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_pa
     assert "inverts, trained changes this video too much for a repair: PSNR" in told
     assert "3 of 5 frames of the result are the input's own" in told
     for file in sorted(source.iterdir()):
-        np.testing.assert_array_equal(cv2.imread(str(out / file.name)), cv2.imread(str(file)))
+        assert_array_equal(cv2.imread(str(out / file.name)), cv2.imread(str(file)))
     assert run_command([*command, "--overwrite", "--anyway"]) == 0
     assert "the fixer changed this video by much (PSNR" in capsys.readouterr().err
     last = cv2.imread(str(source / "frame_04.png"))
-    np.testing.assert_array_equal(cv2.imread(str(out / "frame_04.png")), 255 - last)
+    assert_array_equal(cv2.imread(str(out / "frame_04.png")), 255 - last)

@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
@@ -172,7 +173,7 @@ def test_the_path_is_the_routes_cubic():
     y = 0.4 + 0.03 * x + 0.004 * x**2 / 2 - 1e-5 * x**3 / 6
     path = np.column_stack([x, y, np.zeros(40)])
     found = path_cubic(path, BicycleState(0.0, 0.0, 0.0, 10.0, 0.0))
-    np.testing.assert_allclose(found[:4], (0.4, 0.03, 0.004, -1e-5), rtol=1e-6)
+    assert_allclose(found[:4], (0.4, 0.03, 0.004, -1e-5), rtol=1e-6)
     assert path_cubic(path[:2], BicycleState(0, 0, 0, 10.0, 0.0)) == (0.0,) * 5
 
 
@@ -210,7 +211,7 @@ def test_a_control_unit_drives_a_curve_and_twice_the_same(curve):
     turned = 2 * np.arccos(abs(float(np.dot(log.ego.quat[0], log.ego.quat[-1]))))
     assert turned > 0.05  # it steered
     again, _ = drive(curve, "test-drive-two")
-    np.testing.assert_array_equal(log.ego.xyz, again.ego.xyz)
+    assert_array_equal(log.ego.xyz, again.ego.xyz)
 
 
 def test_without_a_control_unit_the_ego_stops_and_the_facts_say_so():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation, Slerp
 
 from alpasim_plugin.core.errors import InputError
@@ -38,9 +39,7 @@ unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(
 @given(unit_quats)
 def test_rotation_matrix_agrees_with_scipy_and_survives_the_way_back(quat):
     matrix = matrix_from_quat(quat)
-    np.testing.assert_allclose(
-        matrix, Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), atol=1e-12
-    )
+    assert_allclose(matrix, Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), atol=1e-12)
     back = quat_from_matrix(matrix)
     assert abs(abs(back @ quat) - 1) < 1e-12
     assert back[0] >= 0
@@ -51,12 +50,12 @@ def test_half_turn_about_each_axis_has_a_stable_quaternion(axis):
     quat = np.zeros(4)
     quat[1 + axis] = 1.0
     back = quat_from_matrix(matrix_from_quat(quat))
-    np.testing.assert_allclose(np.abs(back), np.abs(quat), atol=1e-15)
+    assert_allclose(np.abs(back), np.abs(quat), atol=1e-15)
 
 
 def test_heading_of_180_degrees_wraps_to_the_lower_end():
     assert float(wrap_angle(np.pi)) == -np.pi
-    np.testing.assert_allclose(yaw_from_quat(quat_from_yaw(np.array([3.0, -3.0]))), [3.0, -3.0])
+    assert_allclose(yaw_from_quat(quat_from_yaw(np.array([3.0, -3.0]))), [3.0, -3.0])
 
 
 @settings(deadline=None, max_examples=examples(50))
@@ -90,7 +89,7 @@ def test_interpolation_outside_the_trajectory_is_refused():
 def test_offset_trajectory_turns_the_offset_with_the_body():
     left_turn = trajectory_from_poses([0, 1], [se2(0, 0, 0), se2(0, 0, np.pi / 2)])
     moved = offset_trajectory(left_turn, se2(2.0, 0.0, 0.0))
-    np.testing.assert_allclose(moved.xyz, [[2, 0, 0], [0, 2, 0]], atol=1e-12)
+    assert_allclose(moved.xyz, [[2, 0, 0], [0, 2, 0]], atol=1e-12)
 
 
 def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends():
@@ -102,4 +101,4 @@ def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends():
 
 def test_resampling_skips_repeated_points():
     line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
-    np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])
+    assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])

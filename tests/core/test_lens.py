@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, resized, sides_of
@@ -63,10 +64,10 @@ def test_the_ray_of_a_pixel_is_shown_at_that_pixel(lens):
     pixel = np.stack(np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5), axis=-1).reshape(-1, 2)
     seen = rays.seen & (np.linalg.norm(pixel - spec.K[:2, 2], axis=1) > 1)
     assert seen.sum() > 0.8 * len(seen)
-    np.testing.assert_allclose(by_equations(spec, rays.ray[seen]), pixel[seen], atol=0.06)
+    assert_allclose(by_equations(spec, rays.ray[seen]), pixel[seen], atol=0.06)
     shown, good = pixels_of(spec, rays.ray[seen])
     assert good.all()
-    np.testing.assert_allclose(shown, pixel[seen], atol=0.06)
+    assert_allclose(shown, pixel[seen], atol=0.06)
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE, FTHETA, BACKWARD])
@@ -114,4 +115,4 @@ def test_a_camera_of_another_size_sees_the_same_at_its_corners():
         ray = np.array([[0.3, -0.2, 1.0], [-0.5, 0.1, 1.0]])
         whole, _ = pixels_of(spec, ray)
         half, _ = pixels_of(resized(spec, W // 2, H // 2), ray)
-        np.testing.assert_allclose(half, whole / 2, atol=1e-6)
+        assert_allclose(half, whole / 2, atol=1e-6)

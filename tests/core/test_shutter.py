@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.shutter import (
@@ -74,7 +75,7 @@ def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask(
         height, width = band.rows.stop - band.rows.start, band.columns.stop - band.columns.start
         band.put(whole, np.full((height, width), float(i)))
     expected = np.where(np.isnan(share), -1, np.minimum(share * 4, 3).astype(float) // 1)
-    np.testing.assert_array_equal(whole, expected)
+    assert_array_equal(whole, expected)
 
 
 def test_a_car_that_stands_on_an_empty_road_needs_one_band_and_a_turning_one_many():
@@ -102,8 +103,8 @@ def test_motion_is_what_a_near_point_moves_by():
 def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn():
     start, end = se2(2, 0, 0.2), se2(4, 8, 0.2 + 0.9 * np.pi)
     middle = between(np.stack([start]), np.stack([end]), 0.25)[0]
-    np.testing.assert_allclose(middle, se2(2.5, 2, 0.2 + 0.225 * np.pi), atol=1e-12)
-    np.testing.assert_array_equal(between(np.stack([start]), np.stack([end]), 1.0)[0], end)
+    assert_allclose(middle, se2(2.5, 2, 0.2 + 0.225 * np.pi), atol=1e-12)
+    assert_array_equal(between(np.stack([start]), np.stack([end]), 1.0)[0], end)
 
 
 def test_road_users_are_where_they_are_at_the_time_of_the_band():

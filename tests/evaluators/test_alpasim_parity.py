@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from evaluators import PRESETS, reduce_rollout
 from evaluators.alpasim import load_settings
@@ -53,14 +54,14 @@ def assert_steps(log, archive, preset, rails=True, table=None):
     for name in want:
         t_us, value, valid = want[name]
         one = found[name]
-        np.testing.assert_array_equal(one.t_us, t_us, err_msg=name)
-        np.testing.assert_array_equal(one.valid, valid.astype(bool), err_msg=name)
+        assert_array_equal(one.t_us, t_us, err_msg=name)
+        assert_array_equal(one.valid, valid.astype(bool), err_msg=name)
         if set(np.unique(value)) <= {0.0, 1.0} and name not in (
             "progress",
             "progress_rel",
             "progress_rel_to_total",
         ):
-            np.testing.assert_array_equal(one.value, value, err_msg=name)
+            assert_array_equal(one.value, value, err_msg=name)
         else:
             off = [
                 (k, float(v), float(w))

@@ -9,6 +9,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.types import Lane
 from evaluators import PRESETS, rollout_values, score
@@ -276,7 +277,7 @@ def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
         one.offroad for one in slow
     ]
     gap = by_name(score(log, where, "paper"))["min_distance_to_lane_boundary_m"].value
-    np.testing.assert_allclose(gap, [one.boundary_gap_m for one in slow], atol=1e-9)
+    assert_allclose(gap, [one.boundary_gap_m for one in slow], atol=1e-9)
     assert (held(log, lane_map).in_one | held(log, lane_map).in_union).tolist() == [
         one.on_road for one in slow
     ]
@@ -308,4 +309,4 @@ def test_unions_are_kept_for_the_next_rollout_and_not_mixed_between_maps():
         lane("right", 0.0), lane("left", 9.0), edges=(*TWO_LANES.road_edges, edge_line(1.75))
     )
     assert offroad_of(log, other).value.tolist() == [1.0] * 30
-    np.testing.assert_array_equal(offroad_of(log, TWO_LANES).value, first)
+    assert_array_equal(offroad_of(log, TWO_LANES).value, first)

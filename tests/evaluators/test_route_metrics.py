@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from evaluators import rollout_values, score
 from evaluators.metrics.route import beside, moving, to_path
@@ -114,12 +115,10 @@ def test_array_projection_and_twin_agree(points, offset):
     tol = (
         1e-9 if offset == 0 else 1e-6
     )  # moving the rig to the box centre and back rounds at UTM size
-    np.testing.assert_allclose(
+    assert_allclose(
         found["dist_to_gt_trajectory"].value, [one.distance_m for one in slow], atol=tol
     )
-    np.testing.assert_allclose(
-        found["dist_to_gt_location"].value, [one.away_m for one in slow], atol=tol
-    )
+    assert_allclose(found["dist_to_gt_location"].value, [one.away_m for one in slow], atol=tol)
     if offset == 0:
         # Where the ego is equally far from two parts of the path, rounding picks one of them.
         for name, want in (

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
@@ -37,7 +38,7 @@ def test_line_lies_where_the_formula_puts_it_and_fades_with_depth():
             1 - depth / 200,
             depth**2 / (640 * 1.5),
         )  # a pixel of height is this much of depth
-        np.testing.assert_allclose(
+        assert_allclose(
             image[int(v), int(u)],
             np.array(COLOURS["road_boundary"]) * fade,
             atol=2 + 0.75 * pixel_m / 200 * 253,
@@ -103,8 +104,8 @@ def test_road_users_go_from_the_front_colour_to_the_back_colour():
     row = side_on[78]  # heading left: front at the left
     inside = np.flatnonzero(row.any(axis=1))
     first, last = row[inside[3]], row[inside[-4]]
-    np.testing.assert_allclose(first, np.array([0, 46, 136]) * 0.955, atol=25)
-    np.testing.assert_allclose(last, np.array([126, 206, 255]) * 0.955, atol=25)
+    assert_allclose(first, np.array([0, 46, 136]) * 0.955, atol=25)
+    assert_allclose(last, np.array([126, 206, 255]) * 0.955, atol=25)
     assert (np.diff(row[inside[3:-3], 0].astype(int)) >= 0).all()
 
 
@@ -119,7 +120,7 @@ def test_road_users_go_from_the_front_colour_to_the_back_colour():
 )
 def test_classes_have_their_colours(label, back):
     image = draw_map(prepare_map(EMPTY), PIN, at(), (ActorBox(se2(10, 0, 0, 0.8), CAR, label),))
-    np.testing.assert_allclose(
+    assert_allclose(
         image[78, 128], np.array(back) * (1 - 7.75 / 200), atol=3
     )  # its back, 7.75 m ahead
 
@@ -132,7 +133,7 @@ def test_nearer_road_user_hides_the_farther_and_the_line_behind():
         draw_map(scene, BIG, at(z=1), (far, near)),
         draw_map(scene, BIG, at(z=1), (near, far)),
     )
-    np.testing.assert_array_equal(one, two)
+    assert_array_equal(one, two)
     assert not lit(one[:, 600:680], COLOURS["road_boundary"]).any()
     assert lit(one, np.array(COLOURS["road_boundary"]) * 0.85).any()
     assert not lit(one[:, 620:660], np.array([255, 192, 64]) * 0.9).any()
@@ -272,7 +273,7 @@ def street():
 def test_a_part_of_the_rows_is_that_part_of_the_picture(rows):
     scene, boxes = street()
     whole = draw_map(scene, PIN, at(), boxes)
-    np.testing.assert_array_equal(draw_map(scene, PIN, at(), boxes, rows=rows), whole[rows])
+    assert_array_equal(draw_map(scene, PIN, at(), boxes, rows=rows), whole[rows])
 
 
 def test_concave_area_stays_concave():

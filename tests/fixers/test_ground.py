@@ -4,6 +4,7 @@ stands on it keeps its own depth.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
@@ -78,7 +79,7 @@ def test_the_road_is_seen_where_the_render_has(fog_m):
     for image, by_two in zip(
         carry(pictures, view, rig(10.0)), carry(pictures, view, rig(10.0), threads=2), strict=True
     ):
-        np.testing.assert_array_equal(image, by_two)
+        assert_array_equal(image, by_two)
         assert off(image, truth, road) < 6
         assert (image[road][..., 3] == VALID).mean() > 0.9
     assert off(warp(pictures[0], view), truth, road) > 20
@@ -105,7 +106,7 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground():
     assert (held[rear] == 0).all()
     aside = np.ones(depth.shape, bool)
     aside[rear] = False
-    np.testing.assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
+    assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
 
 
 def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road():

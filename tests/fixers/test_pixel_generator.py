@@ -5,6 +5,7 @@ the start.
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.pixel_generator import (
@@ -92,7 +93,7 @@ def test_time_one_is_the_deployed_step_and_other_times_differ():
     state, source = net.start(frame[0]), torch.randn_like(frame[0])
     deployed, _ = net(*frame, state, source)
     at_one, _ = net(*frame, state, source, torch.ones(2))
-    torch.testing.assert_close(at_one, deployed, atol=1e-6, rtol=0)
+    assert_close(at_one, deployed, atol=1e-6, rtol=0)
     assert not torch.allclose(
         net(*frame, state, source, torch.tensor([1.0, 0.5]))[0][1], deployed[1]
     )
@@ -107,15 +108,15 @@ def test_noise_enters_holes_alone():
     everywhere = np.arange(render[0, ..., 0].numel())
     noise = [pixel_noise(int(key), everywhere).reshape(render.shape[1:]) for key in keys]
     dense = pixel_source(render, alpha, torch.from_numpy(np.stack(noise)))
-    torch.testing.assert_close(sparse_source(render, alpha, keys), dense)
-    torch.testing.assert_close(dense_source(render, alpha, keys), dense, rtol=0, atol=1e-6)
+    assert_close(sparse_source(render, alpha, keys), dense)
+    assert_close(dense_source(render, alpha, keys), dense, rtol=0, atol=1e-6)
     assert sparse_source(render, torch.ones_like(alpha), keys) is render
 
 
 def test_an_upsampled_cell_starts_flat():
     out = Upsample(5, 3)(torch.randn(1, 4, 6, 5))
     assert out.shape == (1, 8, 12, 3)
-    torch.testing.assert_close(out[:, ::2, ::2], out[:, 1::2, 1::2])
+    assert_close(out[:, ::2, ::2], out[:, 1::2, 1::2])
 
 
 def test_weights_say_the_sizes():
@@ -134,4 +135,4 @@ def test_clips_of_a_batch_do_not_see_each_other():
     for b in range(2):
         alone, _ = rolled(net, [tuple(x[b : b + 1] for x in frame) for frame in clip])  # type: ignore[misc]
         for one, both in zip(alone, whole, strict=True):
-            torch.testing.assert_close(one[0], both[b], atol=2e-6, rtol=0)
+            assert_close(one[0], both[b], atol=2e-6, rtol=0)

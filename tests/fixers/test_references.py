@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.shutter import bands, rolling
@@ -200,7 +201,7 @@ def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted(
     for image, same, of_lower_road in zip(
         images, session()[0].of(wrong, frame), session(road_m=-1.0)[0].of(asked, frame), strict=True
     ):
-        np.testing.assert_array_equal(image, same)
+        assert_array_equal(image, same)
         assert (image != of_lower_road).any()
 
 
@@ -231,7 +232,7 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
         for image, alone in zip(
             images, found.of(replace(asked, T_world_camera=T), frame), strict=True
         ):
-            np.testing.assert_array_equal(image[band.rows], alone[band.rows])
+            assert_array_equal(image[band.rows], alone[band.rows])
 
 
 def test_a_wall_seen_from_nearer_is_larger():

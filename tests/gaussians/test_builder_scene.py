@@ -3,6 +3,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Environment, LaneMap
@@ -180,8 +181,8 @@ def test_file_background_is_scaled_turned_and_cut_into_blocks(
     T[:3, :3] = 2.0 * se3([0, 0, 0], quat_from_yaw(0.5))[:3, :3]
     T[:3, 3] = (30.0, 5.0, 3.0)
     placed = placed_cloud(cloud, T)
-    np.testing.assert_allclose(placed.means, cloud.means @ T[:3, :3].T + T[:3, 3], atol=1e-9)
-    np.testing.assert_allclose(placed.scales, 2.0 * cloud.scales, rtol=1e-6)
+    assert_allclose(placed.means, cloud.means @ T[:3, :3].T + T[:3, 3], atol=1e-9)
+    assert_allclose(placed.scales, 2.0 * cloud.scales, rtol=1e-6)
     graph = with_background(street[1], cloud, T)
     added = graph.background[
         len(street[1].background) :

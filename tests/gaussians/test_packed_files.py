@@ -10,6 +10,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import read_ply
@@ -53,8 +54,8 @@ def test_both_bikers_have_the_published_facts(biker):
     assert len(ply.means) == len(spz.means) == 152746
     assert read_ply_header(biker / "biker.compressed.ply").element("chunk").count == 597
     low, high = (-0.62126, -3.18008, -0.53226), (0.41440, 0.0, 0.61328)
-    np.testing.assert_allclose(ply.means.min(axis=0), low, atol=6e-6)
-    np.testing.assert_allclose(ply.means.max(axis=0), high, atol=6e-6)
+    assert_allclose(ply.means.min(axis=0), low, atol=6e-6)
+    assert_allclose(ply.means.max(axis=0), high, atol=6e-6)
     assert f"{ply.opacities.mean():.10f}" == f"{spz.opacities.mean():.10f}" == "0.2966253344"
 
 
@@ -100,11 +101,11 @@ def test_packed_bits_are_spread_over_the_chunk(tmp_path):
         tmp_path / "a.compressed.ply", 1, 1, (position, 511 << 20 | 511 << 10 | 511, 0, colour)
     )
     raw = read_compressed_ply(path)
-    np.testing.assert_allclose(raw.means, [[2, 10, 22]])
-    np.testing.assert_allclose(raw.scales, np.exp([[-3, -3, -3]]))
-    np.testing.assert_allclose(raw.sh[0, 0], (np.array([1, 0, 0.2]) - 0.5) / C0, rtol=1e-6)
+    assert_allclose(raw.means, [[2, 10, 22]])
+    assert_allclose(raw.scales, np.exp([[-3, -3, -3]]))
+    assert_allclose(raw.sh[0, 0], (np.array([1, 0, 0.2]) - 0.5) / C0, rtol=1e-6)
     assert raw.opacities[0] == pytest.approx(0.4)
-    np.testing.assert_allclose(raw.quats[0], [1, 0, 0, 0], atol=1e-3)
+    assert_allclose(raw.quats[0], [1, 0, 0, 0], atol=1e-3)
 
 
 def test_harmonics_element_is_channel_major(tmp_path):
@@ -115,7 +116,7 @@ def test_harmonics_element_is_channel_major(tmp_path):
     )
     assert raw.sh.shape == (1, 4, 3)
     assert raw.sh[0, 2, 0] == 4
-    np.testing.assert_allclose(np.delete(raw.sh[0, 1:].ravel(), 3), 0.5 / 256 * 8)
+    assert_allclose(np.delete(raw.sh[0, 1:].ravel(), 3), 0.5 / 256 * 8)
 
 
 @pytest.mark.parametrize("largest", range(4))
@@ -125,7 +126,7 @@ def test_left_out_component_is_restored_in_its_place(largest):
     quat[largest] = np.sqrt(1 - quat @ quat)
     others = [round((q / np.sqrt(2) + 0.5) * 1023) for i, q in enumerate(quat) if i != largest]
     packed = largest << 30 | others[0] << 20 | others[1] << 10 | others[2]
-    np.testing.assert_allclose(unpack_rotation(np.array([packed], np.uint32))[0], quat, atol=1e-3)
+    assert_allclose(unpack_rotation(np.array([packed], np.uint32))[0], quat, atol=1e-3)
 
 
 # --- .splat
@@ -146,8 +147,8 @@ def test_splat_bytes_worked_by_hand(tmp_path):
     row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 128, 192, 128, 64, 128)
     (tmp_path / "a.splat").write_bytes(row)
     raw = read_splat(tmp_path / "a.splat")
-    np.testing.assert_array_equal(raw.quats, [[0.5, 0, -0.5, 0]])
-    np.testing.assert_allclose(0.5 + C0 * raw.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    assert_array_equal(raw.quats, [[0.5, 0, -0.5, 0]])
+    assert_allclose(0.5 + C0 * raw.sh[0, 0], [1, 0, 0.2], atol=1e-6)
     assert raw.opacities[0] == 128 / 255
 
 
@@ -187,13 +188,13 @@ def test_every_version_unpacks_to_the_same_numbers(tmp_path, version, degree):
     streams = body_streams(version, 6, degree)
     streams[0] = b"".join(int(v).to_bytes(3, "little", signed=True) for v in range(-9, 9))
     raw = as_stored(read_spz(write_spz(tmp_path / "a.spz", version, 6, degree, streams)))
-    np.testing.assert_array_equal(raw.means, np.arange(-9, 9).reshape(6, 3) / 4096)
-    np.testing.assert_array_equal(raw.opacities, np.frombuffer(streams[1], np.uint8) / 255)
+    assert_array_equal(raw.means, np.arange(-9, 9).reshape(6, 3) / 4096)
+    assert_array_equal(raw.opacities, np.frombuffer(streams[1], np.uint8) / 255)
     colour, scale = (np.frombuffer(s, np.uint8).reshape(6, 3) for s in streams[2:4])
-    np.testing.assert_allclose(raw.sh[:, 0], (colour / 255 - 0.5) / 0.15, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(raw.scales, np.exp(scale / 16 - 10))
+    assert_allclose(raw.sh[:, 0], (colour / 255 - 0.5) / 0.15, rtol=1e-6, atol=1e-7)
+    assert_allclose(raw.scales, np.exp(scale / 16 - 10))
     harmonics = np.frombuffer(streams[5], np.uint8).reshape(6, -1, 3)
-    np.testing.assert_allclose(raw.sh[:, 1:], (harmonics - 128.0) / 128, atol=1e-6)
+    assert_allclose(raw.sh[:, 1:], (harmonics - 128.0) / 128, atol=1e-6)
     cloud, report = read_gaussians(tmp_path / "a.spz")
     assert report.n_kept == len(cloud) == 6
 
@@ -202,7 +203,7 @@ def test_version_2_rotation_is_xyz_bytes(tmp_path):
     streams = body_streams(2, 1, 0)
     streams[4] = bytes([255, 128, 127])
     quat = as_stored(read_spz(write_spz(tmp_path / "a.spz", 2, 1, 0, streams))).quats[0]
-    np.testing.assert_allclose(quat, [0, 1, 1 / 255, -1 / 255], atol=1e-2)
+    assert_allclose(quat, [0, 1, 1 / 255, -1 / 255], atol=1e-2)
 
 
 @settings(max_examples=examples(200), deadline=None)
@@ -218,7 +219,7 @@ def test_smallest_three_rotation_is_restored(q):
     packed = np.frombuffer(struct.pack("<I", word), np.uint8)
     wxyz = unpack_smallest_three(packed)[0]
     assert abs(np.linalg.norm(wxyz) - 1) < 1e-6
-    np.testing.assert_allclose(wxyz, xyzw[[3, 0, 1, 2]], atol=2.5e-3)
+    assert_allclose(wxyz, xyzw[[3, 0, 1, 2]], atol=2.5e-3)
 
 
 def test_fourth_degree_is_cut_and_noted(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
@@ -69,8 +70,8 @@ def test_trained_model_has_the_published_facts(train):
     assert len(header.element("vertex").properties) == 62
     assert all(np.isfinite(rows[name]).all() for name in rows.dtype.names)
     assert all((rows[name] == 0).all() for name in ("nx", "ny", "nz"))
-    np.testing.assert_allclose(raw.means.min(axis=0), (-13.0210, -3.9220, -3.8217), atol=5e-5)
-    np.testing.assert_allclose(raw.means.max(axis=0), (10.2932, 1.9683, 13.8217), atol=5e-5)
+    assert_allclose(raw.means.min(axis=0), (-13.0210, -3.9220, -3.8217), atol=5e-5)
+    assert_allclose(raw.means.max(axis=0), (10.2932, 1.9683, 13.8217), atol=5e-5)
     assert raw.opacities.mean() == pytest.approx(0.2467, abs=5e-5)
     assert np.median(raw.scales) == pytest.approx(0.01177, abs=5e-6)
     assert raw.scales.max() == pytest.approx(0.5667, abs=5e-5)
@@ -79,7 +80,7 @@ def test_trained_model_has_the_published_facts(train):
         pytest.approx(0.642, abs=5e-4),
         pytest.approx(1.319, abs=5e-4),
     )
-    np.testing.assert_allclose(raw.sh[:, 0].mean(axis=0), (0.1658, 0.2361, 0.0812), atol=5e-5)
+    assert_allclose(raw.sh[:, 0].mean(axis=0), (0.1658, 0.2361, 0.0812), atol=5e-5)
 
 
 def test_trained_model_comes_back_byte_for_byte(train, tmp_path):
@@ -97,9 +98,9 @@ def test_every_degree_survives_a_round_trip(tmp_path, k):
     write_ply(tmp_path / "a.ply", cloud)
     back = read_ply_arrays(tmp_path / "a.ply")
     for name in ("means", "quats", "sh"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
-    np.testing.assert_allclose(back.scales, cloud.scales, rtol=5e-7)
-    np.testing.assert_allclose(back.opacities, cloud.opacities, rtol=5e-7)
+        assert_array_equal(getattr(back, name), getattr(cloud, name))
+    assert_allclose(back.scales, cloud.scales, rtol=5e-7)
+    assert_allclose(back.opacities, cloud.opacities, rtol=5e-7)
 
 
 def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path):
@@ -135,7 +136,7 @@ def test_property_order_and_extra_properties_do_not_matter(tmp_path):
     names = [*reversed(rows.dtype.names), "semantic_0"]
     table = np.stack([rows[n] if n != "semantic_0" else np.full(4, 7.0) for n in names], axis=1)
     path = write_elements(tmp_path / "a.ply", element("vertex", names, table))
-    np.testing.assert_array_equal(read_ply_arrays(path).sh, cloud.sh)
+    assert_array_equal(read_ply_arrays(path).sh, cloud.sh)
 
 
 def test_big_endian_doubles_are_read(tmp_path):
@@ -143,8 +144,8 @@ def test_big_endian_doubles_are_read(tmp_path):
     row = (np.arange(1, len(NAMES) + 1) / 100).astype(">f8")
     path = write_elements(tmp_path / "a.ply", (header, row.tobytes()), fmt="binary_big_endian")
     raw = read_ply_arrays(path)
-    np.testing.assert_array_equal(raw.means, [[0.01, 0.02, 0.03]])
-    np.testing.assert_allclose(raw.scales[0], np.exp([0.08, 0.09, 0.10]), rtol=1e-15)
+    assert_array_equal(raw.means, [[0.01, 0.02, 0.03]])
+    assert_allclose(raw.scales[0], np.exp([0.08, 0.09, 0.10]), rtol=1e-15)
 
 
 # --- several models in one file

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -28,8 +29,8 @@ def test_same_pose_at_twice_the_size_repeats_what_the_view_saw():
     alpha = np.ones((18, 32), np.float32)
     alpha[:8] = 0.0
     share = SkyMask([view(alpha)]).share(camera(64, 36))
-    np.testing.assert_array_equal(share[:15], 1.0)
-    np.testing.assert_array_equal(share[17:], 0.0)
+    assert_array_equal(share[:15], 1.0)
+    assert_array_equal(share[17:], 0.0)
 
 
 def test_turning_left_moves_the_skyline_to_the_right():
@@ -57,7 +58,7 @@ def test_directions_between_corners_are_those_at_the_middles_of_pixels():
     plain = cv2.remap(
         grid.astype(np.float32), (columns + 0.5) / STEP_PX, (rows + 0.5) / STEP_PX, cv2.INTER_LINEAR
     )
-    np.testing.assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)
+    assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)
 
 
 def test_only_actors_present_are_posed():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
@@ -139,7 +140,7 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
     found = {one.name: one for one in score(log, env.scenario.scene, "paper")}
     at = np.searchsorted(log.ego.t_us, [one["t_us"] for one in facts])
     for name in ("lateral_distance_m", "progress"):
-        np.testing.assert_allclose(
+        assert_allclose(
             [one[name] for one in facts], found[name].value[at], atol=1e-5
         )  # poses in the log are float32
     assert np.flatnonzero(found["offroad"].value).tolist() == [len(log.ego.t_us) - 1]
@@ -242,11 +243,11 @@ def test_environments_run_in_processes_and_agree_with_one_in_this_process():
     seen, _ = several.reset(seed=[4, 5])
     one = DriveEnv(**settings)  # type: ignore[arg-type]
     own, _ = one.reset(seed=5)
-    np.testing.assert_array_equal(seen["route"][1], own["route"])
+    assert_array_equal(seen["route"][1], own["route"])
     for _ in range(3):
         seen, worth, *_ = several.step(np.array([[0.0, 0.2], [0.1, 0.0]], np.float32))
         own, alone, *_ = one.step(np.array([0.1, 0.0], np.float32))
-    np.testing.assert_array_equal(seen["route"][1], own["route"])
+    assert_array_equal(seen["route"][1], own["route"])
     assert worth[1] == pytest.approx(float(alone))
     several.close()
     one.close()

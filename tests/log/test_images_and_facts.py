@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log import decode_image, encode_image, read_facts, write_facts
@@ -14,7 +15,7 @@ from tests.examples import examples
 @settings(max_examples=examples(40), deadline=None)
 @given(hnp.arrays(np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3))))
 def test_png_is_exact(rgb):
-    np.testing.assert_array_equal(decode_image(encode_image(rgb, "png")), rgb)
+    assert_array_equal(decode_image(encode_image(rgb, "png")), rgb)
 
 
 @pytest.mark.parametrize("encoding", ["png", "jpeg"])
@@ -22,12 +23,12 @@ def test_red_stays_red(encoding):
     red = np.zeros((16, 16, 3), np.uint8)
     red[..., 0] = 255
     back = decode_image(encode_image(red, encoding)).reshape(-1, 3).mean(axis=0)  # type: ignore[arg-type]
-    np.testing.assert_allclose(back, [255, 0, 0], atol=3)
+    assert_allclose(back, [255, 0, 0], atol=3)
 
 
 def test_views_that_are_not_contiguous_are_encoded_as_seen():
     image = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(decode_image(encode_image(image[::2, ::-1])), image[::2, ::-1])
+    assert_array_equal(decode_image(encode_image(image[::2, ::-1])), image[::2, ::-1])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
@@ -73,15 +74,15 @@ def test_ego_in_the_log_is_the_box_centre(log):
     expected = rig + np.array(
         [offset * np.cos(yaw), offset * np.sin(yaw), HEADER.vehicle.box.height_m / 2]
     )
-    np.testing.assert_allclose(log.ego.xyz, expected, atol=1e-6)
-    np.testing.assert_allclose(yaw_from_quat(log.ego.quat), yaw, atol=1e-7)
-    np.testing.assert_allclose(log.T_rig_box[:3, 3], [offset, 0, 0.8], atol=1e-6)
-    np.testing.assert_allclose(log.ego_log.xyz, HEADER.ego_log.xyz, atol=1e-6)
+    assert_allclose(log.ego.xyz, expected, atol=1e-6)
+    assert_allclose(yaw_from_quat(log.ego.quat), yaw, atol=1e-7)
+    assert_allclose(log.T_rig_box[:3, 3], [offset, 0, 0.8], atol=1e-6)
+    assert_allclose(log.ego_log.xyz, HEADER.ego_log.xyz, atol=1e-6)
 
 
 def test_actor_is_there_only_while_it_was_present(log):
     assert log.actors["late"].track.t_us.tolist() == [T0_US + 4 * STEP_US, T0_US + 5 * STEP_US]
-    np.testing.assert_allclose(log.actors["late"].track.xyz, ACTORS[1].track.xyz[:2], atol=1e-6)
+    assert_allclose(log.actors["late"].track.xyz, ACTORS[1].track.xyz[:2], atol=1e-6)
     assert [a.is_static for a in log.actors.values()] == [False, False, True]
     assert [a.label for a in log.actors.values()] == ["automobile", "person", "other"]
 
@@ -93,7 +94,7 @@ def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log):
     assert log.info["empty_plans"] == 1
     for step, plan in zip((2, 3, 4), log.plans, strict=True):
         assert plan.trajectory.t_us[0] == plan.now_us
-        np.testing.assert_allclose(plan.trajectory.xyz, plan_at(step).xyz, atol=1e-6)
+        assert_allclose(plan.trajectory.xyz, plan_at(step).xyz, atol=1e-6)
     assert [len(p.samples) for p in log.plans] == [0, 2, 2]
 
 
@@ -103,7 +104,7 @@ def test_png_images_come_back_pixel_for_pixel_in_time_order(log):
         i.end_us - i.start_us == CAMERA.shutter_us and i.camera == CAMERA.name for i in log.images
     )
     for step, image in enumerate(log.images, start=1):
-        np.testing.assert_array_equal(decode_image(image.data), picture(step))
+        assert_array_equal(decode_image(image.data), picture(step))
 
 
 def test_jpeg_images_come_back_close(tmp_path):
@@ -121,8 +122,8 @@ def test_images_can_be_left_out(path):
 def test_camera_survives(log):
     (camera,) = log.info["cameras"]
     assert (camera.name, camera.width, camera.height) == (CAMERA.name, 64, 40)
-    np.testing.assert_array_equal(camera.K, CAMERA.K)
-    np.testing.assert_allclose(camera.T_rig_camera, CAMERA.T_rig_camera, atol=1e-6)
+    assert_array_equal(camera.K, CAMERA.K)
+    assert_allclose(camera.T_rig_camera, CAMERA.T_rig_camera, atol=1e-6)
 
 
 def test_controller_entries_hold_the_plan_in_its_own_rig_frame(path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_yaw, se2, yaw_from_quat
@@ -61,7 +62,7 @@ def test_nan_pose_is_refused_at_writing(tmp_path):
 def test_heading_of_half_a_turn_survives():
     quat = quat_from_yaw(np.array([np.pi, -np.pi, np.pi - 1e-9]))
     _, back = read_poses(wire_poses(np.zeros((3, 3)), quat, "a test"), "a test")
-    np.testing.assert_allclose(np.abs(yaw_from_quat(back)), np.pi, atol=1e-6)
+    assert_allclose(np.abs(yaw_from_quat(back)), np.pi, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +74,7 @@ def test_quaternion_norm_rule(scale, fine):
         vec=common_pb2.Vec3(), quat=common_pb2.Quat(w=0.6 * scale, z=0.8 * scale)
     )
     if fine:
-        np.testing.assert_allclose(read_poses([pose], "a test")[1], [[0.6, 0, 0, 0.8]], atol=1e-7)
+        assert_allclose(read_poses([pose], "a test")[1], [[0.6, 0, 0, 0.8]], atol=1e-7)
     else:
         with pytest.raises(InputError, match=r"\|q\|\^2"):
             read_poses([pose], "a test")

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.interfaces import Renderer
@@ -60,8 +61,8 @@ def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(
     clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
     frozen, late = make_renderer("broken-frozen", scenario), make_renderer("broken-late", scenario)
     for i, r in enumerate(views):
-        np.testing.assert_array_equal(frozen.render(r).rgb, clean[0])
-        np.testing.assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])
+        assert_array_equal(frozen.render(r).rgb, clean[0])
+        assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])
 
 
 def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the_right(
@@ -69,14 +70,14 @@ def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the
 ):
     r = requests(scenario, 1)[0]
     clean = make_renderer("clean", scenario)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         make_renderer("broken-mirrored", scenario).render(r).rgb, clean.render(r).rgb[:, ::-1]
     )
     beside = r.T_world_camera @ np.array(
         [[1.0, 0, 0, SHIFT_M], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     )
     found = make_renderer("broken-shifted", scenario).render(r)
-    np.testing.assert_array_equal(found.rgb, clean.render(replace(r, T_world_camera=beside)).rgb)
+    assert_array_equal(found.rgb, clean.render(replace(r, T_world_camera=beside)).rgb)
     assert SHIFT_M == 0.5
 
 
@@ -90,5 +91,5 @@ def test_late_shows_the_newest_picture_that_is_a_second_old_at_any_frame_rate(
     late = make_renderer("broken-late", scenario)
     for i, r in enumerate(views):
         due = max((j for j in range(i + 1) if t_us[j] <= t_us[i] - LATE_US), default=0)
-        np.testing.assert_array_equal(late.render(r).rgb, clean[due])
+        assert_array_equal(late.render(r).rgb, clean[due])
     assert due > 2

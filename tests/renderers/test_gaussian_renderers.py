@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.interfaces import Renderer
@@ -84,8 +85,8 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario):
         a.render(request(scenario, left_m=0.9)),
         b.render(request(scenario, left_m=0.9)),
     )
-    np.testing.assert_array_equal(first.rgb, second.rgb)
-    np.testing.assert_array_equal(first.alpha, second.alpha)
+    assert_array_equal(first.rgb, second.rgb)
+    assert_array_equal(first.alpha, second.alpha)
 
 
 def test_actor_hides_the_road_where_it_stands(scenario):
@@ -119,4 +120,4 @@ def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario):
         r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]])
     )
     renderer = make_renderer("clean", scenario)
-    np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)
+    assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)

@@ -7,6 +7,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, se2
@@ -107,8 +108,8 @@ def test_frames_do_not_depend_on_what_came_before_nor_on_threads(
     clear_cache()
     for threads in (1, 2):  # of the rasteriser: the model comes from the disk
         again = make_renderer("3dgs", fitted.scenario, seed=5, threads=threads).render(r)
-        np.testing.assert_array_equal(first.rgb, again.rgb)
-        np.testing.assert_array_equal(first.alpha, again.alpha)
+        assert_array_equal(first.rgb, again.rgb)
+        assert_array_equal(first.alpha, again.alpha)
 
 
 def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(
@@ -135,7 +136,7 @@ def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted, monkeypa
     second.read()  # now the first is the one that was not read for longest
     again = first.read()
     assert again is not was
-    np.testing.assert_array_equal(again[0], was[0])
+    assert_array_equal(again[0], was[0])
 
 
 def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(
@@ -145,7 +146,7 @@ def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(
     assert len(actors["ahead"].levels) == 1
     own = make_renderer("clean", fitted.scenario)
     assert isinstance(own, CleanRenderer)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         actors["never-seen"].levels[0].cloud.means,
         own.scene.actors["never-seen"].levels[0].cloud.means,
     )
@@ -180,7 +181,7 @@ def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cac
     assert all(len(node.levels) > 1 for node in renderer.model.graph.actors.values())
     _, views = ensure(scenario, recipe_of(scenario))
     y = [inverse(view.camera.T_camera_world)[1, 3] for view in views]
-    np.testing.assert_allclose(y, -0.8, atol=1e-6)  # the log runs at y = -1.8
+    assert_allclose(y, -0.8, atol=1e-6)  # the log runs at y = -1.8
 
 
 def test_a_sharp_camera_is_fitted_with_more_steps_and_points_of_larger_views():
@@ -269,7 +270,7 @@ def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(cach
         models.append(ensure(scenario, recipe_of(scenario), 1, again=True)[0].background)
     for model in models[1:]:
         for part in ("means", "quats", "scales", "opacities", "sh"):
-            np.testing.assert_array_equal(getattr(model, part), getattr(models[0], part))
+            assert_array_equal(getattr(model, part), getattr(models[0], part))
 
 
 def test_every_camera_gives_points_to_start_from(cache):

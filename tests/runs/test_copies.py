@@ -3,9 +3,9 @@
 import shutil
 from types import SimpleNamespace
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.types import SensorSpec
@@ -110,7 +110,7 @@ def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path):
         film = read_mp4(tmp_path / "all" / cell.folder / "front.mp4")
         assert film.fps == 10
         assert len(film.frames) == 13  # both ends of 1.2 s
-        np.testing.assert_allclose(film.frames, level, atol=2)
+        assert_allclose(film.frames, level, atol=2)
     drive(plan_of(), tmp_path / "failures")
     assert not list((tmp_path / "failures").rglob("front.mp4"))
 
@@ -152,4 +152,4 @@ def test_clean_has_no_history(straight_road):
     renderer = make_renderer("clean", straight_road)
     renderer.render_batch(requests[0][:1])
     assert not renderer.has_history
-    np.testing.assert_array_equal(renderer.render_batch(requests[1][:1])[0].rgb, alone.rgb)
+    assert_array_equal(renderer.render_batch(requests[1][:1])[0].rgb, alone.rgb)

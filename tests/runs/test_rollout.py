@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin import make_policy, make_renderer, run_rollout
 from alpasim_plugin.core.errors import PolicyError, RendererError
@@ -35,9 +36,7 @@ def test_log_replay_reproduces_the_recorded_poses(straight_road):
     log = drive(straight_road, "log-replay").log()
     rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
     recorded = interpolate(straight_road.ego_log, rig.t_us)
-    np.testing.assert_allclose(
-        rig.xyz, recorded[:, :3, 3], atol=1e-4
-    )  # poses are float32 in the log
+    assert_allclose(rig.xyz, recorded[:, :3, 3], atol=1e-4)  # poses are float32 in the log
 
 
 def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(
@@ -57,7 +56,7 @@ def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road):
         straight_road, make_renderer("clean", straight_road), StandStill(), 0
     ).log()
     warm = log.ego.t_us <= 1_000_000
-    np.testing.assert_allclose(braking.ego.xyz[warm], log.ego.xyz[warm], atol=1e-4)
+    assert_allclose(braking.ego.xyz[warm], log.ego.xyz[warm], atol=1e-4)
     assert braking.ego.xyz[-1, 0] < log.ego.xyz[-1, 0] - 2.0
 
 
@@ -72,7 +71,7 @@ def test_the_same_rollout_twice_is_equal_to_the_byte_for_any_number_of_threads(
 def test_seeds_change_a_sampling_policy_and_nothing_in_the_warm_up(straight_road):
     zero, one = (drive(straight_road, "lane-camera", seed=seed).log() for seed in (0, 1))
     warm = zero.ego.t_us <= 1_000_000
-    np.testing.assert_array_equal(zero.ego.xyz[warm], one.ego.xyz[warm])
+    assert_array_equal(zero.ego.xyz[warm], one.ego.xyz[warm])
     assert not np.array_equal(zero.ego.xyz[~warm], one.ego.xyz[~warm])
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios.argoverse import read_argoverse
@@ -29,10 +30,10 @@ def log(tmp_path):
 
 def test_world_is_local_and_keeps_centimetres_of_utm_sized_coordinates(log):
     assert log.world_origin == tuple(ORIGIN)
-    np.testing.assert_allclose(
+    assert_allclose(
         log.ego_log.xyz, np.column_stack([np.arange(21.0), np.zeros(21), np.zeros(21)]), atol=2e-9
     )
-    np.testing.assert_allclose(log.lane_map.lanes["1"].left, [[-20, 2, 0], [40, 2, 0]], atol=2e-9)
+    assert_allclose(log.lane_map.lanes["1"].left, [[-20, 2, 0], [40, 2, 0]], atol=2e-9)
 
 
 def test_time_is_whole_microseconds(log):
@@ -43,13 +44,11 @@ def test_time_is_whole_microseconds(log):
 
 def test_cuboids_of_a_moving_ego_frame_stand_still_in_the_world(log):
     parked, walker = log.actors
-    np.testing.assert_allclose(
-        parked.track.xyz, np.broadcast_to([30.0, -6.0, 0.75], (21, 3)), atol=1e-8
-    )
+    assert_allclose(parked.track.xyz, np.broadcast_to([30.0, -6.0, 0.75], (21, 3)), atol=1e-8)
     assert (parked.label, parked.is_static, parked.box.length_m) == ("car", True, 4.5)
     assert (walker.label, walker.is_static, len(walker.track)) == ("pedestrian", False, 11)
     assert walker.track.t_us[0] == (T0_NS + 5 * STEP_NS) // 1000
-    np.testing.assert_allclose(walker.track.xyz[[0, -1], 1], [-5, 5], atol=1e-8)
+    assert_allclose(walker.track.xyz[[0, -1], 1], [-5, 5], atol=1e-8)
 
 
 def test_track_with_a_hole_becomes_two_actors(tmp_path):
@@ -82,7 +81,7 @@ def test_road_edge_runs_round_the_union_of_areas_and_not_through_its_seam(log):
     inside = np.abs(edge[:, 1]) < 7.99
     assert set(np.round(edge[inside, 0]).tolist()) == {-20.0, 200.0}
     assert np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1).max() <= 2.0 + 1e-9
-    np.testing.assert_array_equal(edge[0], edge[-1])
+    assert_array_equal(edge[0], edge[-1])
 
 
 def test_hole_in_the_drivable_area_is_an_edge_of_its_own(tmp_path):
@@ -138,7 +137,7 @@ def test_cuboids_turn_with_the_ego(tmp_path):
     rows = cuboids([("a", "BUS", (12.0, 2.5, 3.0), [3], place(0.0, 0.0, 1.5))], ego)
     rows["tx_m"], rows["ty_m"], rows["tz_m"] = [7.0], [2.0], [1.0]
     actor = read_argoverse(write_argoverse(tmp_path / "x", ego=ego, annotations=rows)).actors[0]
-    np.testing.assert_allclose(actor.track.xyz[0], [3.0 - 2.0, 7.0, 1.33], atol=1e-8)
+    assert_allclose(actor.track.xyz[0], [3.0 - 2.0, 7.0, 1.33], atol=1e-8)
     assert yaw_from_quat(actor.track.quat[0]) == pytest.approx(np.pi / 2)
 
 

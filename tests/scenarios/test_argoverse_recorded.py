@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.geometry import (
     wrap_angle,
@@ -155,7 +156,7 @@ def test_real_wheels_stand_on_the_ground(real):
     above = log.ego_log.xyz[:, 2] - height_at(log.ground, log.ego_log.xyz)
     assert np.abs(above).max() < 0.06
     assert np.abs(np.median(above)) < 0.01
-    np.testing.assert_allclose(np.linalg.norm(raw.quat, axis=1), 1.0, atol=1e-12)
+    assert_allclose(np.linalg.norm(raw.quat, axis=1), 1.0, atol=1e-12)
 
 
 def test_real_calibration(shared_data):
@@ -164,13 +165,11 @@ def test_real_calibration(shared_data):
     assert len(cameras) == 9
     front = cameras["ring_front_center"]
     assert (front.width, front.height) == (1550, 2048)
-    np.testing.assert_allclose(
+    assert_allclose(
         front.K, [[1776.041484, 0, 777.990573], [0, 1776.041484, 1013.524325], [0, 0, 1]], atol=1e-6
     )
-    np.testing.assert_allclose(front.T_rig_camera[:3, 2], [1, 0, 0], atol=0.01)  # looks ahead
-    np.testing.assert_allclose(
-        front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01
-    )  # image down is world down
+    assert_allclose(front.T_rig_camera[:3, 2], [1, 0, 0], atol=0.01)  # looks ahead
+    assert_allclose(front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01)  # image down is world down
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)
     sweep = folder / "sensors" / "lidar" / "315966265259836000.feather"
     assert len(SourceFiles().read_feather(sweep, {"x": "number"})["x"]) == 99229

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.cli.output import size_lines
 from alpasim_plugin.core.errors import InputError
@@ -29,7 +30,7 @@ def test_lens_shutter_and_rate_of_a_section_are_the_cameras(tmp_path):
     rays = rays_of(camera)
     middle = rays.ray.reshape(160, 200, 3)[80, [0, 199]]
     angle = np.rad2deg(np.arctan2(np.abs(middle[:, 0]), middle[:, 2]))
-    np.testing.assert_allclose(angle, 95 * 199 / 200, atol=0.1)
+    assert_allclose(angle, 95 * 199 / 200, atol=0.1)
     assert len(sides_of(camera)) == 5
 
 
@@ -72,7 +73,7 @@ def test_cameras_of_a_usdz_have_its_lenses(tmp_path):
     assert all(camera.lens and camera.shutter_us == 20_000 for camera in cameras)
     rays = rays_of(cameras[0])
     across = rays.ray.reshape(288, 512, 3)[144, [0, -1]]
-    np.testing.assert_allclose(across[:, 0] / across[:, 2], [-0.7, 0.7], atol=0.005)
+    assert_allclose(across[:, 0] / across[:, 2], [-0.7, 0.7], atol=0.005)
 
 
 def test_cameras_of_an_argoverse_log_have_its_distortion(shared_data, tmp_path):
@@ -94,12 +95,12 @@ def test_cameras_of_a_transforms_json_stand_where_its_poses_say(tmp_path):
     left, fisheye = sorted(cameras, key=lambda camera: camera.name)
     assert left.lens == LensModel("opencv", (-0.1, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0))
     assert fisheye.lens == LensModel("fisheye", (0.0,) * 4)
-    np.testing.assert_allclose(left.K[[0, 1, 0], [0, 1, 2]], [250, 255, 160.25])
-    np.testing.assert_allclose(left.T_rig_camera[:3, 2:].T, [[1, 0, 0], [1.5, 0.2, 1.6]])
+    assert_allclose(left.K[[0, 1, 0], [0, 1, 2]], [250, 255, 160.25])
+    assert_allclose(left.T_rig_camera[:3, 2:].T, [[1, 0, 0], [1.5, 0.2, 1.6]])
     turned = (RIG % ("opengl", "round", 1)).replace("[0, 0, 1, 1.5]", "[0, 0, -1, 1.5]")
     (tmp_path / "rig.json").write_text(turned.replace("[0, -1, 0, 1.6]", "[0, 1, 0, 1.6]"))
     same = load_scenario(written(tmp_path, "{from: rig.json, width: 320}")).cameras
-    np.testing.assert_array_equal(same[0].T_rig_camera, cameras[0].T_rig_camera)
+    assert_array_equal(same[0].T_rig_camera, cameras[0].T_rig_camera)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import shapely
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
@@ -55,10 +56,10 @@ def test_longest_drive_is_the_ego_and_no_actor(log):
 def test_rear_axle_lies_behind_the_recorded_centre(log):
     back = log.vehicle.rear_axle_to_centre_m
     assert back == pytest.approx(1.4 * 4.4 / 4.855)
-    np.testing.assert_allclose(
+    assert_allclose(
         log.ego_log.xyz[:, 0], np.linspace(0, 20, 21) - back
     )  # origin: the first obstacle's place, whole metres
-    np.testing.assert_array_equal(log.ego_log.xyz[:, 2], 0.0)
+    assert_array_equal(log.ego_log.xyz[:, 2], 0.0)
     assert log.world_origin == (20.0, 0.0, 0.0)
     assert (log.vehicle.box.length_m, log.vehicle.box.width_m) == (4.4, 1.8)
 
@@ -71,8 +72,8 @@ def test_time_is_whole_microseconds_of_the_file_s_step(tmp_path):
 def test_actor_keeps_the_time_it_was_seen_and_stands_on_the_ground(log):
     actor = log.actors[1]
     assert (actor.track.t_us[0], actor.track.t_us[-1]) == (0, 1_000_000)
-    np.testing.assert_allclose(actor.track.xyz[:, 2], actor.box.height_m / 2)
-    np.testing.assert_allclose(actor.track.xyz[0, :2], [40.0, 0.0])
+    assert_allclose(actor.track.xyz[:, 2], actor.box.height_m / 2)
+    assert_allclose(actor.track.xyz[0, :2], [40.0, 0.0])
 
 
 def test_car_that_is_not_present_all_the_time_is_passed_over(tmp_path):
@@ -103,10 +104,10 @@ def test_shapes_become_boxes_round_them(tmp_path):
     boxes = {a.actor_id: a for a in read(tmp_path, traffic=TRAFFIC + more).actors}
     sizes = {k: (boxes[k].box.length_m, boxes[k].box.width_m) for k in ("40", "41", "42", "43")}
     assert sizes == {"40": (1.0, 1.0), "41": (4.0, 2.0), "42": (4.0, 2.0), "43": (5.0, 2.0)}
-    np.testing.assert_allclose(
+    assert_allclose(
         boxes["41"].track.xyz[0, :2], [80 - 1.0, 2.0], atol=1e-12
     )  # the polygon's middle, turned by 90 degrees
-    np.testing.assert_allclose(boxes["42"].track.xyz[0, :2], [80.0, 1.0], atol=1e-12)
+    assert_allclose(boxes["42"].track.xyz[0, :2], [80.0, 1.0], atol=1e-12)
     assert abs(yaw_from_quat(boxes["42"].track.quat[0])) == pytest.approx(np.pi)
 
 
@@ -163,7 +164,7 @@ def test_version_2020a(tmp_path):
     paints = [(k.left_paint, k.right_paint) for k in lanes_.values()]
     assert paints == [("dashed_white", "solid_white"), ("solid_white", "none"), ("unknown", "none")]
     assert lanes_["1"].speed_limit_mps == 10.0
-    np.testing.assert_allclose(log.lane_map.stop_lines[0][:, :2], [[180, 6], [180, 2]])
+    assert_allclose(log.lane_map.stop_lines[0][:, :2], [[180, 6], [180, 2]])
     assert len(log.lane_map.crosswalks) == 1
     assert [(a.label, a.is_static) for a in log.actors] == [("other", True)]
     assert "1 environmentObstacle elements were left out" in log.notes
@@ -176,8 +177,8 @@ def test_points_with_heights_give_a_ground_with_heights(tmp_path):
     path.write_text(text)
     log = read_commonroad(path)
     assert isinstance(log.ground, HeightField)
-    np.testing.assert_allclose(log.ground.z, 7.0)
-    np.testing.assert_allclose(log.ego_log.xyz[:, 2], 7.0)
+    assert_allclose(log.ground.z, 7.0)
+    assert_allclose(log.ego_log.xyz[:, 2], 7.0)
 
 
 def test_seam_between_lanelets_is_no_road_edge_and_a_traffic_island_is(tmp_path):

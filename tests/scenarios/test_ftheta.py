@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from scenarios.ftheta import front_camera
 from tests.scenarios.ftheta_projection import lens_of, project_ftheta
@@ -25,7 +26,7 @@ def test_both_directions_of_a_lens_undo_each_other(values):
     camera = lens_of(np.array(values))
     polynomial = np.polynomial.polynomial.polyval
     theta = np.linspace(0, camera.lens.max_angle_rad, 200)
-    np.testing.assert_allclose(
+    assert_allclose(
         polynomial(polynomial(theta, camera.lens.angle_to_pixel), camera.lens.pixel_to_angle),
         theta,
         atol=1e-4,
@@ -34,4 +35,4 @@ def test_both_directions_of_a_lens_undo_each_other(values):
     rays = np.column_stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)])
     radius = np.linalg.norm(project_ftheta(camera, rays) - (camera.cx, camera.cy), axis=1)
     back = polynomial(radius, camera.lens.pixel_to_angle)
-    np.testing.assert_allclose(back, theta, atol=1e-9 if camera.backward_given else 1e-4)
+    assert_allclose(back, theta, atol=1e-9 if camera.backward_given else 1e-4)

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import shapely
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from alpasim_plugin.core.errors import InputError
@@ -83,21 +84,19 @@ def test_an_arc_lies_on_its_circle(curvature):
     arc = Geometry(0.0, 0.0, 0.0, 1.1, 2 * np.pi / abs(curvature), "arc", (curvature,))
     at = arc.at(np.linspace(0.0, arc.length_m, 50))
     centre = np.array([-np.sin(1.1), np.cos(1.1)]) / curvature
-    np.testing.assert_allclose(np.hypot(*(at[:, :2] - centre).T), 1 / abs(curvature), rtol=1e-12)
-    np.testing.assert_allclose(at[-1, :2], 0.0, atol=1e-10)  # a full turn
+    assert_allclose(np.hypot(*(at[:, :2] - centre).T), 1 / abs(curvature), rtol=1e-12)
+    assert_allclose(at[-1, :2], 0.0, atol=1e-10)  # a full turn
 
 
 def test_a_cubic_is_walked_by_its_arc_length():
     cubic = Geometry(0.0, 0.0, 0.0, 0.0, 30.0, "poly3", (0.0, 0.1, 0.02, -0.0005))
     s = np.linspace(0.0, 30.0, 3001)
     at = cubic.at(s)
-    np.testing.assert_allclose(
+    assert_allclose(
         at[:, 1], 0.1 * at[:, 0] + 0.02 * at[:, 0] ** 2 - 0.0005 * at[:, 0] ** 3, atol=1e-9
     )
-    np.testing.assert_allclose(arc_lengths(at[:, :2]), s, atol=1e-4)  # chords of 1 cm
-    np.testing.assert_allclose(
-        at[1:-1, 2], np.arctan2(*(at[2:, :2] - at[:-2, :2]).T[::-1]), atol=1e-5
-    )
+    assert_allclose(arc_lengths(at[:, :2]), s, atol=1e-4)  # chords of 1 cm
+    assert_allclose(at[1:-1, 2], np.arctan2(*(at[2:, :2] - at[:-2, :2]).T[::-1]), atol=1e-5)
 
 
 @pytest.mark.parametrize("normalised", [True, False])
@@ -107,7 +106,7 @@ def test_a_parametric_cubic_by_share_or_by_length(normalised):
     at = Geometry(0.0, 1.0, 2.0, np.pi / 2, 20.0, "paramPoly3", numbers, normalised).at(
         np.array([0.0, 10.0, 20.0])
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         at[:, :2], [[1.0, 2.0], [1.0 - (6 / 4 - 4 / 8), 12.0], [-1.0, 22.0]], atol=1e-12
     )
     assert at[0, 2] == pytest.approx(np.pi / 2)
@@ -115,7 +114,7 @@ def test_a_parametric_cubic_by_share_or_by_length(normalised):
 
 def test_the_record_in_force_counts():
     records = np.array([[0.0, 1.0, 0.0, 0.0, 0.0], [10.0, 5.0, 0.5, 0.0, 0.0]])
-    np.testing.assert_allclose(
+    assert_allclose(
         cubics_at(records, np.array([-1.0, 0.0, 9.99, 10.0, 12.0])), [1.0, 1.0, 1.0, 5.0, 6.0]
     )
     assert cubics_at([], np.array([3.0])).tolist() == [0.0]
@@ -124,8 +123,8 @@ def test_the_record_in_force_counts():
 def test_lanes_of_both_sides_run_against_each_other():
     found = lanes_of(road(left=lane(1), right=lane(-1) + lane(-2, kind="shoulder")))
     right, left = found.lanes["1.0.-1"], found.lanes["1.0.1"]
-    np.testing.assert_allclose(right.centre[[0, -1]], [[0, -1.75, 0], [40, -1.75, 0]], atol=1e-9)
-    np.testing.assert_allclose(left.centre[[0, -1]], [[40, 1.75, 0], [0, 1.75, 0]], atol=1e-9)
+    assert_allclose(right.centre[[0, -1]], [[0, -1.75, 0], [40, -1.75, 0]], atol=1e-9)
+    assert_allclose(left.centre[[0, -1]], [[40, 1.75, 0], [0, 1.75, 0]], atol=1e-9)
     for one in (right, left):
         ring = lane_polygon(one)
         assert not shapely.is_ccw(
@@ -148,7 +147,7 @@ def test_widths_offsets_heights_and_borders_follow_the_true_arc_length():
     found = lanes_of(road(sections=body, before=rise + bank))
     one = found.lanes["1.0.-1"]
     at_30 = np.argmin(np.abs(one.right[:, 0] - 30.0))
-    np.testing.assert_allclose(
+    assert_allclose(
         one.right[at_30], [30.0, 0.5 - 4.0, 2.0 + 3.0 + (0.5 - 4.0) * np.tan(0.1)], atol=1e-9
     )
     outer = found.lanes["1.0.-2"].right
@@ -281,10 +280,10 @@ def test_a_map_is_placed_by_its_origin_on_the_earth():
     shift = np.eye(4)
     shift[:3, 3] = [5.0, -7.0, 1.0]
     place = T_local_map("+lat_0=49 +lon_0=8 +h_0=110", T_earth_local @ shift)
-    np.testing.assert_allclose(place, np.linalg.inv(shift), atol=1e-8)
-    np.testing.assert_array_equal(T_local_map("", T_earth_local), np.eye(4))
+    assert_allclose(place, np.linalg.inv(shift), atol=1e-8)
+    assert_array_equal(T_local_map("", T_earth_local), np.eye(4))
     x, y, z = np.linalg.inv(T_enu_earth(90.0, 0.0, 0.0))[:3, 3]
-    np.testing.assert_allclose(
+    assert_allclose(
         [x, y, z], [0.0, 0.0, 6356752.3142], atol=1e-4
     )  # the pole: WGS 84's semi-minor axis
 
@@ -399,11 +398,11 @@ def test_a_lane_for_both_directions_is_noted(both):
 @pytest.mark.parametrize("rule", ["LHT", "lht"])
 def test_with_left_hand_traffic_lanes_run_the_other_way(rule):
     found = lanes_of(road(left=lane(1), right=lane(-1), more=f'rule="{rule}"'))
-    np.testing.assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
+    assert_allclose(
         found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12
     )  # its left is the road's outside
-    np.testing.assert_allclose(found.lanes["1.0.1"].right[:, 1], 0.0, atol=1e-12)
+    assert_allclose(found.lanes["1.0.1"].right[:, 1], 0.0, atol=1e-12)
 
 
 def test_paint_of_marks():

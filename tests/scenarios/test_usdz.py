@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
@@ -54,7 +55,7 @@ def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path):
     right, left = log.lane_map.lanes["L0"], log.lane_map.lanes["L1"]
     assert right.left_neighbour == "L1"
     assert left.left_neighbour is None
-    np.testing.assert_allclose(right.centre[:, 1], 0.0)
+    assert_allclose(right.centre[:, 1], 0.0)
     assert np.diff(right.centre[:, 0]).max() <= 2.0
     assert len(log.lane_map.road_edges) == 2
     assert len(log.lane_map.stop_lines) == 1
@@ -78,7 +79,7 @@ def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path):
 def test_rails_as_a_struct_of_lists_give_the_same_map(tmp_path):
     one = read_usdz_scene(write(tmp_path / "a.usdz"))
     two = read_usdz_scene(write(tmp_path / "b.usdz", members() | tables(as_struct=True)))
-    np.testing.assert_array_equal(one.lane_map.lanes["L0"].left, two.lane_map.lanes["L0"].left)
+    assert_array_equal(one.lane_map.lanes["L0"].left, two.lane_map.lanes["L0"].left)
 
 
 def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_path):
@@ -216,8 +217,8 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path):
     content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
     (camera,) = read_usdz(write(tmp_path / "a.usdz", content)).cameras
     assert camera.name == "camera_front_wide_120fov"
-    np.testing.assert_allclose(camera.T_rig_camera[:3, 3], [1.7, 0.1, 1.4])
-    np.testing.assert_allclose(
+    assert_allclose(camera.T_rig_camera[:3, 3], [1.7, 0.1, 1.4])
+    assert_allclose(
         camera.T_rig_camera[:3, 2], [0.0, 1.0, 0.0], atol=1e-12
     )  # turned left by the correction: looks along y
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import shapely
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lane_areas import lane_polygon
@@ -53,12 +54,12 @@ def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
     for key, lane in view.lanes.items():
         other = read.lane_map.lanes[ids[key]]
         for name in ("centre", "left", "right"):
-            np.testing.assert_array_equal(getattr(other, name), getattr(lane, name))  # unrounded
+            assert_array_equal(getattr(other, name), getattr(lane, name))  # unrounded
         assert other.successors == tuple(ids[s] for s in lane.successors)
         assert other.left_neighbour == ids.get(lane.left_neighbour or "")
     assert len(read.lane_map.road_edges) == len(view.road_edges)
     for one, edge in zip(read.lane_map.road_edges, view.road_edges, strict=True):
-        np.testing.assert_array_equal(one, edge)
+        assert_array_equal(one, edge)
     assert read.lane_map.signs == ()  # a row stands in for none, and is no sign
     assert len(read.lane_map.stop_lines) == len(scenario.lane_map.stop_lines)
 
@@ -70,17 +71,15 @@ def test_drive_traffic_and_vehicle_come_back(written):
     assert read.vehicle.rear_axle_to_centre_m == pytest.approx(
         scenario.vehicle.rear_axle_to_centre_m, abs=1e-6
     )
-    np.testing.assert_array_equal(read.ego_log.t_us, scenario.ego_log.t_us)
-    np.testing.assert_array_equal(read.ego_log.xyz, scenario.ego_log.xyz)
+    assert_array_equal(read.ego_log.t_us, scenario.ego_log.t_us)
+    assert_array_equal(read.ego_log.xyz, scenario.ego_log.xyz)
     assert read.first_frame_us == scenario.start_us
     assert [(a.actor_id, a.label, a.box, a.is_static) for a in read.actors] == [
         (a.actor_id, a.label, a.box, a.is_static) for a in scenario.actors
     ]
     for one, other in zip(read.actors, scenario.actors, strict=True):
-        np.testing.assert_array_equal(one.track.xyz, other.track.xyz)
-        np.testing.assert_allclose(
-            np.abs(np.sum(one.track.quat * other.track.quat, axis=1)), 1.0, atol=1e-12
-        )
+        assert_array_equal(one.track.xyz, other.track.xyz)
+        assert_allclose(np.abs(np.sum(one.track.quat * other.track.quat, axis=1)), 1.0, atol=1e-12)
 
 
 def test_no_table_is_empty_and_links_go_both_ways(written):
@@ -165,7 +164,7 @@ def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhol
     assert np.abs(focal * np.tan(angle) - radius).max() < 0.05  # pixels
     write_usdz(tmp_path / "s.usdz", straight)
     (read,) = read_usdz(tmp_path / "s.usdz").cameras
-    np.testing.assert_allclose(read.T_rig_camera, camera.T_rig_camera, atol=1e-9)
+    assert_allclose(read.T_rig_camera, camera.T_rig_camera, atol=1e-9)
     with zipfile.ZipFile(tmp_path / "s.usdz") as archive:
         (rig,) = json.loads(archive.read("rig_trajectories.json"))["rig_trajectories"]
         mesh = archive.read("mesh_ground.ply")
@@ -191,7 +190,7 @@ def test_vertices_are_put_in_and_rounded_as_alpasims_loader_does():
     for a, b in itertools.pairwise(line):
         inner = int(np.linalg.norm(b - a) // 2.0)
         want += [a + (b - a) / (inner + 1) * k for k in range(1, inner + 1)] + [b]
-    np.testing.assert_array_equal(
+    assert_array_equal(
         with_vertices(line), want
     )  # to the bit: it decides whether a union of lanes has cracks
 
@@ -216,5 +215,5 @@ def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(
 def test_a_lane_without_edges_is_widened():
     centre = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
     left, right = rails(Lane("a", centre, None, None))
-    np.testing.assert_allclose(left[:, 1], 1.85)
-    np.testing.assert_allclose(right[:, 1], -1.85)
+    assert_allclose(left[:, 1], 1.85)
+    assert_allclose(right[:, 1], -1.85)

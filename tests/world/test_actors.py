@@ -4,6 +4,7 @@ closed.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import interpolate, quat_from_yaw, se2
 from alpasim_plugin.core.types import (
@@ -74,9 +75,7 @@ def test_batched_replay_agrees_with_interpolating_track_by_track():
         assert set(poses) == present
         for actor in actors:
             if actor.actor_id in present:
-                np.testing.assert_allclose(
-                    poses[actor.actor_id], interpolate(actor.track, t), atol=1e-9
-                )
+                assert_allclose(poses[actor.actor_id], interpolate(actor.track, t), atol=1e-9)
 
 
 def test_replay_is_present_exactly_from_its_first_to_its_last_pose():
@@ -90,7 +89,7 @@ def test_reactive_driver_follows_its_track_while_the_log_is_forced():
     x = run(actors, ego_at(40.0), 2_000_000)[
         "a"
     ]  # the ego stands in its way, but the loop is not closed yet
-    np.testing.assert_allclose(x, 8.0 * np.arange(21) * 0.1, atol=1e-9)
+    assert_allclose(x, 8.0 * np.arange(21) * 0.1, atol=1e-9)
 
 
 def test_reactive_driver_stops_behind_a_standing_ego_without_contact():
@@ -168,7 +167,7 @@ def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends():
     assert at[10:, 1].max() > 12.0
     # The offset from the lane's middle at the end of the track is kept at first and then fades out.
     radius = np.hypot(at[30:, 0] - 15, at[30:, 1] - 20)
-    np.testing.assert_allclose(radius, 20.0, atol=0.3)
+    assert_allclose(radius, 20.0, atol=0.3)
     assert "a" not in poses[-1], "it leaves the scene at the end of the map"
 
 
@@ -203,12 +202,12 @@ def test_an_outlook_stays_as_it_is_while_the_actors_move_on():
     for t in range(200_000, 1_500_000, 100_000):
         moved = actors.step(t, FAR_AWAY)
         if t == 1_000_000:
-            np.testing.assert_array_equal(moved["replayed"], expected[t]["replayed"])
+            assert_array_equal(moved["replayed"], expected[t]["replayed"])
             # Foreseen at the speed of 0.1 s; free of a leader the driver keeps close to it.
             assert abs(moved["driver"][0, 3] - expected[t]["driver"][0, 3]) < 0.5
     for t, poses in expected.items():
         for name, pose in poses.items():
-            np.testing.assert_array_equal(forecast.at(t)[name], pose)
+            assert_array_equal(forecast.at(t)[name], pose)
     assert expected[1_000_000]["driver"][0, 3] - expected[500_000]["driver"][0, 3] == pytest.approx(
         5.0, abs=0.1
     )
@@ -236,7 +235,7 @@ def test_one_pose_track_is_there_at_its_instant():
     )
     actors = Actors([Actor("a", "car", BOX, one)], Vehicle(), 0)
     assert actors.step(100_000, FAR_AWAY) == {}
-    np.testing.assert_allclose(actors.step(200_000, FAR_AWAY)["a"][:3, 3], [1.0, 2.0, 0.75])
+    assert_allclose(actors.step(200_000, FAR_AWAY)["a"][:3, 3], [1.0, 2.0, 0.75])
 
 
 def test_reset_gives_the_same_drive_again():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.geometry import speeds, yaw_from_quat
 from alpasim_plugin.core.types import Box
@@ -31,14 +32,14 @@ def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt(tmp_pa
     )
     (actor,) = load_scenario(tmp_path / "a.yaml").actors
     t, y = actor.track.t_us, actor.track.xyz[:, 1]
-    np.testing.assert_allclose(y[t <= 1_000_000], -5.25, atol=1e-9)
-    np.testing.assert_allclose(y[t >= 3_500_000], -1.75, atol=1e-9)
+    assert_allclose(y[t <= 1_000_000], -5.25, atol=1e-9)
+    assert_allclose(y[t >= 3_500_000], -1.75, atol=1e-9)
     assert (np.diff(y) >= -1e-9).all()
     lateral_accel = np.gradient(np.gradient(y[:-1], 0.05), 0.05)
     # Peak of the quintic: 10 / sqrt(3) * distance / duration^2.
     assert np.abs(lateral_accel).max() == pytest.approx(10 / np.sqrt(3) * 3.5 / 2.5**2, rel=0.03)
     heading, v = yaw_from_quat(actor.track.quat), np.gradient(actor.track.xyz[:, :2], axis=0)
-    np.testing.assert_allclose(heading[5:-5], np.arctan2(v[5:-5, 1], v[5:-5, 0]), atol=2e-3)
+    assert_allclose(heading[5:-5], np.arctan2(v[5:-5, 1], v[5:-5, 0]), atol=2e-3)
 
 
 def test_track_is_cut_where_the_path_ends():
@@ -57,7 +58,7 @@ def test_walker_stands_walks_at_its_speed_and_stands_again():
     v = speeds(track)
     assert v.max() == pytest.approx(1.4, abs=1e-6)
     assert np.abs(np.gradient(v, 0.01)).max() < 1.4 / 0.4 + 0.1
-    np.testing.assert_allclose(yaw_from_quat(track.quat), np.pi / 2)
+    assert_allclose(yaw_from_quat(track.quat), np.pi / 2)
     assert track.xyz[:, 1].max() <= 5.0 + 1e-9
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import fresnel
 
 from alpasim_plugin.core.errors import InputError
@@ -33,21 +34,19 @@ def test_clothoid_agrees_with_fresnel_integrals(end_curvature, step_m):
     length = 60.0
     curve = sample_clothoid((0.0, 0.0, 0.0), length, 0.0, end_curvature, step_m)
     s = np.linspace(0.0, length, len(curve))
-    np.testing.assert_allclose(
-        curve[:, :2], clothoid_by_fresnel(s, end_curvature / length), atol=1e-11
-    )
+    assert_allclose(curve[:, :2], clothoid_by_fresnel(s, end_curvature / length), atol=1e-11)
 
 
 def test_arc_with_positive_curvature_turns_left_on_its_circle():
     curve = sample_clothoid((3.0, 4.0, 0.0), 30.0, 0.05, 0.05)
-    np.testing.assert_allclose(np.hypot(curve[:, 0] - 3.0, curve[:, 1] - 24.0), 20.0, atol=1e-12)
+    assert_allclose(np.hypot(curve[:, 0] - 3.0, curve[:, 1] - 24.0), 20.0, atol=1e-12)
     assert curve[-1, 1] > 4.0
-    np.testing.assert_allclose(curve[-1, 2], 1.5)
+    assert_allclose(curve[-1, 2], 1.5)
 
 
 def test_straight_keeps_its_heading_far_from_the_origin():
     curve = sample_clothoid((5e5, 4e6, np.pi / 2), 100.0, 0.0, 0.0)
-    np.testing.assert_allclose(curve[-1, :2], [5e5, 4e6 + 100.0], atol=1e-8)
+    assert_allclose(curve[-1, :2], [5e5, 4e6 + 100.0], atol=1e-8)
 
 
 @settings(deadline=None, max_examples=examples(40))
@@ -61,12 +60,12 @@ def test_connector_meets_both_poses_exactly_and_never_bends_backwards(ahead, asi
     d = np.diff(curve[:, :2], axis=0)
     heading = np.arctan2(d[:, 1], d[:, 0])
     assert (np.abs(heading) <= abs(turn) + 0.02).all()
-    np.testing.assert_allclose(heading[[0, -1]], [0.0, turn], atol=0.05)
+    assert_allclose(heading[[0, -1]], [0.0, turn], atol=0.05)
 
 
 def test_offset_line_lies_left_of_the_curve():
     line = offset_line(sample_clothoid((0, 0, 0), 10, 0, 0), 2.0)
-    np.testing.assert_allclose(line[:, 1], 2.0)
+    assert_allclose(line[:, 1], 2.0)
 
 
 def test_smoothstep_is_flat_at_both_ends():
@@ -74,7 +73,7 @@ def test_smoothstep_is_flat_at_both_ends():
     assert smoothstep(h) < 1e-10
     assert smoothstep(1 - h) > 1 - 1e-10
     assert smoothstep(0.5) == 0.5
-    np.testing.assert_array_equal(smoothstep([-1.0, 2.0]), [0.0, 1.0])
+    assert_array_equal(smoothstep([-1.0, 2.0]), [0.0, 1.0])
 
 
 @settings(deadline=None, max_examples=examples(60))
@@ -91,8 +90,8 @@ def test_projection_finds_arc_length_and_offset_again(s, d, curvature):
 def test_projection_beyond_the_ends_follows_the_tangent():
     path = polyline_path(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
     s, d = path.project(np.array([[-3.0, 1.0], [7.0, -2.0]]))
-    np.testing.assert_allclose(s, [-3.0, 7.0], atol=1e-6)
-    np.testing.assert_allclose(d, [1.0, -2.0], atol=1e-6)
+    assert_allclose(s, [-3.0, 7.0], atol=1e-6)
+    assert_allclose(d, [1.0, -2.0], atol=1e-6)
 
 
 def test_path_of_one_point_is_refused():

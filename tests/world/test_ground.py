@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2, yaw_of
@@ -30,7 +31,7 @@ FIELD = HeightField(-3.0, 7.0, 0.5, np.random.default_rng(5).normal(size=(9, 13)
 @settings(deadline=None)
 def test_heights_agree_with_the_written_out_formula_inside_and_outside(points):
     expected = [slow_height(FIELD, x, y) for x, y in points]
-    np.testing.assert_allclose(height_at(FIELD, np.array(points)), expected, atol=1e-12)
+    assert_allclose(height_at(FIELD, np.array(points)), expected, atol=1e-12)
 
 
 def test_grid_nodes_give_their_own_height_and_the_border_goes_on_level():
@@ -41,7 +42,7 @@ def test_grid_nodes_give_their_own_height_and_the_border_goes_on_level():
 
 def test_one_cell_grid_is_level():
     field = HeightField(0.0, 0.0, 1.0, np.array([[4.0]]))
-    np.testing.assert_array_equal(height_at(field, np.array([[0.0, 0.0], [9.0, -9.0]])), [4.0, 4.0])
+    assert_array_equal(height_at(field, np.array([[0.0, 0.0], [9.0, -9.0]])), [4.0, 4.0])
 
 
 @given(
@@ -57,7 +58,7 @@ def test_points_of_a_plane_give_back_the_plane_wherever_it_lies(slope_x, slope_y
     points = np.column_stack([xy + shift, height + xy @ [slope_x, slope_y]])
     field = from_points(points, 2.0)
     inside = rng.uniform(-25, 25, (50, 2))
-    np.testing.assert_allclose(
+    assert_allclose(
         height_at(field, inside + shift), height + inside @ [slope_x, slope_y], atol=1e-6
     )
 
@@ -66,7 +67,7 @@ def test_points_in_any_order_give_the_same_ground():
     rng = np.random.default_rng(2)
     points = rng.uniform(0, 30, (200, 3))
     one, two = from_points(points), from_points(points[::-1])
-    np.testing.assert_allclose(one.z, two.z, atol=1e-9)
+    assert_allclose(one.z, two.z, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +75,7 @@ def test_points_in_any_order_give_the_same_ground():
 )
 def test_one_point_or_a_line_of_points_is_ground_enough(points):
     field = from_points(np.array(points))
-    np.testing.assert_allclose(height_at(field, np.array([[0.0, 0.0], [11.0, 5.0]])), 3.0)
+    assert_allclose(height_at(field, np.array([[0.0, 0.0], [11.0, 5.0]])), 3.0)
 
 
 def test_ground_of_a_continent_is_refused_before_memory_is_taken():
@@ -83,9 +84,7 @@ def test_ground_of_a_continent_is_refused_before_memory_is_taken():
 
 
 def test_level_ground_leaves_a_planar_pose():
-    np.testing.assert_allclose(
-        ground_pose(flat(2.0), 3.0, -4.0, 0.7), se2(3.0, -4.0, 0.7, 2.0), atol=1e-15
-    )
+    assert_allclose(ground_pose(flat(2.0), 3.0, -4.0, 0.7), se2(3.0, -4.0, 0.7, 2.0), atol=1e-15)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, np.pi / 2, 3.0, -2.4])
@@ -94,8 +93,8 @@ def test_pose_on_a_slope_keeps_its_heading_and_stands_upright_on_the_surface(yaw
     points = np.column_stack([x.ravel(), y.ravel(), 0.1 * x.ravel() - 0.05 * y.ravel()])
     pose = ground_pose(from_points(points, 1.0), 2.0, 3.0, yaw)
     normal = np.array([-0.1, 0.05, 1.0]) / np.linalg.norm([-0.1, 0.05, 1.0])
-    np.testing.assert_allclose(pose[:3, 2], normal, atol=1e-9)
-    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    assert_allclose(pose[:3, 2], normal, atol=1e-9)
+    assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
     assert yaw_of(pose) == pytest.approx(yaw)
     assert pose[2, 3] == pytest.approx(0.2 - 0.15)

@@ -3,6 +3,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify
 from alpasim_plugin.core.lane_areas import lane_polygon
@@ -125,7 +126,7 @@ def test_path_goes_straight_on_at_a_fork_and_has_the_asked_length():
     path = LaneIndex(fork).path_ahead("in", 75.0, start=np.array([5.0, 0.7]))
     assert path.lane_ids == ("in", "on", "end")
     assert arc_lengths(path.xyz)[-1] == pytest.approx(75.0)
-    np.testing.assert_allclose(path.xyz[[0, -1], 0], [5.0, 80.0])
+    assert_allclose(path.xyz[[0, -1], 0], [5.0, 80.0])
     assert (np.diff(path.xyz[:, 0]) > 0).all()
 
 
@@ -140,7 +141,7 @@ def test_path_round_a_ring_road_comes_to_an_end():
     path = LaneIndex(make(arc("one", 20.0, 180.0, successors=("two",)), back)).path_ahead(
         "one", 300.0
     )
-    np.testing.assert_allclose(np.hypot(path.xyz[:, 0], path.xyz[:, 1] - 20), 20.0, atol=0.15)
+    assert_allclose(np.hypot(path.xyz[:, 0], path.xyz[:, 1] - 20), 20.0, atol=0.15)
     assert arc_lengths(path.xyz)[-1] == pytest.approx(300.0)
     assert path.lane_ids[:3] == ("one", "two", "one")
 
@@ -166,9 +167,9 @@ def test_centre_lies_halfway_between_edges_with_different_numbers_of_points():
     left = np.array([[0.0, 2, 1], [50.0, 2, 1]])
     right = np.array([[0.0, -2, 0], [3.0, -2, 0], [11.0, -2, 0], [50.0, -2, 0]])
     centre = centre_line(left, right)
-    np.testing.assert_allclose(centre[:, 1], 0, atol=1e-12)
-    np.testing.assert_allclose(centre[:, 2], 0.5, atol=1e-12)
-    np.testing.assert_allclose(centre[[0, -1], 0], [0, 50])
+    assert_allclose(centre[:, 1], 0, atol=1e-12)
+    assert_allclose(centre[:, 2], 0.5, atol=1e-12)
+    assert_allclose(centre[[0, -1], 0], [0, 50])
     assert np.diff(centre[:, 0]).max() <= 2.0 + 1e-9
 
 

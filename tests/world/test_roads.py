@@ -5,6 +5,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.world.road_strip import Curve, Intersection, LaneTaper, Profile
@@ -195,8 +196,8 @@ def test_any_winding_road_is_sound(bends, forward, backward, shoulder, heading):
 
 def test_oncoming_lane_runs_the_other_way_on_the_left():
     lane_map = build_road([Curve(30)], Profile(1, 1, lane_width_m=3.0)).lane_map
-    np.testing.assert_allclose(lane_map.lanes["s0_f0"].centre[[0, -1], :2], [[0, -1.5], [30, -1.5]])
-    np.testing.assert_allclose(lane_map.lanes["s0_b0"].centre[[0, -1], :2], [[30, 1.5], [0, 1.5]])
+    assert_allclose(lane_map.lanes["s0_f0"].centre[[0, -1], :2], [[0, -1.5], [30, -1.5]])
+    assert_allclose(lane_map.lanes["s0_b0"].centre[[0, -1], :2], [[30, 1.5], [0, 1.5]])
 
 
 def test_t_junction_closes_the_missing_side():

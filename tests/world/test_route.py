@@ -2,6 +2,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
 from alpasim_plugin.core.types import Route, Trajectory
@@ -40,7 +41,7 @@ def test_route_is_the_recorded_path_and_goes_on_straight_behind_it():
     for point in log.xyz:
         assert abs(project(route.xyz, point)[1]) < 1e-9
     assert arc_lengths(route.xyz)[-1] == pytest.approx(arc_lengths(log.xyz)[-1] + 120.0, abs=0.1)
-    np.testing.assert_allclose(route.xyz[-5:, 1], 0.0, atol=1e-9)  # back on the centre
+    assert_allclose(route.xyz[-5:, 1], 0.0, atol=1e-9)  # back on the centre
 
 
 def test_lateral_lane_change_is_named_in_order():
@@ -82,7 +83,7 @@ def test_drive_outside_every_lane_is_its_own_route():
     log = drive(np.arange(0.0, 30.0), np.full(30, 60.0))
     route = route_from_log(ROAD, log)
     assert route.lane_ids == ()
-    np.testing.assert_array_equal(route.xyz, log.xyz)
+    assert_array_equal(route.xyz, log.xyz)
 
 
 def test_car_at_rest_gets_the_lane_ahead():
@@ -101,8 +102,8 @@ def test_way_points_start_at_the_projection_and_are_evenly_spaced():
     route = Route(np.array([[0.0, 0, 0], [200.0, 0, 0]]))
     seen = route_in_rig(route, se2(10.0, 2.0, 0.0))
     assert seen.shape == (20, 3)
-    np.testing.assert_allclose(seen[:, 0], np.arange(20) * 80 / 19, atol=1e-9)
-    np.testing.assert_allclose(seen[:, 1], -2.0, atol=1e-12)
+    assert_allclose(seen[:, 0], np.arange(20) * 80 / 19, atol=1e-9)
+    assert_allclose(seen[:, 1], -2.0, atol=1e-12)
 
 
 def test_route_over_itself_is_followed_in_the_ego_s_direction():
@@ -116,7 +117,7 @@ def test_route_over_itself_is_followed_in_the_ego_s_direction():
 def test_skidding_ego_is_not_sent_to_a_far_stretch_that_runs_its_way():
     corner = np.array([[0.0, 0, 0], [500.0, 0, 0], [500.0, 500, 0]])
     seen = route_in_rig(Route(corner), se2(100.0, 1.0, np.pi / 2))
-    np.testing.assert_allclose(seen[0], [-1.0, 0.0, 0.0], atol=1e-9)
+    assert_allclose(seen[0], [-1.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_ego_against_the_route_sees_the_route_run_backwards():
@@ -150,7 +151,7 @@ def test_far_maps_give_the_same_route():
         route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved),
     )
     assert near.lane_ids == far.lane_ids
-    np.testing.assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
+    assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
 
 
 def test_rows_behind_the_end_are_nan_and_only_those():

@@ -4,6 +4,7 @@ nothing else.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
@@ -37,7 +38,7 @@ def test_augmented_cars_have_the_colours_of_the_other_class(kind):
     assert (off[differs] <= 6).mean() > 0.85, (
         "but for pixels that a box shares with its grey edges or with paint"
     )
-    np.testing.assert_array_equal(made[~differs], car[~differs])
+    assert_array_equal(made[~differs], car[~differs])
 
 
 @pytest.mark.parametrize("paint", COLOURS)
@@ -45,7 +46,7 @@ def test_augmented_cars_have_the_colours_of_the_other_class(kind):
 def test_paint_of_every_colour_and_darkness_stays(paint, kind):
     shares = np.linspace(0.1, 1.0, 64)[None, :, None]
     faded = np.rint(shares * np.array(COLOURS[paint])).astype(np.uint8)
-    np.testing.assert_array_equal(swap_class_colours(faded, kind), faded)
+    assert_array_equal(swap_class_colours(faded, kind), faded)
 
 
 def test_an_unknown_class_is_refused():

@@ -5,6 +5,7 @@ learn from.
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.demonstrations import (
@@ -46,9 +47,9 @@ def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
     assert (folder / "frames_front.npy").stat().st_mtime_ns == before
     first, other = Demonstrations(folder), root / "other"
     write_demonstrations(scenario, other, QUICK, 0)
-    np.testing.assert_array_equal(first.frames[0], Demonstrations(other).frames[0])
+    assert_array_equal(first.frames[0], Demonstrations(other).frames[0])
     for name, array in first.arrays.items():
-        np.testing.assert_array_equal(array, Demonstrations(other).arrays[name])
+        assert_array_equal(array, Demonstrations(other).arrays[name])
     assert write_demonstrations(scenario, other, QUICK, 1)
     assert not np.array_equal(Demonstrations(other).arrays["yaw"], first.arrays["yaw"])
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, initial_weights
 from alpasim_plugin.block_fixers.sizes import DiTSizes
@@ -105,10 +106,10 @@ def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradien
     sigma = torch.tensor([0.3, 0.6])
     direction(score, score, z, n, sigma)
     assert torch.equal(seen[0], seen[1])
-    torch.testing.assert_close(seen[0], noised(z, n, sigma))
+    assert_close(seen[0], noised(z, n, sigma))
     weight = torch.tensor(0.5, requires_grad=True)
     loss = critic_loss(lambda x, s: weight * x, z, n, sigma)
-    torch.testing.assert_close(loss, (0.5 * noised(z, n, sigma) - (n - z)).square().mean())
+    assert_close(loss, (0.5 * noised(z, n, sigma) - (n - z)).square().mean())
     loss.backward()
     assert z.grad is None
     assert weight.grad is not None
@@ -155,7 +156,7 @@ def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deploy
     (reached,) = torch.autograd.grad(made.square().sum(), z_1)
     assert [float(reached[:, :, i].abs().max()) > 0 for i in range(N)] == [False, False, True, True]
     with torch.no_grad():
-        torch.testing.assert_close(made, causal_rollout(net, [z_1], *args), rtol=0, atol=0)
+        assert_close(made, causal_rollout(net, [z_1], *args), rtol=0, atol=0)
 
 
 def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(
@@ -167,9 +168,7 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     sigma = torch.tensor([0.2, 0.7])
     condition = torch.zeros(2, 16, N, 4, 4)
     v = score(x, sigma, condition, frozen=True)
-    torch.testing.assert_close(
-        v, net(x, 1000 * sigma[:, None], TEXT, condition, block_latents=None)
-    )
+    assert_close(v, net(x, 1000 * sigma[:, None], TEXT, condition, block_latents=None))
     score(x, sigma, condition, frozen=True)
     term.generator(head(score.features)).backward()
     assert float(x.grad.abs().max()) > 0
@@ -185,7 +184,7 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     plain, _ = replace(term, r1=0.0, r2=0.0).critic(logits, x.detach(), fake, logits(fake), xi)
     r1 = (logits(x.detach() + 0.1 * xi) - real).square().mean()
     r2 = 0.5 * 0.001 * ((logits(fake + 0.01 * xi) - logits(fake)) / 0.01).square().mean()
-    torch.testing.assert_close(loss, plain + r1 + r2)
+    assert_close(loss, plain + r1 + r2)
     loss.backward()
     assert all(p.grad is not None for p in head.parameters())
     assert net.blocks[0].self_attn.q_proj.weight.grad is not None
@@ -205,7 +204,7 @@ def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one():
     assert torch.equal(drawn["block"], t[:, [0, 0, 2, 2, 4, 4, 6, 6]])
     assert torch.equal(drawn["clip"], t[:, :1].expand(3, 8))
     shifted = noise_levels(FlowMatching("clip", shift=5.0), sample, Attention(2), 0, 0)[0]
-    torch.testing.assert_close(shifted, 5 * drawn["clip"] / (1 + 4 * drawn["clip"]))
+    assert_close(shifted, 5 * drawn["clip"] / (1 + 4 * drawn["clip"]))
     u = 1 - torch.arange(1000, dtype=torch.float64) / 1000
     weights = bell_weight(5 * u / (1 + 4 * u))
     assert float(weights.mean()) == pytest.approx(1.0, abs=1e-6)

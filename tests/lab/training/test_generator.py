@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
@@ -88,10 +90,10 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(d
     video = torch.from_numpy(frames).permute(3, 0, 1, 2)[None].float() / 127.5 - 1
     with torch.inference_mode():
         wanted = TinyVAE.from_state_dict(load_weights(data / "vae.safetensors")).encode(video)[0]
-    torch.testing.assert_close(clip.z_0, wanted, atol=4e-3, rtol=2e-3)  # float16 on disk
+    assert_close(clip.z_0, wanted, atol=4e-3, rtol=2e-3)  # float16 on disk
     assert clip.m.shape == (1, 4, 4, 6)
     render, opacity = clip.frames(5)
-    np.testing.assert_allclose(
+    assert_allclose(
         (render.permute(1, 2, 3, 0) + 1) * 127.5,
         clip.sequence.clip.rgb_input[7:12, :, ::-1],
         atol=1e-3,
@@ -158,7 +160,7 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     with torch.inference_mode():
         black = vae.encode(torch.full((1, 3, 13, 32, 48), -1.0))
     assert float(black.abs().mean()) > 0.1
-    torch.testing.assert_close(
+    assert_close(
         shown[:, :, :, :, 2:], black[..., 2:4].expand_as(shown[:, :, :, :, 2:]), atol=1e-5, rtol=0
     )
     frames = moving_picture(5)
@@ -170,5 +172,5 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     blacked = pixels(
         run_blocks(fixer(given), frames, [np.zeros_like(frame.rgb) for frame in frames])
     )
-    np.testing.assert_array_equal(fixed, blacked)
+    assert_array_equal(fixed, blacked)
     assert (fixed != nothing).any()

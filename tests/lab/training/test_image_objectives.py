@@ -5,6 +5,7 @@ write.
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, initial_weights
 from alpasim_plugin.block_fixers.networks import Parts
@@ -74,18 +75,14 @@ def test_difixs_step_is_the_ddpm_formula_at_199(net):
     eps = x + (1 - sigma / (alpha + sigma)) * net(
         x, 363.0, TEXT, torch.zeros_like(x), block_latents=None
     )  # x = (1-t) z_0 + t eps
-    torch.testing.assert_close(
-        fixed_step(net, z_r, level, TEXT), (z_r - sigma * eps) / alpha, atol=1e-5, rtol=0
-    )
+    assert_close(fixed_step(net, z_r, level, TEXT), (z_r - sigma * eps) / alpha, atol=1e-5, rtol=0)
 
 
 def test_the_harmonizers_step_at_a_fifth(net):
     settings = fixer_settings("harmonizer")
     z_r = normal(1, 16, 2, 4, 6)
     v = net(0.8 * z_r, 200.0, TEXT, torch.zeros_like(z_r), block_latents=None)
-    torch.testing.assert_close(
-        fixed_step(net, z_r, settings.level, TEXT), 0.8 * z_r - 0.2 * v, atol=1e-6, rtol=0
-    )
+    assert_close(fixed_step(net, z_r, settings.level, TEXT), 0.8 * z_r - 0.2 * v, atol=1e-6, rtol=0)
     with pytest.raises(InputError):
         RenderLevel(1.0, 0.0)
 
@@ -157,9 +154,9 @@ def test_the_enhancers_loss_is_edms_on_the_clean_latents(net):
     )  # EDM's noised latents on the straight path
     x0_hat = x - t.view(-1, 1, 1, 1, 1) * net(x, 1000 * t[:, None], TEXT, z_r, block_latents=None)
     wanted = ((1 + s**2) / s**2).view(-1, 1, 1, 1, 1) * (x0_hat - z_0).abs()
-    torch.testing.assert_close(made, wanted, rtol=1e-3, atol=1e-3)
+    assert_close(made, wanted, rtol=1e-3, atol=1e-3)
     plain = noise_window_errors(net, z_0, z_r, eps, t, TEXT, squared_error)
-    torch.testing.assert_close(
+    assert_close(
         plain,
         (made / (((1 - t) ** 2 + t**2) / t).view(-1, 1, 1, 1, 1)).square(),
         rtol=1e-3,
@@ -174,7 +171,7 @@ def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs():
         CosmosCausalDiT.from_state_dict(w).requires_grad_(False) for w in (weights, shared)
     )
     x = normal(1, 16, 2, 4, 4)
-    torch.testing.assert_close(
+    assert_close(
         after(x, 500.0, TEXT, x), before(x, 500.0, TEXT, torch.zeros_like(x)), atol=1e-5, rtol=0
     )
     assert torch.equal(shared[LATENT_KEY][:, 64:], weights[LATENT_KEY][:, 64:]), (

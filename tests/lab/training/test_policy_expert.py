@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se2
 from alpasim_plugin.core.types import Actor, Box, Trajectory, Vehicle
@@ -49,7 +50,7 @@ def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m):
 
 
 def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it():
-    np.testing.assert_allclose(speeds(10.0), 10.0, atol=1e-6)
+    assert_allclose(speeds(10.0), 10.0, atol=1e-6)
     after = speeds(0.0)
     assert (np.diff(after) > 0).all()
     assert after[0] == pytest.approx(0.75, abs=0.1)
@@ -103,8 +104,8 @@ def test_headings_of_a_circle_lay_out_the_circle():
     heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
     points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
     s = path_grid()
-    np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
-    np.testing.assert_allclose(
+    assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
+    assert_allclose(
         points[0].numpy(),
         40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1),
         atol=2e-3,

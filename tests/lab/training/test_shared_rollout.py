@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, initial_weights
 from alpasim_plugin.block_fixers.sampling import CONTEXT_STEP, context_level, mixed_source
@@ -109,8 +110,8 @@ def test_rollout_and_flow_matching_are_the_equations(net):
             b = slice(start, start + 2)
             parts.append(velocity(net, s, b, rollout, z_t[:, :, b], 1000 * s.t[:, b]))
         expected = (torch.cat(parts, dim=2) - (z_1 - s.z_0)).square().mean()
-    torch.testing.assert_close(result.rollout, rollout, atol=2e-5, rtol=0)
-    torch.testing.assert_close(result.flow, expected, atol=1e-5, rtol=0)
+    assert_close(result.rollout, rollout, atol=2e-5, rtol=0)
+    assert_close(result.flow, expected, atol=1e-5, rtol=0)
     assert result.perceptual is None
     assert torch.equal(result.total, result.flow)
 
@@ -143,9 +144,7 @@ def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net, k,
 def test_predictions_with_gradient_have_the_values_of_the_rollout(net):
     for k in (1, 2, 3, 8):
         result = losses(net, sample(5), TEXT, Objectives(horizon=k), at_w)
-        torch.testing.assert_close(
-            torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0
-        )
+        assert_close(torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0)
         assert not result.rollout.requires_grad
 
 
@@ -164,7 +163,7 @@ def test_history_of_every_kind_is_what_its_name_says(net):
             Objectives(flow="redenoised", horizon=0),
         ).flow
     assert len({float(x) for x in (own, clean, again)}) == 3
-    torch.testing.assert_close(near, clean, atol=0, rtol=0)
+    assert_close(near, clean, atol=0, rtol=0)
 
 
 def test_decoded_frames_are_those_of_the_whole_clip():
@@ -183,6 +182,4 @@ def test_decoded_frames_are_those_of_the_whole_clip():
     )  # type: ignore[func-returns-value]
     for w, frames_of_w in ((0, slice(0, 1)), (1, slice(1, 5)), (3, slice(9, 13))):
         term(z, w)
-        torch.testing.assert_close(
-            predictions[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0
-        )
+        assert_close(predictions[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0)

@@ -8,6 +8,7 @@ import os
 import pytest
 import torch
 from torch import nn
+from torch.testing import assert_close
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.seeding import stream
@@ -44,8 +45,8 @@ def trainer(folder, schedule, facts="a", bad_at=-1):
 def test_learns_and_averages(tmp_path):
     t = trainer(tmp_path, Schedule(steps=300, peak_lr=0.03, warmup=5, weight_decay=0.0, ema=0.9))
     t.run()
-    torch.testing.assert_close(t.module.weight, TRUTH, atol=0.02, rtol=0)
-    torch.testing.assert_close(t.averaged()["weight"], TRUTH, atol=0.02, rtol=0)
+    assert_close(t.module.weight, TRUTH, atol=0.02, rtol=0)
+    assert_close(t.averaged()["weight"], TRUTH, atol=0.02, rtol=0)
     assert set(t.averaged()) == {"weight", "bias", "fixed"}
 
 

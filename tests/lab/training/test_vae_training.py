@@ -5,6 +5,7 @@ says.
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.block_fixers.codec_weights import LatentStats
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
@@ -24,7 +25,7 @@ def test_a_draw_repeats_and_its_channels_belong_together(tmp_path):
     assert torch.equal(one.target, again.target)
     assert one.target.shape == (3, 5, 16, 32)
     grey, damaged = ((x + 1) * 127.5 for x in (one.target, one.render))
-    torch.testing.assert_close(damaged, (grey.round() / 2).floor(), atol=1e-3, rtol=0)
+    assert_close(damaged, (grey.round() / 2).floor(), atol=1e-3, rtol=0)
     np.testing.assert_allclose(one.sdmap, -one.target, atol=1e-6)
     assert set(one.opacity.unique().tolist()) <= {0.0, 1.0}
     assert any(
@@ -75,7 +76,5 @@ def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels():
     assert int(weights.argmax()) == 0, "brightness"
     vae.stats = LatentStats([0.0] * 16, [*[1.0] * 3, 5.0, *[1.0] * 12], stored=True)
     louder = channel_amplitudes(vae)
-    torch.testing.assert_close(
-        louder[3] / louder[0], 5 * weights[3] / weights[0], atol=0.0, rtol=1e-3
-    )
-    torch.testing.assert_close(louder[4] / louder[0], weights[4] / weights[0], atol=0.0, rtol=1e-3)
+    assert_close(louder[3] / louder[0], 5 * weights[3] / weights[0], atol=0.0, rtol=1e-3)
+    assert_close(louder[4] / louder[0], weights[4] / weights[0], atol=0.0, rtol=1e-3)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
@@ -52,8 +53,8 @@ def test_identity_symmetry_and_independence_of_the_batch(net):
     there = net.distance(a, b)
     assert torch.isfinite(there).all()
     assert torch.all(there > 0)
-    torch.testing.assert_close(net.distance(b, a), there)
-    torch.testing.assert_close(net.distance(a.flip(0), b.flip(0)), there.flip(0))
+    assert_close(net.distance(b, a), there)
+    assert_close(net.distance(a.flip(0), b.flip(0)), there.flip(0))
 
 
 def write(folder, kind):
