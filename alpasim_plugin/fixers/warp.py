@@ -203,9 +203,7 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
 
 @float_kernel
 def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
-    """Fill ``x``, ``y`` and ``held`` as if nothing moved; the loop of `plain_coordinates`, whose
-    rows are vectors.
-    """
+    """Fill ``x``, ``y`` and ``held`` as if nothing moved."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
     surfaces = depth_then.reshape(-1)
