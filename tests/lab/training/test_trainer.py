@@ -50,22 +50,6 @@ def test_learns_and_averages(tmp_path):
     assert set(t.averaged()) == {"weight", "bias", "fixed"}
 
 
-def test_resumed_run_ends_with_equal_weights_and_log(tmp_path):
-    schedule = Schedule(steps=20, warmup=3, accumulate=2, save_every=7)
-    whole = trainer(tmp_path / "whole", schedule)
-    whole.run()
-    trainer(tmp_path / "cut", schedule).run(until=10)
-    again = trainer(tmp_path / "cut", schedule)
-    assert again.step == 10
-    again.run()
-    for name, p in whole.averaged().items():
-        assert torch.equal(p, again.averaged()[name])
-    steps = [
-        line.split(",")[0] for line in (tmp_path / "cut" / "log.jsonl").read_text().splitlines()
-    ]
-    assert steps == [f'{{"step": {i}' for i in range(1, 21)]
-
-
 def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path):
     schedule = Schedule(steps=9)
     t = trainer(tmp_path, schedule, bad_at=4)
