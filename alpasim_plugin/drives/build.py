@@ -20,7 +20,8 @@ from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
-from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap
+from alpasim_plugin.core.reading.images import PNG
+from alpasim_plugin.core.types import F64, Box, CameraSpec, LaneMap
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import (
@@ -171,7 +172,7 @@ def _built(
     shown = shown_photographs(drive, placed)
     begin(work, key)
     write_photographs(work, shown, tell)
-    actors = _actors(placed)
+    actors = placed.actors
     views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
     for one in shown:
         present = actors_at(actors, int(one.photograph.t_us or 0))
@@ -310,7 +311,6 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
 
 def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
     """Return all photographs with their names, uses and places."""
-    first_us = int(placed.ego.t_us[0])
     every = EVERY if placed.strip else EVERY_STILL
     out = []
     for camera in drive.cameras:
@@ -321,12 +321,11 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
                 "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
             )
             ending = one.file.suffix.lower() if one.data is None else ".jpg"
-            if one.lens.bends:
+            if one.lens.bends or (one.data is not None and bytes(one.data[:4]) == PNG[:4]):
                 ending = ".png"
-            photograph = replace(one, t_us=int(one.t_us or 0) - first_us)
             out.append(
                 Shown(
-                    photograph,
+                    one,
                     name,
                     use,
                     placed.poses[camera][i],
@@ -380,8 +379,6 @@ def _write_transforms(
 
 
 def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
-    first_us = int(placed.ego.t_us[0])
-    ego = replace(placed.ego, t_us=placed.ego.t_us - first_us)
     only_moved = drive.metric is not None and np.allclose(placed.T_world_source[:3, :3], np.eye(3))
     origin = (
         placed.T_world_source[:3, 3] if only_moved else np.zeros(3)
@@ -397,9 +394,9 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
         "drive",
         roads,
         placed.ground,
-        ego,
+        placed.ego,
         drive.vehicle,
-        _actors(placed),
+        placed.actors,
         tuple(cameras),
         (x, y, z),
         "",
@@ -416,15 +413,6 @@ def _in_view(view: PosedView) -> list[str]:
         if depth > 0 and 0 <= column < camera.width and 0 <= row < camera.height:
             found.append(name)
     return found
-
-
-def _actors(placed: PlacedDrive) -> tuple[Actor, ...]:
-    """Return the road users that move, in the scenario's time."""
-    first_us = int(placed.ego.t_us[0])
-    tracks = [replace(one.track, t_us=one.track.t_us - first_us) for one in placed.actors]
-    return tuple(
-        replace(one, track=track) for one, track in zip(placed.actors, tracks, strict=True)
-    )
 
 
 def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:

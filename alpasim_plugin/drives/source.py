@@ -165,7 +165,17 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
     if len(changes):
         found = f"steps more than {UNITS:.0f} times as long, or as short, from here on"
         raise _two_units(photographs[int(changes[0]) + 6], found)
-    return drive
+    first_us = int(photographs[0].t_us or 0)
+    tracks = [replace(one.track, t_us=one.track.t_us - first_us) for one in drive.actors]
+    return replace(
+        drive,
+        photographs=tuple(
+            replace(one, t_us=int(one.t_us or 0) - first_us) for one in drive.photographs
+        ),
+        actors=tuple(
+            replace(one, track=track) for one, track in zip(drive.actors, tracks, strict=True)
+        ),
+    )
 
 
 def _two_units(one: PosedPhotograph, found: str) -> InputError:

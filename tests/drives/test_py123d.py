@@ -12,7 +12,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.drives.build import _actors, import_drive
+from alpasim_plugin.drives.build import import_drive
 from alpasim_plugin.drives.opening import read_source
 from scenarios.load import load_scenario
 from tests.drives.py123d_log import ORIGIN, TYPES, write_py123d
@@ -33,7 +33,7 @@ def test_a_log_is_the_street_with_its_vehicle_and_the_car_that_moves(log):
     assert_is_the_street(placed)
     assert placed.mounts["pcam_f0"][:2, 3] == pytest.approx([1.2, 0.1])
     assert (drive.vehicle.box.length_m, drive.vehicle.rear_axle_to_centre_m) == (5.0, 1.5)
-    (car,) = _actors(placed)
+    (car,) = placed.actors
     assert (car.actor_id, car.label, car.box.width_m) == ("a1", "car", 1.8)
     way = interpolate(car.track, 1_000_000)[:2, 3] - interpolate(car.track, 0)[:2, 3]
     assert np.linalg.norm(way) == pytest.approx(5.0, rel=0.03)
