@@ -39,6 +39,7 @@ class Traffic:
     bytes_up: int = 0
     bytes_down: int = 0
     graph: object = None  # that is being captured
+    backward: int = 0  # of a tensor of the device, in progress
 
     def reset(self):
         """Forget everything."""
@@ -129,7 +130,8 @@ def _run(func, args, kwargs):
     wants_host = any(device.type == "cpu" for device in asked)
     result = func(*tree_map(_unwrap, args), **tree_map(_unwrap, kwargs))
     if name == "_to_copy" and ours and wants_host:
-        return _downloaded(result)
+        # Autograd converts a gradient to the device that it takes a tensor to have.
+        return _wrap(result) if traffic.backward else _downloaded(result)
     if name == "_to_copy" and theirs and wants_device:
         return _uploaded(result)
     if name == "copy_" and ours and theirs:
@@ -137,7 +139,8 @@ def _run(func, args, kwargs):
         _uploaded(theirs[0]) if target_is_ours else _downloaded(ours[0].held)
         return args[0]
     if not ours and not wants_device:
-        return result
+        # Autograd fills missing gradients with zeros, on the device that it takes a tensor to have.
+        return _wrap(result) if name == "zeros" and traffic.backward else result
     mixed = [tensor for tensor in theirs if tensor.ndim > 0]
     if mixed:
         raise RuntimeError(
@@ -193,8 +196,17 @@ class _Functions(TorchFunctionMode):
                 return {"device": DEVICE, "is_cuda": True, "is_cpu": False}[attribute]
         if name == "numpy" and isinstance(first, OnDevice):
             raise TypeError("a tensor of the device has no array: copy it to the host first")
+        if name == "to" and isinstance(asked[0], torch.Tensor):
+            device = DEVICE if isinstance(asked[0], OnDevice) else HOST
+            args = first, asked[0].dtype
         if name in ("to", "cpu", "cuda") and isinstance(first, torch.Tensor):
             return _moved(first, HOST if name == "cpu" else device, func, args, kwargs)
+        if name == "backward" and isinstance(first, OnDevice):
+            traffic.backward += 1
+            try:
+                return func(*args, **kwargs)
+            finally:
+                traffic.backward -= 1
         if device is not None and device.type == "cuda" and name != "_parse_to":
             kwargs = {key: value for key, value in kwargs.items() if key != "device"}
             made = func(*args, **kwargs)
@@ -264,6 +276,12 @@ def pretended_device(patch):
     patch.setattr(torch.cuda, "is_available", lambda: True)
     patch.setattr(torch.cuda, "device_count", lambda: 1)
     patch.setattr(torch.cuda, "get_device_name", lambda: "pretended")
+    # torch groups tensors by a device that a subclass cannot change, and would copy to it.
+    patch.setattr(
+        torch.nn.utils.clip_grad,
+        "_group_tensors_by_device_and_dtype",
+        lambda lists: {(lists[0][0].device, None): (lists, [])},
+    )
     patch.setattr(torch.cuda, "CUDAGraph", PretendedGraph)
     patch.setattr(torch.cuda, "graph", captured)
     patch.setattr(torch.cuda, "Stream", lambda: SimpleNamespace(wait_stream=lambda other: None))

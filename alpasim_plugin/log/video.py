@@ -266,6 +266,7 @@ class VideoWriter:
             stated in the file.
         pixel_aspect: Width of a pixel over its height.
         crf: Quality of the encoder, 0 (lossless in yuv) to 51.
+        preset: How long the encoder looks for a smaller file.
 
     Raises:
         InputError: No frame, or frames of changing size or wrong type.
@@ -284,6 +285,7 @@ class VideoWriter:
         colour: tuple[int, int, int] = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED),
         pixel_aspect: Fraction = Fraction(1),
         crf: int = 18,
+        preset: str = "veryfast",
     ) -> None:
         self.path, self.count = Path(path), 0
         self._time_base, self._colour, self._pixel_aspect = time_base, colour, pixel_aspect
@@ -296,7 +298,7 @@ class VideoWriter:
         except (OSError, self._av.FFmpegError) as error:
             raise self._failure(error) from error
         self._stream = self._container.add_stream(
-            "libx264", rate=rate, options={"crf": str(crf), "preset": "veryfast"}
+            "libx264", rate=rate, options={"crf": str(crf), "preset": preset}
         )
         self._stream.pix_fmt = "yuv420p"
         self._stream.time_base = self._stream.codec_context.time_base = time_base

@@ -20,6 +20,7 @@ from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe
 from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import FixerRun, TrainableSettings, train_fixer
 from alpasim_plugin.lab.training.latent_clips import ClipForm
+from alpasim_plugin.lab.training.pair_pack import pairs_folder
 from alpasim_plugin.lab.training.recipes.recipe import INIT
 from alpasim_plugin.lab.training.recipes.registry import (
     RECIPES,
@@ -145,6 +146,7 @@ def fixer(
         typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
     ] = None,
     precision: options.Precision = "fp32",
+    device: options.Device = "cpu",
     threads: options.Threads = None,
     seed: options.Seed = 0,
     sizes_of: Annotated[
@@ -161,9 +163,12 @@ def fixer(
     del debug
     options.use_threads(threads)
     own_size = None if size is None else parse_size(size)
+    data = pairs_folder(data, out)
+    video = None if video is None else pairs_folder(video, out)
     if recipe == VAE:
         progress = options.Progress(steps)
-        progress.wrote(train_vae(data, video, out, steps, seed, init, progress.update), as_json)
+        path = train_vae(data, video, out, steps, seed, init, progress.update, device)
+        progress.wrote(path, as_json)
         return
     form = ClipForm(latents, stride, class_colour_augmentation)
     if recipe == DECODER:
@@ -177,10 +182,11 @@ def fixer(
             form,
             DecoderRecipe(clips, columns=columns or DecoderRecipe.columns, seed=seed),
             Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=ema, save_every=50),
-            progress.perceptual_term(metric_weights),
+            progress.perceptual_term(metric_weights, device),
             partial(progress.prepared, every=50),
             progress.update,
             own_size,
+            device,
         )
         progress.wrote(path, as_json)
         return
@@ -208,10 +214,11 @@ def fixer(
         channels == "equal",
         PRECISIONS[precision],
         own_size,
+        device,
     )
     progress = options.Progress(run.updates)
     progress.float32(run.precision, run.stages())
-    distance = progress.perceptual_term(metric_weights) if run.perceptual else None
+    distance = progress.perceptual_term(metric_weights, device) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
     progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +16,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.lab.jobs import map_jobs
+from alpasim_plugin.lab.training.pair_pack import write_pack
 from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.lab.training.video_pairs import VideoRecipe, make_video_pairs
 from scenarios.load import load_scenario
@@ -72,6 +73,13 @@ def pairs(
     ] = 2,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of offsets and damage.")] = 0,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes, one thread each.")] = 1,
+    pack: Annotated[
+        Path | None,
+        typer.Option(
+            "--pack",
+            help="Also write the sequences into this file of at most 40 MB, images as video: it stands for a folder of pairs in training.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
@@ -103,9 +111,13 @@ def pairs(
         note = "" if is_new else " (exists)"
         line = f"{folder}{note}, {time.perf_counter() - began:.0f} s"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+    packed = None
+    if pack is not None:
+        packed = asdict(write_pack([Path(str(row["folder"])) for row in rows], pack))
+        console.print(f"{pack}: {packed}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         new = sum(bool(row["made"]) for row in rows)
-        print(json.dumps({"sequences": len(rows), "made": new, "rows": rows}))
+        print(json.dumps({"sequences": len(rows), "made": new, "rows": rows, "pack": packed}))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size
+from alpasim_plugin.lab.training.pair_pack import pairs_folder
 from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PIXEL_VARIANTS, pixel_variant
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
@@ -145,8 +146,8 @@ def per_frame(
     width, height = parse_size(crop, "--crop", 16)
     shares = StreamShares() if video is not None else WITHOUT_VIDEO
     source = TrainingStreams(
-        data,
-        video,
+        pairs_folder(data, out),
+        None if video is None else pairs_folder(video, out),
         seed=seed,
         batch=streams,
         frames=frames,

@@ -20,7 +20,12 @@ from alpasim_plugin.lab.training.recipes.recipe import Stage
 from alpasim_plugin.lab.training.trainer import LOG_FILE
 from alpasim_plugin.lab.video_metrics.image_distance import distance_for_training
 
-Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
+Pairs = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder of pairs, or a pack of 'simrun train pairs'; the split 'train' is used."
+    ),
+]
 Size = Annotated[
     str | None,
     typer.Option(

@@ -23,7 +23,6 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.atomic import write_array
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.clip_batches import shown_map
 from alpasim_plugin.lab.training.latent_clips import LatentClip, LatentClips
@@ -199,14 +198,9 @@ class DecoderTask:
                 flatten_frames(made[:, :, frames]), flatten_frames(batch.clean[:, :, frames])
             ).mean()
             parts["perceptual"] = self.recipe.perceptual_weight * distance
-        numbers = {name: float(value.detach()) for name, value in parts.items()}
-        decoded, render, clean = (
-            x.detach().clamp(-1, 1).cpu().numpy() for x in (made, batch.render, batch.clean)
-        )
-        numbers["psnr_db"], numbers["render_psnr_db"] = (
-            psnr_db(decoded, clean, peak=2.0),
-            psnr_db(render, clean, peak=2.0),
-        )
+        numbers = {name: value.detach() for name, value in parts.items()}
+        numbers["psnr_db"] = _psnr_db(made.detach(), batch.clean)
+        numbers["render_psnr_db"] = _psnr_db(batch.render, batch.clean)
         return torch.stack(list(parts.values())).sum(), numbers
 
     def _crop(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
@@ -221,6 +215,12 @@ class DecoderTask:
         render, opacity = clip.frames(end)
         videos = [x[:, :, pixels[0], pixels[1]] for x in (render, opacity, clip.clean(end))]
         return (z[:, :, rows, columns], *videos)
+
+
+def _psnr_db(images: Tensor, truth: Tensor) -> Tensor:
+    """Return the PSNR of images in [-1, 1], clipped."""
+    error = (images.clamp(-1, 1) - truth.clamp(-1, 1)).square().mean()
+    return -10 * torch.log10(error / 4)
 
 
 def _digest(weights: Mapping[str, Tensor], clips: LatentClips, deployed: str) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.networks import streaming_dit
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
@@ -42,6 +43,7 @@ def finetune_decoder(
     prepared: Callable[[str, int, int], None] | None = None,
     report: Callable[[int, Mapping[str, float]], None] | None = None,
     size: tuple[int, int] | None = None,
+    device: str = "cpu",
 ) -> Path:
     """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors
     and its card.
@@ -56,6 +58,7 @@ def finetune_decoder(
         prepared: Called with the current item (latents, rollouts), the number done and the total.
         report: Called after every update with its number and the logged values.
         size: Width and height of the sequences to train on, pixels; None: all are of one size.
+        device: Of the training; latents and rollouts are made on the CPU.
 
     Raises:
         InputError: Another kind of bundle, no data, or a crop larger than the clips.
@@ -90,6 +93,7 @@ def finetune_decoder(
     )
     task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
+    vae.to(require_device(device))
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)
     path = out / BUNDLE_FILE

@@ -36,7 +36,7 @@ from alpasim_plugin.lab.training.dmd import (
     score_levels,
 )
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
-from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
+from alpasim_plugin.lab.training.recipes.start import channel_weights_of, no_text, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import T_SOURCE, Sample
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import Loss
@@ -113,13 +113,9 @@ class DistillationTask:
         self.student, fake, real = (
             transformer_of(inputs, part) for part in ("dit", "fake", "real")
         )
-        text = torch.zeros(1, 1, self.student.sizes.text_width)
         taps = config.adversarial.taps if config.adversarial else ()
-        self.text, self.real, self.fake = (
-            text,
-            ScoreNet(real.requires_grad_(False), text),
-            ScoreNet(fake, text, taps),
-        )
+        self.real = ScoreNet(real.requires_grad_(False).to(inputs.device))
+        self.fake = ScoreNet(fake, taps)
         parts: dict[str, nn.Module] = {"dit": self.student, "vae": inputs.vae, "fake": fake}
         if config.adversarial is not None:
             a, seed = (
@@ -166,7 +162,7 @@ class DistillationTask:
         other's weights.
         """
         s, z = batch.sample, None
-        numbers: dict[str, float] = {}
+        numbers: dict[str, Tensor] = {}
         losses: list[Tensor] = []
         if batch.student is not None:
             z = self.roll_out(s, batch.student)
@@ -188,7 +184,7 @@ class DistillationTask:
             sources,
             self.schedule[: len(sources)],
             noise.context,
-            self.text,
+            no_text(self.student, s.z_0),
             s.condition,
             self.attention,
             self.config.gradient_latents,
@@ -196,33 +192,33 @@ class DistillationTask:
 
     def _student_loss(
         self, z: Tensor, s: Sample, noise: RolloutNoise
-    ) -> tuple[Tensor, dict[str, float]]:
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         n, sigma = mixed_source(s.z_r, s.m, noise.score), noise.sigma
         g, normaliser = direction(
             self.real.given(s.condition), self.fake.given(s.condition), z.detach(), n, sigma
         )
         loss = generator_loss(z, g)
         numbers = {
-            "dmd": float(loss.detach()),
-            "direction": float(g.abs().mean()),
-            "normaliser_min": float(normaliser.min()),
-            "rollout": float((z.detach() - s.z_0).square().mean()),
-            "render": float((s.z_r - s.z_0).square().mean()),
+            "dmd": loss.detach(),
+            "direction": g.abs().mean(),
+            "normaliser_min": normaliser.min(),
+            "rollout": (z.detach() - s.z_0).square().mean(),
+            "render": (s.z_r - s.z_0).square().mean(),
         }
         if self.config.adversarial is not None:
             logits = self._logits(noised(z, n, sigma), sigma, s.condition, frozen=True)
             loss = loss + self.config.adversarial.generator(logits)
-            numbers["logit_student"] = float(logits.detach().mean())
+            numbers["logit_student"] = logits.detach().mean()
         return loss, numbers
 
     def _critic_loss(
         self, z: Tensor, s: Sample, noise: RolloutNoise
-    ) -> tuple[Tensor, dict[str, float]]:
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         n = mixed_source(s.z_r, s.m, noise.score)
         sigma = noise.sigma
         term = self.config.adversarial
         loss = critic_loss(self.fake.given(s.condition), z, n, sigma, self.channel_weights)
-        numbers = {"critic": float(loss.detach())}
+        numbers = {"critic": loss.detach()}
         if term is None:
             return loss, numbers
         fake = self.parts["head"](
@@ -233,12 +229,13 @@ class DistillationTask:
             lambda x: self._logits(x, sigma, s.condition), x_real, x_fake, fake, noise.xi
         )
         numbers |= {
-            "logit_real": float(real.detach().mean()),
-            "logit_fake": float(fake.detach().mean()),
+            "logit_real": real.detach().mean(),
+            "logit_fake": fake.detach().mean(),
         }
-        if abs(numbers["logit_real"]) > term.most:
+        logit = float(numbers["logit_real"])
+        if abs(logit) > term.most:
             raise InfrastructureError(
-                f"the adversarial head: real clips have the mean logit {numbers['logit_real']:.3g}, beyond {term.most:g}: the head no longer teaches",
+                f"the adversarial head: real clips have the mean logit {logit:.3g}, beyond {term.most:g}: the head no longer teaches",
                 "lower the learning rate, and begin in another folder",
             )
         return loss + adversarial, numbers
@@ -263,15 +260,14 @@ class ScoreNet:
 
     Args:
         net: The transformer.
-        text: Prompt.
         taps: Blocks whose outputs are kept.
 
     Attributes:
         features: Outputs ``(B, T, N, width)`` of the tapped blocks in the last forward.
     """
 
-    def __init__(self, net: CosmosCausalDiT, text: Tensor, taps: Sequence[int] = ()) -> None:
-        self.net, self.text = net, text
+    def __init__(self, net: CosmosCausalDiT, taps: Sequence[int] = ()) -> None:
+        self.net = net
         self._kept: dict[int, Tensor] = {}
         self._taps = taps
         for tap in taps:
@@ -289,7 +285,7 @@ class ScoreNet:
         sends no gradient to the weights.
         """
         args, attention = (
-            (x, T_SOURCE * sigma[:, None], self.text, condition),
+            (x, T_SOURCE * sigma[:, None], no_text(self.net, x), condition),
             {"block_latents": None},
         )
         v: Tensor = (

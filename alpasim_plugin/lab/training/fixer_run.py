@@ -21,6 +21,7 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.reading.arrays import read_metadata
@@ -67,6 +68,7 @@ class FixerRun:
         precision: Of the forward passes: None is float32. A stage that is always trained in float32
             ignores it.
         size: Width and height of the sequences to train on, pixels; None: all are of one size.
+        device: Where to train; a run may go on on another. Latents are made on the CPU.
     """
 
     settings: TrainableSettings
@@ -80,6 +82,7 @@ class FixerRun:
     equal_channels: bool = False
     precision: torch.dtype | None = None
     size: tuple[int, int] | None = None
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
@@ -235,6 +238,7 @@ def train_stage(
         "vae": file_sha256(run.vae),
         "precision": str(run.precision_of(stage)),
     }
+    task.parts.to(require_device(run.device))
     trainer = Trainer(
         task.parts,
         folder,
@@ -291,6 +295,7 @@ def stage_inputs(
         run.equal_channels,
         distance,
         run.settings,
+        require_device(run.device),
     )
 
 

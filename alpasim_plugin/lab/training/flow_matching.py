@@ -23,7 +23,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers.network.schedule import TABLE, interpolant, shifted
 from alpasim_plugin.lab.training.clip_batches import ClipBatches, Drawn
 from alpasim_plugin.lab.training.recipes.recipe import Attention, StageInputs
-from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
+from alpasim_plugin.lab.training.recipes.start import channel_weights_of, no_text, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import T_SOURCE, Sample, channel_weighted
 from alpasim_plugin.lab.training.tail_drop import TailDrop
 from alpasim_plugin.lab.training.trainer import Loss
@@ -72,7 +72,6 @@ class FlowMatchingTask:
         self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.net = transformer_of(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": inputs.vae})
-        self.text = torch.zeros(1, 1, self.net.sizes.text_width)
         self.channel_weights = channel_weights_of(inputs)
 
     @property
@@ -102,14 +101,14 @@ class FlowMatchingTask:
             s.z_0,
             z_1,
             t,
-            self.text,
+            no_text(self.net, s.z_0),
             s.condition,
             self.attention,
             window=self.config.window,
             channel_weights=self.channel_weights,
             weights=weights,
         )
-        return loss, {"flow": float(loss.detach())}
+        return loss, {"flow": loss.detach()}
 
 
 def flow_matching(
@@ -151,14 +150,17 @@ def noise_levels(
     """
     n = s.t.shape[1]
     size = {"latent": 1, "block": attention.block_latents, "clip": n}[config.times]
-    first = torch.arange(n) // size * size  # latents of a block or clip share the draw of its first
+    device = s.t.device
+    first = (
+        torch.arange(n, device=device) // size * size
+    )  # latents of a block or clip share the draw of its first
     t = s.t[:, first]
     t = config.shift * t / (1 + (config.shift - 1) * t) if config.shift != 1 else t
     rng = stream("training", seed, "generator.levels", index)
-    kind = torch.from_numpy(rng.random(tuple(s.t.shape)))[:, first]
+    kind = torch.from_numpy(rng.random(tuple(s.t.shape))).to(device)[:, first]
     t = torch.where(kind < config.source_share, torch.ones_like(t), t)
     t = torch.where(kind > 1 - config.context_share, torch.full_like(t, context_level().sigma), t)
-    from_noise = torch.from_numpy(rng.random(len(s.t)) < config.noise_share)[
+    from_noise = torch.from_numpy(rng.random(len(s.t)) < config.noise_share).to(device)[
         :, None, None, None, None
     ]
     return t, from_noise

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from itertools import accumulate
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import GROUP
@@ -16,7 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.clip_batches import ClipBatches
 from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
-from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
+from alpasim_plugin.lab.training.recipes.start import channel_weights_of, no_text, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import (
     Losses,
     Objectives,
@@ -103,7 +102,6 @@ class SharedRolloutTask:
         self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.net = transformer_of(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": self.vae})
-        self.text = torch.zeros(1, 1, self.net.sizes.text_width)
         self.channel_weights = channel_weights_of(inputs)
 
     @property
@@ -139,7 +137,7 @@ class SharedRolloutTask:
         made = losses(
             self.net,
             s,
-            self.text,
+            no_text(self.net, s.z_0),
             self.objectives(index),
             perceptual,
             block_latents=attention.block_latents,
@@ -149,12 +147,12 @@ class SharedRolloutTask:
         return made.total, logged(made, s)
 
 
-def logged(made: Losses, s: Sample) -> dict[str, float]:
+def logged(made: Losses, s: Sample) -> dict[str, Tensor]:
     """Return what the log holds of a batch: its terms, and the mean squared errors of rollout and
     render.
     """
     parts = {"flow": made.flow, "perceptual": made.perceptual}
-    numbers = {name: float(value.detach()) for name, value in parts.items() if value is not None}
+    numbers = {name: value.detach() for name, value in parts.items() if value is not None}
     if made.rollout is not None:
-        numbers["rollout"] = float((made.rollout - s.z_0).square().mean())
-    return numbers | {"render": float((s.z_r - s.z_0).square().mean())}
+        numbers["rollout"] = (made.rollout.detach() - s.z_0).square().mean()
+    return numbers | {"render": (s.z_r - s.z_0).square().mean()}

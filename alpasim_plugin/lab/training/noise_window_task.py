@@ -26,7 +26,11 @@ from alpasim_plugin.lab.training.noise_window import (
 )
 from alpasim_plugin.lab.training.picture_batches import PictureBatches, Pictures
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
-from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_with_render
+from alpasim_plugin.lab.training.recipes.start import (
+    channel_weights_of,
+    no_text,
+    transformer_with_render,
+)
 from alpasim_plugin.lab.training.shared_rollout import channel_weighted
 from alpasim_plugin.lab.training.trainer import Loss
 
@@ -89,7 +93,6 @@ class NoiseWindowTask:
         self.batches = PictureBatches(inputs, settings.window_frames)
         self.net = transformer_with_render(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": inputs.vae})
-        self.text = torch.zeros(1, 1, self.net.sizes.text_width)
         self.channel_weights = channel_weights_of(inputs)
 
     @property
@@ -137,7 +140,13 @@ class NoiseWindowTask:
             z_r, z_0 = self.vae.encode(torch.cat(batch.pictures)).chunk(2)
             z_r = z_r * batch.seen[:, None, :, None, None]
         errors = noise_window_errors(
-            self.net, z_0, z_r, batch.eps, batch.t, self.text, ERRORS[self.config.error]
+            self.net,
+            z_0,
+            z_r,
+            batch.eps,
+            batch.t,
+            no_text(self.net, z_0),
+            ERRORS[self.config.error],
         )
         loss = channel_weighted(errors, self.channel_weights).mean()
-        return loss, {"flow": float(loss.detach())}
+        return loss, {"flow": loss.detach()}

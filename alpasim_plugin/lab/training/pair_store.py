@@ -253,10 +253,15 @@ def write_sequence(
         count = _write_arrays(partial, frames, length)
         if beside is not None:
             beside(partial)
-        document = {**info, "frames": count, CONTENT: _content(partial)}
-        (partial / SEQUENCE_FILE).write_text(
-            json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8"
-        )
+        write_info(partial, {**info, "frames": count})
+
+
+def write_info(folder: Path, info: Mapping[str, Any]) -> None:
+    """Write sequence.json beside the arrays of a sequence, with their digest."""
+    document = {**info, CONTENT: _content(folder)}
+    (folder / SEQUENCE_FILE).write_text(
+        json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8"
+    )
 
 
 def _content(folder: Path) -> str:

@@ -53,10 +53,10 @@ class RenderStep:
         Returns:
             Like ``render``, not clipped.
         """
-        text = torch.zeros(1, 1, self.net.sizes.text_width)
         z_r = self.vae.encode(
             render if references is None else torch.cat([render, references], dim=2)
         )
+        text = z_r.new_zeros(1, 1, self.net.sizes.text_width)
         z_0 = fixed_step(self.net, z_r, self.level, text)
         return self.vae.decode(
             z_0[:, :, :1], render=render if self.sees_render else None, clamp=False

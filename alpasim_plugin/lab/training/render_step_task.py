@@ -96,7 +96,7 @@ class RenderStepTask:
         self.largest = (
             None
             if config.clamp is None
-            else largest_distance(self.batches, self.distance, config.clamp)
+            else largest_distance(self.batches, self.distance, config.clamp, inputs.device)
         )
 
     @property
@@ -136,15 +136,17 @@ class RenderStepTask:
         parts = picture_losses(made, wanted, self.distance, self.config.weight, self.largest)
         if batch.joined and self.config.warp:
             parts |= warp_term(made, clean[:, :, : w + 1], self.config.warp)
-        numbers = {name: float(value.detach()) for name, value in parts.items()}
+        numbers: dict[str, Tensor | float] = {name: value.detach() for name, value in parts.items()}
         if self.largest is not None:
             numbers["largest_distance"] = self.largest
-        numbers["render"] = float((render[:, :, w : w + 1] - wanted).square().mean())
+        numbers["render"] = (render[:, :, w : w + 1] - wanted).square().mean()
         return torch.stack(list(parts.values())).sum(), numbers
 
 
 @torch.no_grad()
-def largest_distance(batches: PictureBatches, distance: Distance, share: float) -> float:
+def largest_distance(
+    batches: PictureBatches, distance: Distance, share: float, device: str
+) -> float:
     """Return the quantile ``share`` of the distances between renders and clean frames in the first
     training batches, to three digits.
     """
@@ -153,5 +155,6 @@ def largest_distance(batches: PictureBatches, distance: Distance, share: float) 
         render, clean = batches[
             len(found)
         ]  # any batches will do, as long as they are always the same
-        found += distance(render[:, :, -1], clean[:, :, -1]).tolist()
+        shown = (images[:, :, -1].to(device) for images in (render, clean))
+        found += distance(*shown).tolist()
     return float(f"{np.quantile(found, share):.3g}")

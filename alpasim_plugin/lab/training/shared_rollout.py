@@ -179,7 +179,7 @@ def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
     return (
         squares
         if channel_weights is None
-        else squares * channel_weights.view(1, -1, *[1] * (squares.ndim - 2))
+        else squares * channel_weights.to(squares.device).view(1, -1, *[1] * (squares.ndim - 2))
     )
 
 

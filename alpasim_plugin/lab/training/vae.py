@@ -20,6 +20,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.codec_weights import LatentStats
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.bundle import parts_of
@@ -149,7 +150,7 @@ class VaeTask:
             )
             parts["auxiliary"] = r.auxiliary_weight * error
         total = torch.stack(list(parts.values())).sum()
-        return total, {name: float(value.detach()) for name, value in parts.items()}
+        return total, {name: value.detach() for name, value in parts.items()}
 
     def _latents(self, video: Tensor, index: int, which: int) -> tuple[Tensor, Tensor]:
         z = self.vae.encode(video)
@@ -167,6 +168,7 @@ def train_vae(
     seed: int,
     init: Path | None,
     report: Callable[[int, Mapping[str, float]], None] | None = None,
+    device: str = "cpu",
 ) -> Path:
     """Train the tiny autoencoder; write OUT/vae.safetensors with averaged weights and measured
     latent statistics.
@@ -178,6 +180,7 @@ def train_vae(
         steps, seed: Updates; seed of weights and draws.
         init: Initial weights: an autoencoder, or a fixer's bundle.
         report: Called after every update with its number and the logged values.
+        device: Where to train; a run may go on on another.
     """
     vae = load_tiny_vae(init).requires_grad_(True) if init else TinyVAE.random(seed=seed)
     sequences = PairDataset(data, "train").sequences
@@ -185,10 +188,11 @@ def train_vae(
     if video is not None:
         videos = [sequence.clip.rgb_gt for sequence in PairDataset(video, "train").sequences]
     recipe = VaeRecipe(seed=seed, video_clips=1 if videos else 0)
+    vae.to(require_device(device))
     task = VaeTask(vae, sequences, videos, recipe)
     trainer = Trainer(vae, out, Schedule(steps), task.batch, task.loss, task.facts)
     trainer.run(report)
-    vae.load_state_dict(trainer.averaged())
+    vae.cpu().load_state_dict(trainer.averaged())
     clips = [to_tensor(s.clip.rgb_gt[:MEASURED_FRAMES])[None] for s in sequences]
     mean, std = measure_stats(vae, clips)
     vae.stats = LatentStats(

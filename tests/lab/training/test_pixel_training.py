@@ -290,4 +290,4 @@ def test_a_run_on_a_device_equals_the_processors_and_goes_on_there(tmp_path, mon
         train_per_frame(run, tmp_path / "device", None, 2, report)
     found = load_weights(train_per_frame(run_of(), tmp_path / "device", None))
     assert all(torch.equal(found[key], value) for key, value in wanted.items())
-    assert waits[-1] <= 2
+    assert waits[-1] == 1

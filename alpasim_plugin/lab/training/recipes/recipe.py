@@ -109,6 +109,7 @@ class StageInputs:
         equal_channels: Whether flow matching weights all latent channels alike.
         distance: Name and function of the perceptual term; None where the recipe has none.
         settings: Of the fixer that is trained.
+        device: Of the batches in the loss, and of the distance.
     """
 
     dit: DiTSettings
@@ -124,6 +125,7 @@ class StageInputs:
     equal_channels: bool = False
     distance: tuple[str, Distance] | None = None
     settings: LatentFixerSettings | None = None
+    device: str = "cpu"
 
 
 class Objective(Protocol):

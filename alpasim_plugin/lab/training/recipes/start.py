@@ -68,6 +68,11 @@ def channel_weights_of(inputs: StageInputs) -> Tensor | None:
     return None if inputs.equal_channels else channel_amplitudes(inputs.vae)
 
 
+def no_text(net: CosmosCausalDiT, like: Tensor) -> Tensor:
+    """Return a prompt of one token of zeros ``(1, 1, width)``, on the device of a tensor."""
+    return like.new_zeros(1, 1, net.sizes.text_width)
+
+
 def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]:
     """Return weights whose map input has ``channels`` channels; new columns are zero, so outputs do
     not change.
