@@ -44,7 +44,9 @@ def trained(recipe, data, folder, device, monkeypatch):
         monkeypatch.setattr(vae, "MEASURED_FRAMES", 13)
         monkeypatch.setattr(vae, "VaeRecipe", partial(VaeRecipe, size=CropSize(5, 32, 48)))
         monkeypatch.setattr(
-            TinyVAE, "random", lambda seed: TinyVAE.load(data / "vae.safetensors").requires_grad_()
+            TinyVAE,
+            "random",
+            lambda seed: vae.load_tiny_vae(data / "vae.safetensors").requires_grad_(),
         )
         return vae.train_vae(data, None, folder / "run", 2, 0, None, device=device)
     run = replace(run_of(data, recipe), device=device)

@@ -1,0 +1,43 @@
+"""Recorded frames carried by tensors: the same images as the kernels of the CPU."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import Box
+from alpasim_plugin.fixers.device_carry import carry_on_device, upload
+from alpasim_plugin.fixers.ground import carry, with_users
+from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
+from tests.fixers.test_ground import K, recorded, rig, street
+
+BOXES = {"car": Box(4.0, 2.0, 1.5), "van": Box(5.0, 2.2, 2.5)}
+
+
+def actors(x_m):
+    return {"car": se2(18.0 + x_m, -1.0, 0.1, 0.75), "van": se2(25.0, 3.0, 0.0, 1.25)}
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("wall_m", [np.inf, 30.0])
+def test_images_equal_those_of_the_processor(count, wall_m):
+    T, depth, _ = street(10.013, wall_m)
+    depth[22:30, 8:40] = 0
+    depth[30:36, 8:40] = 3.0
+    view = WarpTarget(K, T, depth, actors(0.0), BOXES)
+    images = [
+        with_users(replace(recorded(8.937 - i, wall_m), actors=actors(-1.0 * i)), BOXES)
+        for i in range(count)
+    ]
+    images[-1] = replace(images[-1], actors={})
+    wanted = carry(images, view, rig(10.0))
+    on_device = replace(view, depth=torch.from_numpy(depth))
+    found = carry_on_device(
+        [upload(one, torch.device("cpu")) for one in images], on_device, rig(10.0)
+    )
+    assert found.dtype == torch.uint8
+    for one, other in zip(found.numpy(), wanted, strict=True):
+        apart = np.abs(one.astype(int) - other)
+        assert (apart.max(axis=-1) > 1).mean() < 2e-3
