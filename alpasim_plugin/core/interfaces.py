@@ -143,6 +143,7 @@ class Fixer(Protocol):
     blocks: BlockRule = BlockRule(1, 1)  # frames of the first block and of each later one
     trained: bool = False  # whether the weights were learned
     label: str = ""  # what this is, for tables and reports: "onefixer, trained"
+    reads_device: bool = False  # whether it takes a frame and its references from a device
 
     @abstractmethod
     def reset(self, seed: int) -> None:

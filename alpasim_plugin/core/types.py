@@ -194,6 +194,7 @@ class DevicePlanes(Protocol):
     alpha: Any  # (H, W) float32
     depth: Any  # (H, W) float32
     pairs: Any  # () int32, downloaded with what is made of the planes, and given to `had_room`
+    references: Any  # (K, H, W, 4) uint8, recorded frames warped into the view; None: none
 
     @property
     def size(self) -> tuple[int, int]:
@@ -213,6 +214,10 @@ class DevicePlanes(Protocol):
     @property
     def again(self) -> Callable[[], DevicePlanes]:
         """Draw the planes once more, with more room."""
+        ...
+
+    def changed(self, change: Callable[[Any], Mapping[str, Any]]) -> DevicePlanes:
+        """Return them with other planes, which they also have when they are drawn again."""
         ...
 
 

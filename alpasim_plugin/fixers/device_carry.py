@@ -27,8 +27,6 @@ from alpasim_plugin.fixers.warp import (
     WarpTarget,
 )
 
-PARTS = 32  # of a pixel, to which OpenCV rounds where an image is looked up
-
 
 @dataclass(frozen=True, eq=False)
 class UploadedImage:
@@ -142,8 +140,8 @@ def _warp(
     far = (surface > INFINITY_M / 2) & (w > INFINITY_M / 2)
     agrees = far | (surface >= free_share * w) | ((surface - w).abs() < SLACK * w + SLACK_M)
     held = torch.where(agrees, VALID, INCONSISTENT) * there
-    x, y = (((part - 0.5).float() * PARTS).round() / PARTS for part in (u, v))
-    grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
+    x, y = 2 * (u - 0.5) / (width - 1) - 1, 2 * (v - 0.5) / (height - 1) - 1
+    grid = torch.stack([x, y], dim=-1).float()
     rgb = F.grid_sample(
         image.rgb, grid[None], mode="bicubic", padding_mode="border", align_corners=True
     )

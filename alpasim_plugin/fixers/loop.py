@@ -52,6 +52,7 @@ class BlockRunner:
         references: Warps recorded frames into each view; None where the fixer reads none, or the
             renderer declares none.
         threads: Threads of the map rasteriser.
+        on_device: Whether the fixer takes the references of a frame that a device drew from there.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -60,6 +61,7 @@ class BlockRunner:
     actors: Sequence[Actor]
     threads: int | None = None
     references: ReferenceSession | None = None
+    on_device: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def reset_times(self) -> None:
@@ -71,7 +73,11 @@ class BlockRunner:
         frame = self.render_base(request)
         if self.references is not None:
             with self._timed("references"):
-                frame = frame.changed(references=self.references.of(request, frame))
+                if self.on_device and frame.pending is not None:
+                    planes = self.references.on_device(request, frame.pending)
+                    frame = frame.changed(on_device=planes)
+                else:
+                    frame = frame.changed(references=self.references.of(request, frame))
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
         with self._timed("map"):
@@ -229,9 +235,9 @@ def fixed_renderer(
     if settings.references and recorded:
         of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
         references = ReferenceSession(*of, threads=thread_count(threads))
-    runner = BlockRunner(render, scene_map, scenario.actors, threads, references)
-
     first = complete(make_fixer(), Fixer)
+    on_device = first.reads_device
+    runner = BlockRunner(render, scene_map, scenario.actors, threads, references, on_device)
     if first.blocks == ONE_BY_ONE:
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)

@@ -164,6 +164,7 @@ class PixelFixer(Fixer):
     """
 
     blocks = BlockRule(1, 1)
+    reads_device = True
 
     def __init__(
         self,
@@ -359,7 +360,9 @@ def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[F
     again = [planes.again() for planes in planes_of([frames[index] for index in mine])]
     for index, planes in zip(mine, again, strict=True):
         frames[index] = frames[index].changed(on_device=planes)
-    rgb, alpha = stacked(again)
+    rgb, alpha, references = stacked(again)
+    if references is not None:
+        view = replace(view, references=references[:, None])
     return replace(view, rgb=rgb[:, None], alpha=alpha[:, None]), frames
 
 

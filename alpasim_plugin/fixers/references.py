@@ -14,8 +14,8 @@ own future is looked at.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from alpasim_plugin.core.types import (
     I64,
     U8,
     Actor,
+    DevicePlanes,
     Frame,
     RecordedFrame,
     RenderRequest,
@@ -130,6 +131,7 @@ class ReferenceSession:
         self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
         self._recorded: OrderedDict[int, RecordedImage] = OrderedDict()
+        self._uploaded: dict[int, Any] = {}  # those of them that lie on a device
 
     def of(self, request: RenderRequest, frame: Frame) -> tuple[U8, ...]:
         """Return the references of a rendered frame, nearest first; none without depth.
@@ -140,13 +142,7 @@ class ReferenceSession:
         """
         if frame.depth is None:
             return ()
-        T_world_camera = request.T_world_camera[1]
-        last = self._last.get(frame.camera, ())
-        chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
-        if self.hysteresis:
-            self._last[frame.camera] = chosen
-        at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
-        T_world_rig = se3(self._ego_log.xyz[at], self._ego_log.quat[at])
+        chosen, T_world_rig = self._choose(request)
         recorded_images = [self._recorded_image(i) for i in chosen]
         out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in recorded_images)
         around = window_px(
@@ -169,12 +165,44 @@ class ReferenceSession:
                 band.put(whole, part[own])
         return out
 
+    def on_device(self, request: RenderRequest, planes: DevicePlanes) -> DevicePlanes:
+        """Return the planes of a rendered frame with its references, both on their device."""
+        from alpasim_plugin.fixers import device_carry
+
+        chosen, T_world_rig = self._choose(request)
+        if not chosen:
+            return planes
+        device = planes.rgb.device
+        for i in chosen:
+            recorded = self._recorded_image(i)
+            if i not in self._uploaded:
+                self._uploaded[i] = device_carry.upload(recorded, device)
+        images = [self._uploaded[i] for i in chosen]
+
+        def carried(drawn: DevicePlanes) -> Mapping[str, Any]:
+            K, T = request.camera.K, request.T_world_camera[1]
+            target = WarpTarget(K, T, drawn.depth, request.actors, self._boxes)
+            return {"references": device_carry.carry_on_device(images, target, T_world_rig)}
+
+        return planes.changed(carried)
+
+    def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
+        """Return which recorded frames a view receives, and the rig's pose nearest to it."""
+        T_world_camera, camera = request.T_world_camera[1], request.camera.name
+        last = self._last.get(camera, ())
+        chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
+        if self.hysteresis:
+            self._last[camera] = chosen
+        at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
+        return chosen, se3(self._ego_log.xyz[at], self._ego_log.quat[at])
+
     def _recorded_image(self, i: int) -> RecordedImage:
         if i not in self._recorded:
             frame = self.index.recorded[i]
             recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
             self._recorded[i] = with_users(recorded, self._boxes)
             if len(self._recorded) > KEPT_FRAMES:
-                self._recorded.popitem(last=False)
+                dropped, _ = self._recorded.popitem(last=False)
+                self._uploaded.pop(dropped, None)
         self._recorded.move_to_end(i)
         return self._recorded[i]

@@ -28,9 +28,9 @@ class Views:
     rgb: Any  # (B, T, H, W, 3) uint8, of the host or of a device
     alpha: Any  # (B, T, H, W) float32 beside it, 0 to 1; None where every pixel is opaque
     maps: U8 | None  # (B, T, H, W, 3)
-    references: U8 | None = (
-        # (B, T, K, H, W, 4) recorded frames, 0 where a frame has fewer than others; None: no frame
-        # has any
+    references: Any = (
+        # (B, T, K, H, W, 4) uint8 recorded frames, of the host or of a device, 0 where a frame has
+        # fewer than others; None: no frame has any
         None
     )
 
@@ -190,17 +190,19 @@ def _stack(
     shape = (*frames[0].size, 3)
     lead = (len(names), len(order[0]))
     drawn = planes_of(frames) if on_device else []
+    references: Any = None
     if len(drawn) == len(frames):
-        rgb, alpha = stacked(drawn)
+        rgb, alpha, references = stacked(drawn)
     else:
         rgb, alpha = np.stack([frame.rgb for frame in frames]), _opacity(frames)
-    references = None
-    count = max(len(frame.references) for frame in frames)
+    given = [] if references is not None else [_references(frame) for frame in frames]
+    count = max(map(len, given), default=0)
     if count:
         references = np.zeros((len(frames), count, *shape[:2], 4), np.uint8)
-        for i, frame in enumerate(frames):
-            for k, image in enumerate(frame.references):
+        for i, images in enumerate(given):
+            for k, image in enumerate(images):
                 references[i, k] = image
+    if references is not None:
         references = references.reshape(*lead, *references.shape[1:])
     return Views(
         names,
@@ -213,17 +215,35 @@ def _stack(
     )
 
 
+def _references(frame: Frame) -> Sequence[U8]:
+    planes = frame.pending
+    if planes is None or planes.references is None:
+        return frame.references
+    return tuple(planes.references.cpu().numpy())
+
+
 def planes_of(frames: Sequence[Frame]) -> list[DevicePlanes]:
     """Return the planes of the frames that a device drew."""
     return [frame.pending for frame in frames if frame.pending is not None]
 
 
-def stacked(drawn: Sequence[DevicePlanes]) -> tuple[Any, Any]:
-    """Return images and opacities that a device drew as one tensor each."""
+def stacked(drawn: Sequence[DevicePlanes]) -> tuple[Any, Any, Any]:
+    """Return images, opacities and references ``(N, K, H, W, 4)`` that a device drew as one tensor
+    each; None where no view has a reference.
+    """
     import torch
 
     rgb = torch.stack([planes.rgb for planes in drawn])
-    return rgb, torch.stack([planes.alpha for planes in drawn])
+    alpha = torch.stack([planes.alpha for planes in drawn])
+    given = [planes.references for planes in drawn if planes.references is not None]
+    if not given:
+        return rgb, alpha, None
+    count = max(map(len, given))
+    references = rgb.new_zeros((len(drawn), count, *rgb.shape[1:3], 4))
+    for mine, planes in zip(references, drawn, strict=True):
+        if planes.references is not None:
+            mine[: len(planes.references)] = planes.references
+    return rgb, alpha, references
 
 
 def _opacity(frames: Sequence[Frame]) -> F32 | None:

@@ -7,8 +7,18 @@ import pytest
 import torch
 
 from alpasim_plugin.core.devices import CapturedFunction, sizes_of
-from alpasim_plugin.core.types import OPACITY_MEAN, Frame
+from alpasim_plugin.core.types import (
+    OPACITY_MEAN,
+    RECORDED_SHARE,
+    CameraSpec,
+    Frame,
+    RecordedFrame,
+    RenderRequest,
+    Trajectory,
+)
 from alpasim_plugin.fixers import fixer_settings, make_fixer
+from alpasim_plugin.fixers.loop import BlockRunner
+from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from tests.examples import first_of
 from tests.gaussians.gaussian_scenes import LSB
@@ -16,7 +26,7 @@ from tests.gaussians.test_scene_graph import SKY, blobs, camera, node, se2
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from tests.pretended_device import pretended_device
+from tests.pretended_device import pretended_device, traffic
 
 HEIGHT, WIDTH = 64, 96
 
@@ -82,6 +92,44 @@ def test_a_frame_stays_on_the_device_between_rasteriser_and_fixer(monkeypatch, c
             if capacity > 10:
                 assert traffic.bytes_down < 3.1 * due.alpha.size + 200
         assert np.abs(fixed.alpha - due.alpha).max() <= LSB
+
+
+def test_references_are_carried_on_the_device(monkeypatch):
+    graph, poses = scene()
+    spec = camera()
+    T = np.linalg.inv(spec.T_camera_world)
+    shown = graph.render(spec, poses).surface()
+    rgb = (shown.rgb * 255).astype(np.uint8)
+    recorded = [
+        RecordedFrame(t, "front", spec.K, T, {}, lambda: (rgb, shown.depth)) for t in range(2)
+    ]
+    path = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    view = CameraSpec("front", spec.width, spec.height, spec.K, T)
+
+    def fixed(device):
+        references = ReferenceSession(recorded, (), path, 2)
+        fixer = make_fixer("onefixer", scene_id="scene", device=device)
+        runner = BlockRunner(
+            lambda r: graph.render(spec, poses, device=device).surface().frame(r.t_us, "front"),
+            None,
+            (),
+            references=references,
+            on_device=fixer.reads_device,
+        )
+        for t_us in (0, 100_000):
+            traffic.reset()
+            request = RenderRequest(t_us, view, np.stack([T, T]), {})
+            (frame,) = runner.fix(fixer, fixer.step, [runner.render(request)])
+        return frame
+
+    wanted = fixed("cpu")
+    assert wanted.facts[RECORDED_SHARE] > 0.05
+    with pretended_device(monkeypatch):
+        found = fixed("cuda:0")
+        assert sum(traffic.waits.values()) == 1
+        assert traffic.bytes_down < 3.1 * rgb[..., 0].size + 200
+        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 2
+        assert found.facts[RECORDED_SHARE] == pytest.approx(wanted.facts[RECORDED_SHARE], abs=1e-3)
 
 
 @pytest.mark.parametrize("holes", ["render", "noise"])

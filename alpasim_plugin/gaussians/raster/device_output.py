@@ -27,6 +27,7 @@ class DeviceOutput(RasterOutput):
             for them.
         had_room: Whether there was room for a number of pairs; makes room for the next frame.
         again: Draws the view once more.
+        references: See `DevicePlanes`.
     """
 
     rgb: Any
@@ -35,6 +36,7 @@ class DeviceOutput(RasterOutput):
     pairs: Tensor
     had_room: Callable[[int], bool]
     again: Callable[[], DeviceOutput]
+    references: Any = None
 
     @property
     def size(self) -> tuple[int, int]:
