@@ -10,7 +10,7 @@ from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.fixers.device_carry import carry_on_device, upload
 from alpasim_plugin.fixers.ground import carry, with_users
-from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
+from alpasim_plugin.fixers.warp import WarpTarget
 from tests.fixers.test_ground import K, recorded, rig, street
 
 BOXES = {"car": Box(4.0, 2.0, 1.5), "van": Box(5.0, 2.2, 2.5)}
