@@ -50,6 +50,14 @@ def require_device(name: str) -> str:
     return f"cuda:{number}"
 
 
+def share_card(device: str, workers: int) -> None:
+    """Leave every worker of a card an equal share of its memory."""
+    if device != "cpu" and workers > 1:
+        import torch
+
+        torch.cuda.set_per_process_memory_fraction(1 / workers, device)
+
+
 def download(*parts: Tensor) -> list[Any]:
     """Return tensors as arrays, brought to the host in one copy: each copy waits for the device."""
     import torch

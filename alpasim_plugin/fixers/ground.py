@@ -63,7 +63,7 @@ def carry(
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
     by_ground = _warp_all(
-        [_hidden_by_users(recorded) for recorded in recorded_images], view, FREE_SHARE, threads
+        [hidden_by_users(recorded) for recorded in recorded_images], view, FREE_SHARE, threads
     )
     ground = view.depth > 0
     if len(recorded_images) > 1:
@@ -138,7 +138,7 @@ def with_users(recorded: RecordedImage, boxes: Mapping[str, Box]) -> RecordedIma
     return replace(recorded, users=users) if users.any() else recorded
 
 
-def _hidden_by_users(recorded: RecordedImage) -> RecordedImage:
+def hidden_by_users(recorded: RecordedImage) -> RecordedImage:
     """Return a recorded frame whose road users hide all ground behind them, however near to it they
     stand.
     """

@@ -235,14 +235,13 @@ def stacked(drawn: Sequence[DevicePlanes]) -> tuple[Any, Any, Any]:
 
     rgb = torch.stack([planes.rgb for planes in drawn])
     alpha = torch.stack([planes.alpha for planes in drawn])
-    given = [planes.references for planes in drawn if planes.references is not None]
-    if not given:
+    counts = [0 if planes.references is None else len(planes.references) for planes in drawn]
+    if not any(counts):
         return rgb, alpha, None
-    count = max(map(len, given))
-    references = rgb.new_zeros((len(drawn), count, *rgb.shape[1:3], 4))
-    for mine, planes in zip(references, drawn, strict=True):
-        if planes.references is not None:
-            mine[: len(planes.references)] = planes.references
+    references = rgb.new_zeros((len(drawn), max(counts), *rgb.shape[1:3], 4))
+    for mine, count, planes in zip(references, counts, drawn, strict=True):
+        if count:
+            mine[:count] = planes.references
     return rgb, alpha, references
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.stage import shown_in
@@ -176,7 +177,7 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
     workers, threads = how.here.workers, how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
-    work = partial(_work, plan.options, root, threads)
+    work = partial(_work, plan.options, root, how.here)
 
     def written(job: Job) -> JsonObject | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
@@ -187,9 +188,11 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-def _work(options: RunOptions, root: Path, threads: int, job: Job) -> JsonObject:
+def _work(options: RunOptions, root: Path, here: Threads, job: Job) -> JsonObject:
     """Drive or copy a cell in a worker of this machine."""
+    share_card(options.device, here.workers)
     cell, original = job
+    threads = here.per_worker
     with shown_in(root / STAGES):
         if original is None:
             return run_cell(cell, options, root, threads)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.devices import CapturedFunction, sizes_of
+from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of
 from alpasim_plugin.core.types import (
     OPACITY_MEAN,
     RECORDED_SHARE,
@@ -148,6 +148,15 @@ def test_the_fixer_waits_once_a_frame_and_replays_its_graph(monkeypatch, holes):
             assert traffic.bytes_up == HEIGHT * WIDTH * (3 + 4 + 3 + 4) + 8 * (holes == "noise")
             assert traffic.bytes_down < HEIGHT * WIDTH * 3.1
         assert traffic.launches <= 40
+
+
+def test_workers_share_the_memory_of_a_card(monkeypatch):
+    shares = []
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda *x: shares.append(x))
+    share_card("cpu", 4)
+    share_card("cuda:1", 1)
+    share_card("cuda:1", 4)
+    assert shares == [(0.25, "cuda:1")]
 
 
 def test_tensors_of_two_devices_do_not_mix(monkeypatch):

@@ -12,10 +12,12 @@ import torch
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.cli.training_options import (
     AsJson,
     Debug,
+    Device,
     Progress,
     Seed,
     Steps,
@@ -73,6 +75,7 @@ def policy(
     ],
     steps: Steps = 4000,
     seed: Seed = 0,
+    device: Device = "cpu",
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -95,6 +98,7 @@ def policy(
     if len(net.views) > 1:
         start_from_front(net, load_net(WEIGHTS))
     net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net = net.to(require_device(device))
     task = PolicyTask(net, demonstrations, PolicyRecipe(seed=seed))
     schedule = Schedule(
         steps, peak_lr=1.5e-3, warmup=min(200, steps // 10 + 1), weight_decay=0.02, ema=0.998
@@ -102,7 +106,7 @@ def policy(
     trainer = Trainer(net, out, schedule, task.batch, task.loss, task.facts)
     progress = Progress(steps, every=50)
     trainer.run(progress.update)
-    net.load_state_dict(trainer.averaged())
+    net.cpu().load_state_dict(trainer.averaged())
     net.eval()
     held_out = (
         measure(PolicyTask(net, read_demonstrations(data, "val"), PolicyRecipe()))

@@ -86,9 +86,11 @@ class PolicyTask:
     ) -> None:
         self.net, self.demonstrations, self.recipe = net, demonstrations, recipe
         self.ends = np.cumsum([len(one) for one in demonstrations])
-        self.weights = torch.from_numpy(knot_weights()).float()
-        self.rows = torch.tensor(KNOTS_M).long()  # knots lie on whole metres
-        self.unit_m = recipe.lateral_scale_m + recipe.lateral_scale_per_m * torch.tensor(KNOTS_M)
+        device = next(net.parameters()).device
+        self.weights = torch.from_numpy(knot_weights()).float().to(device)
+        knots_m = torch.tensor(KNOTS_M).to(device)
+        self.rows = knots_m.long()  # knots lie on whole metres
+        self.unit_m = recipe.lateral_scale_m + recipe.lateral_scale_per_m * knots_m
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -150,9 +152,9 @@ class PolicyTask:
             "speed": speed,
             "sigma": 0.05 * sigma,
         }
-        numbers = {name: float(value.detach()) for name, value in parts.items()}
-        numbers["lateral_m"] = float(lateral[:, SIGMA_KNOT].detach().abs().mean())
-        numbers["speed_mps"] = float(speed_error.detach().abs().mean())
+        numbers = {name: value.detach() for name, value in parts.items()}
+        numbers["lateral_m"] = lateral[:, SIGMA_KNOT].detach().abs().mean()
+        numbers["speed_mps"] = speed_error.detach().abs().mean()
         return torch.stack(list(parts.values())).sum(), numbers
 
     def errors(

@@ -20,6 +20,7 @@ from alpasim_plugin.lab.training.perturbed_rollouts import (
     turning_lines,
 )
 from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask
+from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from policies.learned_input import COMMANDS
 from policies.learned_net import LearnedNet
 from scenarios.load import load_scenario
@@ -114,3 +115,20 @@ def test_sigma_sends_no_gradient_into_the_plan(root):
     (plan, sigma), (plan_again, other_sigma) = gradients(0.0), gradients(1.5)
     assert torch.equal(plan, plan_again)
     assert not torch.allclose(sigma, other_sigma)
+
+
+def test_an_update_on_a_device_waits_once(root, tmp_path, monkeypatch):
+    pytest.importorskip("triton", reason="Triton is not installed")
+    from tests.pretended_device import pretended_device
+
+    def update(device):
+        net = LearnedNet(0).to(device)
+        task = PolicyTask(net, read_demonstrations(root, "train"), PolicyRecipe(batch=4))
+        trainer = Trainer(net, tmp_path / device, Schedule(1), task.batch, task.loss, {})
+        return trainer._update()["loss"]
+
+    wanted = update("cpu")
+    with pretended_device(monkeypatch) as traffic:
+        traffic.reset()
+        assert update("cuda") == pytest.approx(wanted, rel=1e-4)
+        assert sum(traffic.waits.values()) == 1
