@@ -23,7 +23,6 @@ from scenarios.schema import models
 from scenarios.schema_parts import Part
 
 EVERY_VERB = ("--json", "--debug", "--help")
-OBSTACLES_UNKNOWN = METRICS["collision_any"].invalid  # long, and of every contact
 TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
@@ -80,7 +79,7 @@ def metric_table() -> str:
             {"none": "neither"}.get(metric.direction, metric.direction),
             metric.aggregation,
             f"{metric.accepted:g}" if metric.accepted else "",
-            metric.invalid.replace(OBSTACLES_UNKNOWN, "obstacles unknown"),
+            metric.invalid,
         )
         names.setdefault(row, []).append(f"`{name}`")
     head = ("metric", "per step", "measured at", "unit", "better", "over a rollout", "accepted")
