@@ -90,25 +90,20 @@ def blurred(rgb: U8) -> U8:
     return cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1])
 
 
-def _corrupted(
-    scenario: Scenario, seed: int, device: str, threads: int | None, *, corrupt: Corruption
+def _made(
+    scenario: Scenario,
+    seed: int,
+    device: str,
+    threads: int | None,
+    *,
+    fault: Callable[[CleanRenderer], Renderer],
 ) -> Renderer:
-    return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), corrupt)
+    return fault(CleanRenderer(scenario, seed, device, threads))
 
 
-def _stale(
-    scenario: Scenario, seed: int, device: str, threads: int | None, *, age_us: int | None
-) -> Renderer:
-    return StaleRenderer(CleanRenderer(scenario, seed, device, threads), age_us)
-
-
-def shifted_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-    """Make the renderer ``broken-shifted``."""
-    return ShiftedRenderer(CleanRenderer(scenario, seed, device, threads), SHIFT_M)
-
-
-black_renderer = partial(_corrupted, corrupt=black)
-mirrored_renderer = partial(_corrupted, corrupt=mirrored)
-blurred_renderer = partial(_corrupted, corrupt=blurred)
-frozen_renderer = partial(_stale, age_us=None)
-late_renderer = partial(_stale, age_us=LATE_US)
+black_renderer = partial(_made, fault=partial(BrokenRenderer, corrupt=black))
+mirrored_renderer = partial(_made, fault=partial(BrokenRenderer, corrupt=mirrored))
+blurred_renderer = partial(_made, fault=partial(BrokenRenderer, corrupt=blurred))
+shifted_renderer = partial(_made, fault=partial(ShiftedRenderer, right_m=SHIFT_M))
+frozen_renderer = partial(_made, fault=partial(StaleRenderer, age_us=None))
+late_renderer = partial(_made, fault=partial(StaleRenderer, age_us=LATE_US))

@@ -112,9 +112,9 @@ class WeatherRenderer(Renderer):
         return {**self.base.facts(), "environment": asdict(self.scenario.environment)}
 
     def _shown(self, request: RenderRequest, frame: Frame) -> Frame:
-        if frame.depth is None and self.is_clear:
-            return frame
         if frame.depth is None:
+            if self.is_clear:
+                return frame
             raise RendererError(
                 f"weather over {type(self.base).__name__}: its frame has no depth",
                 "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
