@@ -2,6 +2,8 @@
 learn from.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from alpasim_plugin.lab.training.demonstrations import (
     DEMONSTRATIONS_FILE,
     DemonstrationRecipe,
     Demonstrations,
+    common_views,
     read_demonstrations,
     write_demonstrations,
 )
@@ -19,10 +22,12 @@ from alpasim_plugin.lab.training.perturbed_rollouts import (
     perturbed_rollouts,
     turning_lines,
 )
-from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask
+from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, start_from_front
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
+from policies.conformance import canned_scenario
+from policies.learned import WEIGHTS
 from policies.learned_input import COMMANDS
-from policies.learned_net import LearnedNet
+from policies.learned_net import LearnedNet, load_net
 from scenarios.load import load_scenario
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
@@ -71,6 +76,26 @@ def test_sample_has_a_frame_a_state_and_a_target(root):
         for x in (a["yaw"], a["headings"][:, -1])
     )
     assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
+
+
+def test_scene_with_side_cameras_has_three_views_and_the_network_begins_as_the_front_one(
+    scenario, root
+):
+    sides = canned_scenario().cameras[1:]
+    three = replace(scenario, cameras=(*scenario.cameras, *sides))
+    write_demonstrations(three, root / "three" / "lead_000", QUICK, 0)
+    (demonstrations,) = read_demonstrations(root, "three")
+    assert [view.name for view in demonstrations.views] == ["front", "left", "right"]
+    assert len({len(frames) for frames in demonstrations.frames}) == 1
+    with pytest.raises(InputError):
+        common_views([demonstrations, *read_demonstrations(root, "train")])
+    net, front = LearnedNet(0, demonstrations.views), load_net(WEIGHTS)
+    start_from_front(net, front)
+    batch = PolicyTask(net, [demonstrations], PolicyRecipe(batch=4)).batch(0)
+    with torch.inference_mode():
+        heading = net(batch.images, batch.state, batch.command).heading
+        wanted = front(batch.images[:1], batch.state, batch.command).heading
+    torch.testing.assert_close(heading, wanted, atol=1e-5, rtol=1e-5)
 
 
 def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):

@@ -6,7 +6,9 @@ import itertools
 from dataclasses import fields
 
 import pytest
+import yaml
 
+from alpasim_plugin.core.geometry import speeds
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES
 from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
 from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, UNSEEN_DAMAGE
@@ -40,6 +42,22 @@ def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training():
     }
     assert labels["test-unseen"] - labels["train"] == {"other"}
     assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
+
+
+@pytest.mark.parametrize("family", ["cross_left", "cross_right"])
+def test_the_expert_gives_way_to_who_comes_from_a_side(family, tmp_path):
+    """Of five drawn junctions the log slows down in some, for one who comes from the named side."""
+    slowed = 0
+    for seed in range(5):
+        spec = draw_spec("three/train", family, f"s{seed}", seed, 9.0)
+        assert [camera["name"] for camera in spec["cameras"]] == ["front", "left", "right"]
+        for actor in spec["actors"]:
+            assert (actor["points"][0][2] > 0) == (family == "cross_left")
+        path = tmp_path / f"{seed}.yaml"
+        path.write_text(yaml.safe_dump(spec))
+        driven = speeds(load_scenario(path).ego_log)
+        slowed += driven.min() < 0.6 * driven[0]
+    assert slowed >= 1
 
 
 def test_every_unseen_scene_is_damaged_beyond_some_range_of_training():
