@@ -256,7 +256,7 @@ class _Actor(Part):
     label: Label = field("Class of road user.", "car")
     size_m: tuple[Side, Side, Side] | None = field("Length, width, height; none: as usual.", None)
     appearance: str | None = field(
-        "Gaussian file in the frame of its box, such as an actors/*.ply of an imported drive; none: built.",
+        "Gaussian file in the frame of its box; none: built.",
         None,
     )
 
