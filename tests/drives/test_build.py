@@ -121,7 +121,7 @@ def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
     assert run_command(command) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["scenario"] == str(tmp_path / "out/scenario.yaml")
-    assert any("OpenGL" in note for note in told["notes"])
+    assert any("opengl" in note for note in told["notes"])
     assert told["held-out"]["psnr_db"] > 5
     assert "## What is missing or assumed" in (tmp_path / "out/quality.md").read_text()
 
