@@ -113,8 +113,10 @@ def test_the_leaders_of_many_drivers_are_those_of_each():
         xy[:20, 1] = random.normal(0, 3, 20)
         velocity, line = random.normal(0, 8, (count, 2)), random.integers(0, 2, 12)
         front, horizon = random.uniform(-5, 120, 12), random.uniform(20, 120, 12)
-        half, own = random.uniform(0.4, 1.3, 12), random.integers(0, count, 12)
+        half, own = random.uniform(0.4, 1.3, 12), np.full(12, -1)
         everybody = bodies_from(xy, yaw, boxes, velocity)
+        first = find_leaders(Lines(paths), line, front, half, everybody, horizon, own)
+        own = np.array([leader.index for leader in first])  # so that leaving it out matters
         found = find_leaders(Lines(paths), line, front, half, everybody, horizon, own)
         for k, leader in enumerate(found):
             others = xy.copy()
