@@ -18,6 +18,8 @@ from alpasim_plugin.fixers.warp import (
     VALID,
     RecordedImage,
     WarpTarget,
+    on_boxes,
+    place_boxes,
     warp,
 )
 
@@ -107,6 +109,25 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground():
     aside = np.ones(depth.shape, bool)
     aside[rear] = False
     assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
+
+
+@pytest.mark.parametrize(("share", "is_free"), [(0.3, False), (0.5, True)])
+def test_a_surface_much_nearer_than_the_road_is_no_road(share, is_free):
+    T, depth, _ = street(0.0)
+    found = ground_hypothesis(WarpTarget(K, T, share * depth, NOBODY, {}), rig(0.0))
+    assert (found > 0).any() == is_free
+
+
+def test_a_box_around_or_beside_the_camera_is_seen_where_it_is():
+    def seen(y, width):
+        place = {"car": se2(0.0, y, 0.0, 0.75)}
+        box = {"car": Box(20.0, width, 9.0)}
+        return on_boxes((HEIGHT, WIDTH), place_boxes((HEIGHT, WIDTH), K, FORWARD, place, box).seen)
+
+    assert seen(0.0, 2.0).all()
+    beside = seen(2.0, 2.0)  # from 1 m to the left on, to 10 m ahead
+    assert beside[:, :25].all()
+    assert not beside[:, 28:].any()
 
 
 def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road():
