@@ -46,7 +46,7 @@ class SnowCover:
         projected = local[is_seen] @ view.K.T
         pixels = projected[..., :2] / projected[..., 2:] - 0.5
         corners = np.rint(16 * np.clip(pixels, -1e5, 1e5)).astype(np.int32)
-        cover = np.full(view.ground.shape, BESIDE, np.float32)
+        cover: F32 = np.full(view.ground.shape, BESIDE, np.float32)
         for quad, share in zip(corners, self.shares[is_seen].tolist(), strict=True):
             cv2.fillConvexPoly(cover, quad, share, cv2.LINE_8, SUBPIXEL_BITS)
         return view.ground * cv2.GaussianBlur(cover, (0, 0), SOFT_WIDTHS * cover.shape[1])
