@@ -105,6 +105,7 @@ SIDE_FAMILIES: Mapping[str, Family] = {
     "turn_left": partial(_junction, turn="left", sides=("left", "right")),
     "merge": _merge,
 }
-THREE_FAMILIES: Mapping[str, Family] = SIDE_FAMILIES | {
-    name: KNOWN_FAMILIES[name] for name in ("street", "long_bend", "junction_turn", "avenue")
+THREE_FAMILIES: Mapping[str, Family] = {
+    **SIDE_FAMILIES,
+    **{name: KNOWN_FAMILIES[name] for name in ("street", "long_bend", "junction_turn", "avenue")},
 }
