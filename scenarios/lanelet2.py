@@ -385,7 +385,7 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
         (line, replace(stop, head=head))
         for (line, ref), keys in held.items()
         for stop in [_stop(osm, line, ref, [lanes[key] for key in keys])]
-        for head in _lamps(osm, osm.rules[ref], stop) or [None]
+        for head in _lamps(osm, osm.rules[ref], stop)
     ]
     if not signals:
         return ()
@@ -398,18 +398,18 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
     )
 
 
-def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64]:
+def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64 | None]:
     """Return the middle of the lamps of each light of an element: a way is their lower edge, in
-    maps without heights on the ground.
+    maps without heights on the ground; None alone where the element names no light.
     """
-    middles = []
+    middles: list[F64 | None] = []
     for way in rule.of("refers", "way"):
         middle = osm.line(osm.nodes(way)).mean(axis=0)
         with parsing(f"{osm.path}, way {way}, height", "give a number of metres"):
             middle[2] += float(osm.items["way"][way].tags.get("height", LAMPS_M)) / 2
         middle[2] = max(middle[2], float(stop.stop[:, 2].mean()) + LOWEST_HEAD_M)
         middles.append(middle)
-    return middles
+    return middles or [None]
 
 
 def _give_way(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Signal, ...]:

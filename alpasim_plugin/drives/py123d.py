@@ -166,7 +166,7 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
 
 def _film(path: Path) -> list[bytes]:
     """Return the frames of a film as JPEG."""
-    frames = []
+    frames: list[bytes] = []
     film = cv2.VideoCapture(str(path))
     while True:
         is_read, image = film.read()
