@@ -65,20 +65,3 @@ def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, 
         strict=True,
     ):
         assert torch.allclose(one, other, atol=2e-3)
-
-
-def test_weights_over_all_magnitudes_blend_as_in_float64():
-    weight = torch.linspace(-100, 59, 8 * 8 * 4).view(1, 1, 8, 8, 4)
-    draw = torch.Generator().manual_seed(5)
-    repaired, images = torch.rand(1, 16, 16, 3, generator=draw), recordings(1, 1, 16, 16)
-    heads = BlendHeads(weight, torch.zeros(1, 1, 8, 8, 2), torch.zeros(1, 1, 8, 8, 12))
-    out, recorded = CPU.blend(repaired, images, heads, 1)
-    exact = mix(
-        sources_of(
-            repaired.double(),
-            in_floats(images).double(),
-            BlendHeads(*(part.double() for part in heads)),
-        )
-    )
-    assert torch.allclose(out.double(), exact[0], atol=1e-6)
-    assert torch.allclose(recorded.double(), exact[1], atol=1e-6)

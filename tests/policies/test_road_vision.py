@@ -199,33 +199,3 @@ def test_track_needs_three_sightings_and_ends_after_nine_misses():
         track = track_obstacle(track, None, 0.0, 0.1)
         assert track is not None
     assert track_obstacle(track, None, 0.0, 0.1) is None
-
-
-def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure():
-    fresh = start(0.0, 0.0, 0.0)
-    both = update(fresh, paint_of(0, 0, 0, 3.5), np.ones(48))
-    one = update(fresh, paint_of(0, 0, 0, 3.5, sides=(1,)), np.ones(24))
-    blind = fresh
-    for _ in range(20):
-        blind = predict(blind, 1.0, 0.0, 0.0)
-    at = np.array([5.0])
-    assert both.sigma(at)[0] < one.sigma(at)[0] < fresh.sigma(at)[0] < blind.sigma(at)[0]
-    assert blind.blind_m == pytest.approx(20.0)
-
-
-def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of_two():
-    left, right = paint_of(0.4, 0.05, 0.01, 3.4), paint_of(-3.0, 0.05, 0.01, 3.4)
-    both = PaintPoints(
-        *(
-            np.concatenate([getattr(left, f), getattr(right, f)])
-            for f in ("x_m", "y_m", "strength", "sigma_m")
-        )
-    )
-    ones = np.ones(len(both.x_m))
-    for guess, truth in ((0.0, 0.4), (-3.2, -3.0)):
-        found = search(both, ones, guess, 0.0, 0.0)
-        assert found is not None
-        x = np.array([6.0, 10.0, 18.0])
-        assert np.allclose(
-            settled(both, found).centre(x), truth + 0.05 * x + 0.01 * x**2 / 2, atol=0.1
-        )

@@ -17,7 +17,6 @@ from alpasim_plugin.fixers.network.reference_blend import Sources, mix
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term
 from alpasim_plugin.lab.training.pixel_rollout import (
-    ROAD_USER,
     PixelObjectives,
     PixelSample,
     choice_term,
@@ -147,27 +146,6 @@ def test_terms_are_what_they_are_called():
     assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
 
 
-def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays():
-    net, s = generator(), sample()
-    start = net.start(s.render[:, 0])
-    users = torch.zeros_like(s.opacity, dtype=torch.bool)
-    users[:, :, 4:8, 8:16] = True
-    plain, found = (
-        pixel_losses(net, replace(s, road_users=which), start, PixelObjectives(0, 1, 0), None)
-        for which in (None, users)
-    )
-    error = (found.predictions - s.truth).abs()
-    inside, all_of_them = error[:, :, 4:8, 8:16].mean(), error.mean()
-    share = users.float().mean()
-    expected = (all_of_them + (ROAD_USER - 1) * share * inside) / (1 + (ROAD_USER - 1) * share)
-    torch.testing.assert_close(found.picture, expected)
-    assert not torch.allclose(found.temporal, plain.temporal)
-    everywhere = pixel_losses(
-        net, replace(s, road_users=torch.ones_like(users)), start, PixelObjectives(0, 1, 0), None
-    )
-    torch.testing.assert_close(everywhere.picture, plain.picture)
-
-
 @pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])
 def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
     net, s = generator(), sample()
@@ -183,21 +161,6 @@ def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
     reached = [i for i in range(FRAMES) if bool(gradient[:, i].any())]
     assert len(reached) - 1 == reaches
     assert not found.state.hidden.requires_grad
-
-
-def test_a_redenoised_history_is_the_truth_noised_and_denoised():
-    net, s = generator(), sample()
-    found = pixel_losses(
-        net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None
-    )
-    state = net.start(s.render[:, 0])
-    for i in range(FRAMES):
-        z_1 = pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i])
-        given = (s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state)
-        torch.testing.assert_close(found.predictions[:, i], net(*given, z_1)[0])
-        t = s.t_history[:, i]
-        at = t[:, None, None, None]
-        _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
 
 
 def run_of(steps=4, decay_from=3, variant="V9", **changes):

@@ -141,13 +141,6 @@ def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net, k,
     assert all(g is None or torch.isfinite(g).all() for g in grads)
 
 
-def test_predictions_with_gradient_have_the_values_of_the_rollout(net):
-    for k in (1, 2, 3, 8):
-        result = losses(net, sample(5), TEXT, Objectives(horizon=k), at_w)
-        assert_close(torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0)
-        assert not result.rollout.requires_grad
-
-
 def test_history_of_every_kind_is_what_its_name_says(net):
     s = sample()
     with torch.no_grad():

@@ -80,29 +80,6 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
     assert seen == set(KINDS)
 
 
-def test_render_and_target_are_relit_by_the_same_levels(root):
-    made = streams(root, shares=StreamShares(1, 0, 0, 0))
-    compared = 0
-    for i in range(0, 120, 4):
-        (episode, at), batch = made.episode_of(0, i), made.update(i)
-        if episode.better or episode.moved_px or episode.grey:
-            continue
-        compared += 1
-        index = there_and_back(
-            episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip)
-        )
-        cut = np.s_[episode.top : episode.top + 32, episode.left : episode.left + 48]
-        for channel, shown in (
-            (episode.sequence.clip.rgb_input, batch.render),
-            (episode.sequence.clip.rgb_gt, batch.target),
-        ):
-            raw = channel[index[0]][cut][:, ::-1] if episode.flip else channel[index[0]][cut]
-            wanted = np.stack([episode.levels[raw[..., c], c] for c in range(3)])
-            np.testing.assert_array_equal(shown[0, 0].numpy(), wanted)
-        assert (np.diff(episode.levels, axis=0) >= 0).all()
-    assert compared > 3
-
-
 def test_held_out_video_is_never_shown(root):
     made = streams(root, shares=StreamShares(0, 0, 0.5, 0.5))
     shown = {made.episode_of(slot, i)[0].sequence.folder for slot in range(3) for i in range(60)}
