@@ -99,7 +99,7 @@ class CapturedFunction:
         self._graph = torch.cuda.CUDAGraph()
         self._lock = Lock()
         with torch.cuda.device(device):
-            main, side = torch.cuda.current_stream(), torch.cuda.Stream()
+            main, side = torch.cuda.current_stream(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
             side.wait_stream(main)
             with torch.cuda.stream(side):  # libraries choose their kernels in the first calls
                 for _ in range(WARM_UP):

@@ -65,7 +65,7 @@ def carry_on_device(
         target: The view, whose depth is a tensor.
         T_world_rig: ``(4, 4)`` of a rig near the view.
     """
-    depth: Tensor = target.depth
+    depth: Tensor = target.depth  # type: ignore[assignment]  # a tensor here
     rays = _rays(depth)
     on_ground = _ground_depth(rays, target, T_world_rig)
     by_depth = torch.stack([_warp(one, one.depth, rays, target, depth, np.inf) for one in images])
@@ -123,7 +123,7 @@ def _warp(
     points = rays * torch.where(depth > 0, depth, INFINITY_M)
     there = _turned(T_then_camera[:, :3] @ np.linalg.inv(target.K), points)
     there += _column(T_then_camera[:, 3], points)
-    boxes = zip(placed.names, *placed.seen[:3], strict=True) if depth is target.depth else ()
+    boxes = zip(placed.names, *placed.seen[:3], strict=True) if depth is target.depth else ()  # type: ignore[comparison-overlap]
     for name, ray, eye, (low, high) in reversed(list(boxes)):  # of two boxes the first counts
         local = _turned(ray, points) + _column(eye, points)
         inside = (local >= _column(low, points)) & (local < _column(high, points))

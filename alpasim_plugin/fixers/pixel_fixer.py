@@ -275,7 +275,7 @@ class PixelFixer(Fixer):
             (rgb[b], rgb[b]) if past is None else (past.raw, past.fixed)
             for b, past in enumerate(pasts)
         ]
-        given = GivenFrame(
+        given = GivenFrame(  # type: ignore[call-arg]
             rgb,
             *(torch.stack(parts) for parts in zip(*before, strict=True)),
             *(torch.cat(parts) for parts in zip(*states, strict=True)),
