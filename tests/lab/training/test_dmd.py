@@ -115,7 +115,7 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     net,
 ):
     term = AdversarialTerm(heads=2, inner=8)
-    head, score = AdversarialHead(24, 1, 2, 8, seed=0), ScoreNet(net, TEXT, term.taps)
+    head, score = AdversarialHead(24, 1, 2, 8, seed=0), ScoreNet(net, term.taps)
     x = noise("x", 2, 16, N, 4, 4).requires_grad_(True)
     sigma = torch.tensor([0.2, 0.7])
     condition = torch.zeros(2, 16, N, 4, 4)
