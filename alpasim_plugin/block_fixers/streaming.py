@@ -125,7 +125,7 @@ def channels_to_frames(x: Tensor, parts: int) -> Tensor:
     """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to
     ``(B, parts * T, H, W, C)``.
     """
-    return x.unflatten(-1, (parts, -1)).movedim(-2, 2).flatten(1, 2)
+    return torch.unflatten(x, -1, (parts, -1)).movedim(-2, 2).flatten(1, 2)
 
 
 def spread(x: Tensor) -> Tensor:
@@ -229,7 +229,7 @@ class StreamingDecoder(nn.Module, ABC):
 
     def decode_in_passes(self, step: Step, z: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Apply a step of a decoder to ``latents_per_pass`` latents at a time."""
-        parts = z.to(self.dtype).split(self.latents_of_passes(z.shape[2]), dim=2)
+        parts = torch.split(z.to(self.dtype), self.latents_of_passes(z.shape[2]), dim=2)
         return in_passes(step, state, zip(parts, strict=True))
 
     def decode(self, z: Tensor, **options: Any) -> Tensor:
@@ -263,9 +263,8 @@ class StreamingCodec(StreamingDecoder):
         """Apply a step of an encoder to the frames of ``latents_per_pass`` latents at a time."""
         first = state is None
         latents = self.latents_of_passes(frames.shape[2] // GROUP + first)
-        return in_passes(
-            step, state, zip(frames.split(frame_counts(latents, first), 2), strict=True)
-        )
+        parts = torch.split(frames, frame_counts(latents, first), dim=2)
+        return in_passes(step, state, zip(parts, strict=True))
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode a whole clip.

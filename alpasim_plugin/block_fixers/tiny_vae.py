@@ -162,7 +162,7 @@ class TinyVAE(StreamingCodec):
         b, _, m, h, w = z.shape
         latents = self.latents_of_passes(m)
         frames = frame_counts(latents, state is None)
-        parts = [z.float().split(latents, dim=2)]
+        parts = [torch.split(z.float(), latents, dim=2)]
         if render is not None:
             cover = torch.ones_like(render[:, :1]) if opacity is None else opacity
             for given, channels in ((render, COLOURS), (cover, 1)):
@@ -172,7 +172,7 @@ class TinyVAE(StreamingCodec):
                         f"a render or opacity of shape {list(given.shape)}",
                         f"give that of the frames that come out, {expected}",
                     )
-                parts.append(given.float().split(frames, dim=2))
+                parts.append(torch.split(given.float(), frames, dim=2))
         video, state = in_passes(self._decode_pass, state, zip(*parts, strict=True))
         return video.clamp(-1, 1) if clamp else video, state
 
@@ -207,4 +207,4 @@ class TinyVAE(StreamingCodec):
 
 def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
     """Multiply ``(..., n * 3)`` by one number a pixel ``(..., n)``."""
-    return (colours.unflatten(-1, (-1, COLOURS)) * factor[..., None]).flatten(-2)
+    return (torch.unflatten(colours, -1, (-1, COLOURS)) * factor[..., None]).flatten(-2)

@@ -6,6 +6,7 @@ The laboratory's pages, and what leads to them, are those of `tests/lab/docs`.
 import ast
 import re
 from functools import cache
+from subprocess import DEVNULL, run
 
 import pytest
 
@@ -13,6 +14,7 @@ from tests.docs import commands
 
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+OF_COMMIT = re.compile(r"`python (docs/scripts/\w+\.py)[^`\n]*`\s+at\s+commit\s+(\w{8})")
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
 OF_LAB = re.compile(r"\blab[/.]")  # files and modules of the laboratory
 HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.M)
@@ -78,7 +80,7 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo, pages):
     ]
     missing = []
     for file in [*code, *pages]:
-        mentions = MENTION.findall(file.read_text(encoding="utf-8"))
+        mentions = MENTION.findall(OF_COMMIT.sub("", file.read_text(encoding="utf-8")))
         there = (mention for mention in mentions if not mention.startswith(commands.LAB))
         missing += [
             f"{file.relative_to(repo)}: {mention}"
@@ -86,6 +88,17 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo, pages):
             if not (repo / mention).is_file()
         ]
     assert missing == []
+
+
+def test_studies_that_are_done_are_in_the_commit_that_their_page_names(repo, pages):
+    named = {
+        study for page in pages for study in OF_COMMIT.findall(page.read_text(encoding="utf-8"))
+    }
+    assert named
+    for script, commit in named:
+        if run(["git", "cat-file", "-e", commit], cwd=repo, stderr=DEVNULL).returncode:
+            pytest.skip(f"the history of commit {commit} is not here")
+        assert run(["git", "cat-file", "-e", f"{commit}:{script}"], cwd=repo).returncode == 0
 
 
 def reachable(docs):
@@ -136,7 +149,8 @@ def files_not_there(repo, pages):
     named = re.compile(r"\b([a-z][\w]*(?:/\w+)+\.(?:py|proto))\b")
     missing = []
     for page in pages:
-        code = re.findall(r"`([^`\n]+)`", without_code(page.read_text(encoding="utf-8")))
+        text = OF_COMMIT.sub("", without_code(page.read_text(encoding="utf-8")))
+        code = re.findall(r"`([^`\n]+)`", text)
         files = {file for text in code for file in named.findall(text)}
         missing += [
             f"{page.relative_to(repo)}: {file}"
