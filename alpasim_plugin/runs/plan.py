@@ -18,7 +18,6 @@ from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.log.run_folder.schema import rollout_folder
 from alpasim_plugin.renderers.background import background_note
 from evaluators import resolve_evaluators
@@ -273,8 +272,11 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
                 f"{ref.path} and {loaded[scenario.scene_id][0].path}: both have the scene id {scenario.scene_id!r}",
                 "give one of them another id, or name it once",
             )
-        for actor in scenario.actors:
-            if actor.appearance is not None:
+        shown_by_files = [actor for actor in scenario.actors if actor.appearance is not None]
+        if shown_by_files:
+            from alpasim_plugin.gaussians.scene.build_actors import build_actor  # loads kernels
+
+            for actor in shown_by_files:
                 build_actor(actor, scenario)
         note = background_note(scenario)
         loaded[scenario.scene_id] = (

@@ -1,7 +1,5 @@
 """How often the interval of `simrun --vary` holds the true boundary, with simulated policies.
 
-    python docs/scripts/boundary_coverage.py
-
 A simulated policy has a boundary of its own in every seed, drawn around the true one, and fails
 below it. With a noise in every drive its outcomes near the boundary are not monotone.
 """
@@ -37,13 +35,8 @@ def search(boundary: float, noise: float, rng: np.random.Generator) -> tuple[Bra
 
 def main() -> None:
     """Print one line a case: spread over seeds, noise of a drive, seeds, and what was found."""
-    for spread_m, noise_m, seeds in (
-        (0.3, 0, 4),
-        (0.3, 0, 10),
-        (1, 0, 4),
-        (1, 0, 10),
-        (0.3, 0.3, 10),
-    ):
+    cases = (0.3, 0, 4), (0.3, 0, 10), (1, 0, 4), (1, 0, 10), (0.3, 0.3, 10)
+    for spread_m, noise_m, seeds in cases:
         held, held_difference, answered, driven, width_m = 0, 0, 0, 0, []
         for number in range(POLICIES):
             rng = stream("boundary", number, f"coverage/{spread_m}/{noise_m}/{seeds}")

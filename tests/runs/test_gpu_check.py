@@ -28,8 +28,8 @@ def test_images_that_differ_fail_the_section():
     same = gpu_check.compared(lambda: image, lambda: image)
     other = gpu_check.compared(lambda: image + 9, lambda: image)
     assert (same["levels"], other["levels"]) == (0, 9)
-    assert gpu_check._judged({"ok": True, "1x1": same})["ok"]
-    assert not gpu_check._judged({"ok": True, "1x1": other})["ok"]
+    assert gpu_check._checked({"ok": True, "1x1": same})["ok"]
+    assert not gpu_check._checked({"ok": True, "1x1": other})["ok"]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")

@@ -1,0 +1,59 @@
+"""Compile the rasteriser's Triton kernels for a GPU that need not be here, and print what they use.
+
+Usage: python docs/scripts/compile_gpu_kernels.py 80 90
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from alpasim_plugin.gaussians.constants import TILE
+from alpasim_plugin.gaussians.raster import triton_kernels as kernels
+from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
+
+CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK}
+TYPES = {
+    "*fp64": ("poses", "camera", "means"),
+    "*fp32": ("factors", "opacities", "extents", "sh_ptr", "records", "depths", "image"),
+    "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
+    "*i64": ("order", "ends"),
+    "fp32": ("near_m",),
+    "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height"),
+    "constexpr": tuple(CONSTANTS),
+}
+
+
+def resources(kernel: Any, capability: int) -> str:
+    """Return registers and bytes of stack (spilled registers) that a compiled kernel takes."""
+    names = list(inspect.signature(kernel.fn).parameters)
+    type_of = {name: kind for kind, names in TYPES.items() for name in names}
+    source = ASTSource(
+        fn=kernel,
+        signature={name: type_of[name] for name in names},
+        constexprs={name: CONSTANTS[name] for name in names if name in CONSTANTS},
+    )
+    compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))
+    tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(compiled.asm["cubin"])
+        file.flush()
+        command = [str(tool), "--dump-resource-usage", file.name]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    (registers,), (stack,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK"))
+    return f"registers {registers} stack {stack} "
+
+
+if __name__ == "__main__":
+    for wanted in map(int, sys.argv[1:]):
+        for kernel in (kernels.project, kernels.list_tiles, kernels.composite):
+            print(f"{kernel.fn.__name__} sm_{wanted} {resources(kernel, wanted)}")
