@@ -156,6 +156,13 @@ def read_views(path: Path) -> tuple[View, ...]:
     with parsing(path, "train the policy again", f"the entry {VIEWS!r} holds no views"):
         views = pydantic.TypeAdapter(tuple[View, ...]).validate_json(text)
     sizes = [size for view in views for size in (view.width, view.height)]
+    for view in views:
+        if not (
+            np.isfinite(view.yaw_deg)
+            and 1 <= view.focal_px <= MOST_PIXELS
+            and 0 <= view.horizon_row <= view.height
+        ):
+            raise InputError(f"{path}: {view} is no view", "train the policy again")
     if not views or not all(16 <= size <= MOST_PIXELS for size in sizes):
         raise InputError(
             f"{path}: views of {sizes} pixels, width and height in turn",

@@ -181,6 +181,13 @@ def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
     log = drawn.spec.log
     if log is None:
         files = {one.id: _appearance(drawn, i) for i, one in enumerate(drawn.spec.actors)}
+        for i, name in enumerate(files):
+            if files[name] and name not in {actor.actor_id for actor in drive.actors}:
+                raise drawn.document.error(
+                    ("actors", i, "appearance"),
+                    f"{name!r} is a row of several vehicles",
+                    "give each vehicle an entry of its own",
+                )
         return tuple(replace(actor, appearance=files.get(actor.actor_id)) for actor in drive.actors)
     if log.actors == "replay":
         return drive.actors
@@ -198,7 +205,7 @@ def _appearance(drawn: Drawn, i: int) -> str | None:
         return None
     path = document.folder_of(key) / file
     if not os.path.isfile(path):
-        raise document.error(key, f"{path} does not exist", "correct the path")
+        raise document.error(key, f"{path} is no file", "correct the path")
     return str(path)
 
 

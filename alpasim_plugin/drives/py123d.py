@@ -21,6 +21,7 @@ import pyarrow as pa
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.limits import BODY_M
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
 from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
@@ -69,8 +70,12 @@ def read_py123d(folder: Path) -> SourceDrive:
     body, (times, poses) = _modality(folder, EGO, ("timestamp_us", "imu_se3"))
     where = folder / f"{EGO}.arrow"
     with parsing(where, DO_THIS):
+        if times.null_count:
+            raise ValueError("a row without a time")
         table = np.array(poses.to_pylist(), np.float64).reshape(-1, 7)
         ego = checked_trajectory(where, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
+        for name in ("length", "width", "height", "wheel_base"):
+            BODY_M.check(body[name], f"{where}: {name}")
         T_imu_axle, T_imu_centre = _T(body["rear_axle_to_imu_se3"]), _T(body["center_to_imu_se3"])
         vehicle = Vehicle(
             Box(body["length"], body["width"], body["height"]),
@@ -151,17 +156,22 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
         of_ego = interpolate(ego, t_us.clip(ego.t_us[0], ego.t_us[-1]))
         poses = of_ego @ _T(facts["camera_to_imu_se3"])
         film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(data.type) else []
-        pictures = []
+        photographs = []
         for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
             where = f"{path}, row {i}"
             T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), where)
             file, encoded = path, None
             if pa.types.is_string(data.type):
-                file = folder / value.as_py()
+                name_in_log = Path(value.as_py())
+                if name_in_log.is_absolute() or ".." in name_in_log.parts:
+                    raise ValueError(f"row {i}: the path {name_in_log} leads out of the log")
+                file = folder / name_in_log
             else:
                 encoded = memoryview(film[value.as_py()] if film else value.as_buffer())
-            pictures.append(PosedPhotograph(file, lens, T, where, int(t_us[i]), name, {}, encoded))
-    return pictures
+            photographs.append(
+                PosedPhotograph(file, lens, T, where, int(t_us[i]), name, {}, encoded)
+            )
+    return photographs
 
 
 def _film(path: Path) -> list[bytes]:
@@ -196,6 +206,8 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
             where = f"{path}, track {token}"
             track = checked_trajectory(where, times, table[:, 1:4], table[:, 4:8])
             length_m, width_m, height_m = np.median(table[:, 8:11], axis=0).tolist()
+            for side_m in (length_m, width_m, height_m):
+                BODY_M.check(side_m, where)
             box = Box(length_m, width_m, height_m)
             found += actors_of_track(token, LABELS[letter], box, track)
     moving = tuple(one for one in found if not one.is_static and len(one.track) > 1)

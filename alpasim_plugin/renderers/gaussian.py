@@ -58,8 +58,8 @@ class CleanRenderer(Renderer):
 
     def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
         out = self.scene.render(camera, actors, self.threads, self.device)
-        is_complete = self.scenario.background is None
-        return (out.covered(ALL) if is_complete else out).surface()
+        surface = out.surface()  # before what is seen through it counts as opaque
+        return surface.covered(ALL) if self.scenario.background is None else surface
 
 
 def scene_of(scenario: Scenario) -> SceneGraph:

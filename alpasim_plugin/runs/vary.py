@@ -69,7 +69,13 @@ class Sweep:
             raise InputError(f"--vary {text}: an end is not a number", example) from None
         if not -1e12 < low < high < 1e12:
             raise InputError(f"--vary {text}: LOW is not below HIGH", example)
-        return cls(match[1], low, high)
+        sweep = cls(match[1], low, high)
+        if len({sweep.value(point) for point in range(STEPS + 1)}) <= STEPS:
+            raise InputError(
+                f"--vary {text}: its {STEPS + 1} points round to fewer values",
+                "Give a wider range.",
+            )
+        return sweep
 
     def value(self, point: int) -> float:
         """Return the value at a point of the grid; times in microseconds are whole numbers."""
@@ -132,6 +138,8 @@ class BoundarySearch:
                 reached = middle
             else:
                 bad = middle
+        if reached == good:
+            raise self.unreachable[bad]
         return min(reached, good), max(reached, good)
 
     def _is_reachable(self, point: int) -> bool:

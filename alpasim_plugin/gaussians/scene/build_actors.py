@@ -82,7 +82,8 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
     """
     if actor.appearance is not None:
         cloud = read_ply(Path(actor.appearance))
-        _check_size(actor, np.abs(cloud.means))
+        largest = cloud.scales.max(axis=1, keepdims=True, initial=0.0)
+        _check_size(actor, np.maximum(np.abs(cloud.means), largest))
         parts = GaussianCloud.concatenate([cloud, _shadow(actor.box, actor.label)])
         return SceneNode(actor.actor_id, "actor", (Level(0.0, parts),))
     rng = stream(scenario.scene_id, scenario.seed, f"scene/actor/{actor.actor_id}")
@@ -103,6 +104,8 @@ def _check_size(actor: Actor, reach: F64) -> None:
     """Refuse an appearance of which more than `SPILL` lies outside of the actor's box, which is what
     others hit.
     """
+    if not len(reach):
+        raise InputError(f"{actor.appearance}: no Gaussians", "give a file that shows the actor")
     box = actor.box
     half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + OUTSIDE_M
     if (reach > half).any(axis=1).mean() > SPILL:
