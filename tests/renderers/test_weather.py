@@ -25,6 +25,13 @@ RIG = np.eye(4)
 GREY = np.full((60, 100, 3), 120, np.uint8)
 
 
+def test_what_is_less_than_half_opaque_is_sky_in_a_wide_image():
+    wide = "cameras=[{name: front, width: 128, height: 96, hfov_deg: 120}]"
+    scenario = load_scenario("smoke/curve", overrides=[wide])
+    frame = make_renderer("clean", scenario).render(frame_request(scenario, 128, 96))
+    assert frame.depth[1, 64] == 0
+
+
 def depth_of_wall(distance_m):
     return np.full((60, 100), distance_m, np.float32)
 

@@ -34,6 +34,19 @@ def test_an_actor_looks_like_its_file_and_the_scene_is_another_one(tmp_path):
     assert len({one.content_hash for one in (built, made, other)}) == 3
 
 
+def test_a_file_without_gaussians_and_one_for_a_row_of_vehicles_are_refused(tmp_path):
+    written(tmp_path, (2.2, 0.9, 0.7))
+    scene, file = tmp_path / "scene.yaml", tmp_path / "car.ply"
+    write_ply(file, cloud_from_points(np.zeros((0, 3)), np.zeros((0, 3))))
+    with pytest.raises(InputError):
+        build_actors(load_scenario(scene))
+    scene.write_text(
+        scene.read_text().replace("drive, s_m: 20, speeds: [[0, 10]]", "parked, s_m: 20, count: 2")
+    )
+    with pytest.raises(InputError):
+        load_scenario(scene)
+
+
 def test_a_run_refuses_an_appearance_that_is_larger_than_what_is_hit(tmp_path):
     written(tmp_path, (4.0, 0.9, 0.7))
     assert run_command(["--renderer", "clean", "--dry-run", str(tmp_path / "scene.yaml")]) == 2
