@@ -31,7 +31,9 @@ def repeated(plan, root):
     return found
 
 
-@pytest.mark.parametrize("policy", ["constant-velocity", "lane-camera"])
+@pytest.mark.parametrize(
+    "policy", ["constant-velocity", pytest.param("lane-camera", marks=pytest.mark.slow)]
+)
 def test_the_shortest_rollout_is_repeatable(tmp_path, policy):
     found = repeated(plan_of(policy), tmp_path)
     assert found["repeatable"]

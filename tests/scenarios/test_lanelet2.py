@@ -176,6 +176,7 @@ def karlsruhe(shared_data):
     return shared_data / "lanelet2" / "mapping_example.osm"
 
 
+@pytest.mark.slow
 def test_a_real_map_has_what_its_source_states_and_is_driven(karlsruhe):
     made = read_street(SourceFiles(), karlsruhe)
     assert sum(not key.startswith("-") for key in made.lanes) + 8 + 2 + 2 + 17 == 371

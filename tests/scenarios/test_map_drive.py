@@ -249,7 +249,7 @@ def test_the_whole_car_starts_on_the_map(tmp_path):
     assert made.ego_log.xyz[0, 0] + made.world_origin[0] > rear
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_short_road_gives_a_short_route(tmp_path, seed):
     made = scenario(tmp_path, (road("1", section(0, lane(-1)), length=90),), seed=seed)
     assert 20.0 < np.ptp(made.ego_log.xyz[:, 0]) < 90.0
