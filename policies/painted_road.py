@@ -126,14 +126,14 @@ class PaintedRoad:
 
     def colours(self, s_m: F64, offset_m: F64) -> F32:
         """Return the colours ``(N, 3)`` of ground points in road coordinates."""
-        # Numbers of paints are drawn, a quarter of the bytes of colours.
-        paints: list[Colour] = [GRASS, ASPHALT]
+        # Numbers of mark_types are drawn, a quarter of the bytes of colours.
+        mark_types: list[Colour] = [GRASS, ASPHALT]
         on_road = (offset_m > self.road_m[0]) & (offset_m < self.road_m[1])
         index = on_road.astype(np.uint8)
         for line in self.lines:
             paint = on_road & (np.abs(offset_m - line.offset_m) < LINE_WIDTH_M / 2)
             if line.dashed:
                 paint[paint] = np.mod(s_m[paint], PERIOD_M) < DASH_M
-            index[paint] = len(paints)
-            paints.append(line.colour)
-        return np.array(paints, dtype=np.float32)[index]
+            index[paint] = len(mark_types)
+            mark_types.append(line.colour)
+        return np.array(mark_types, dtype=np.float32)[index]

@@ -35,8 +35,8 @@ from alpasim_plugin.core.types import (
     HeightField,
     Lane,
     LaneMap,
+    LaneMarkType,
     LensModel,
-    Paint,
     Trajectory,
     Vehicle,
 )
@@ -46,7 +46,7 @@ from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checke
 
 # Argoverse 2 mark types -> the markings a scene can show. Mixed lines take their solid half; double
 # white is drawn as one line.
-PAINTS: dict[str, Paint] = {
+MARK_TYPES: dict[str, LaneMarkType] = {
     "NONE": "none",
     "UNKNOWN": "unknown",
     "SOLID_WHITE": "solid_white",
@@ -132,8 +132,8 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
                 successors=tuple(str(i) for i in raw.get("successors", ())),
                 left_neighbour=str(raw.get("left_neighbor_id")),
                 right_neighbour=str(raw.get("right_neighbor_id")),
-                left_paint=PAINTS.get(str(raw.get("left_lane_mark_type")), "unknown"),
-                right_paint=PAINTS.get(str(raw.get("right_lane_mark_type")), "unknown"),
+                left_mark_type=MARK_TYPES.get(str(raw.get("left_lane_mark_type")), "unknown"),
+                right_mark_type=MARK_TYPES.get(str(raw.get("right_lane_mark_type")), "unknown"),
                 is_intersection=bool(raw.get("is_intersection")),
             )
         areas = tuple(
@@ -162,7 +162,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
     notes = [
         "road edges are the border of the union of the drivable areas; where the map is cut off, its border is an edge too"
     ]
-    strange = Counter(mark for mark in raw_marks if mark not in PAINTS)
+    strange = Counter(mark for mark in raw_marks if mark not in MARK_TYPES)
     notes += [
         f"{count} lane edges have the mark type {mark!r}: taken as unknown lane markings"
         for mark, count in sorted(strange.items())

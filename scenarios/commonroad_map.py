@@ -15,12 +15,12 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.reading import parsing
-from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint, Signal
+from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
 from scenarios.recorded import near
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
-PAINTS: dict[str, Paint] = {
+MARK_TYPES: dict[str, LaneMarkType] = {
     "solid": "solid_white",
     "broad_solid": "solid_white",
     "solid_solid": "solid_white",
@@ -116,8 +116,12 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
                 successors=tuple(str(s.get("ref")) for s in element.findall("successor")),
                 left_neighbour=neighbours.get("adjacentLeft"),
                 right_neighbour=neighbours.get("adjacentRight"),
-                left_paint=PAINTS.get(str(element.findtext("leftBound/lineMarking")), "unknown"),
-                right_paint=PAINTS.get(str(element.findtext("rightBound/lineMarking")), "unknown"),
+                left_mark_type=MARK_TYPES.get(
+                    str(element.findtext("leftBound/lineMarking")), "unknown"
+                ),
+                right_mark_type=MARK_TYPES.get(
+                    str(element.findtext("rightBound/lineMarking")), "unknown"
+                ),
                 is_intersection="intersection" in types,
                 speed_limit_mps=_speed_limit(element, signs),
             )

@@ -25,7 +25,7 @@ import scipy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, se2, transform_points
 from alpasim_plugin.core.reading import parsing, some_of
-from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Signal
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
 from scenarios.map_lines import is_left_of, rails
 from scenarios.map_route import Spot
@@ -304,8 +304,8 @@ def _lane(
         centre_line(*lines),
         *lines,
         kind,
-        left_paint=_paint(osm.items["way"][left.way]),
-        right_paint=_paint(osm.items["way"][right.way]),
+        left_mark_type=_mark_type(osm.items["way"][left.way]),
+        right_mark_type=_mark_type(osm.items["way"][right.way]),
         speed_limit_mps=limit_mps,
     )
     even_left, even_right = rails(lane)
@@ -334,7 +334,7 @@ def _linked(
     }
 
 
-def _paint(way: Item) -> Paint:
+def _mark_type(way: Item) -> LaneMarkType:
     """Return the lane marking of a bound; colours other than yellow are white."""
     kind, subtype = way.tags.get("type"), way.tags.get("subtype", "")
     if kind in UNMARKED:

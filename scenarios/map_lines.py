@@ -79,7 +79,7 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     centre, left, right = (
         laid(path.at(s, side * LANE_M / 2)[0], field) for side in (0.0, 1.0, -1.0)
     )
-    lane = Lane("corridor", centre, left, right, left_paint="none", right_paint="none")
+    lane = Lane("corridor", centre, left, right, left_mark_type="none", right_mark_type="none")
     return LaneMap({"corridor": lane})
 
 

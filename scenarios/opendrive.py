@@ -22,7 +22,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import densify, project
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import parsing, some_of
-from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
+from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType
 from scenarios.map_lines import bordered
 from scenarios.map_route import Spot
 from scenarios.opendrive_road import (
@@ -400,7 +400,7 @@ def _section(
         # traffic on the right.
         order = -1 if road.left_hand != lane.reversed else 1
         edges = (near, far)[::order]
-        paints = (_paint(inner_mark), _paint(lane.mark))[::order]
+        mark_types = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
         beside_ids = beside_ids[::order]
         left, right = (edge[::turn] for edge in edges)
         out.append(
@@ -412,8 +412,8 @@ def _section(
                 kind,
                 left_neighbour=beside_ids[0],
                 right_neighbour=beside_ids[1],
-                left_paint=paints[0],
-                right_paint=paints[1],
+                left_mark_type=mark_types[0],
+                right_mark_type=mark_types[1],
                 is_intersection=road.junction != "-1",
                 speed_limit_mps=road.limit_mps(section.s_m),
             )
@@ -442,7 +442,7 @@ def _stations(road: Road, section: Section) -> F64:
     return np.concatenate([*parts, [np.nextafter(section.end_m, section.s_m)]])
 
 
-def _paint(mark: tuple[str, str] | None) -> Paint:
+def _mark_type(mark: tuple[str, str] | None) -> LaneMarkType:
     """Return the kind of a road mark; colours other than yellow are white."""
     if mark is None or mark[0] == "none":
         return "none"

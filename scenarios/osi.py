@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
-from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Paint, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
 from scenarios.osi_messages import UNREAD, ground_truths
@@ -218,7 +218,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         edge = _along(centre, np.concatenate([np.zeros((0, 3)), *points]) - origin)
         if len(edge) < 2:
             return None
-        sides.append((near(where, edge), _paint(found[0])))
+        sides.append((near(where, edge), _mark_type(found[0])))
     ahead = [str(pair.successor_lane_id.value) for pair in facts.lane_pairing]
     behind = [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing]
     beside = [
@@ -230,7 +230,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         ahead, beside = behind, beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):
         sides = sides[::-1]
-    (left, left_paint), (right, right_paint) = sides
+    (left, left_mark_type), (right, right_mark_type) = sides
     if min(float(arc_lengths(edge)[-1]) for edge in (left, right)) <= 0.0:
         return None
     return Lane(
@@ -242,8 +242,8 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         successors=tuple(dict.fromkeys(ahead)),
         left_neighbour=beside[0],
         right_neighbour=beside[1],
-        left_paint=left_paint,
-        right_paint=right_paint,
+        left_mark_type=left_mark_type,
+        right_mark_type=right_mark_type,
     )
 
 
@@ -260,7 +260,7 @@ def _along(centre: F64, points: F64) -> F64:
     return line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
 
 
-def _paint(border: Any) -> Paint:
+def _mark_type(border: Any) -> LaneMarkType:
     """Return the lane marking of a boundary; colours other than yellow are white."""
     yellow = border.classification.color == YELLOW
     if border.classification.type == SOLID:
@@ -279,8 +279,8 @@ def _through(area: str, begin: Lane, end: Lane) -> Lane:
         left,
         right,
         successors=(end.lane_id,),
-        left_paint="none",
-        right_paint="none",
+        left_mark_type="none",
+        right_mark_type="none",
         is_intersection=True,
     )
 

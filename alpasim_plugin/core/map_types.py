@@ -12,7 +12,7 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 LEVEL_M = 3.0  # a stop line farther above or below belongs to another road
 
-Paint = Literal[
+LaneMarkType = Literal[
     "none",
     "solid_white",
     "dashed_white",
@@ -44,8 +44,8 @@ class Lane:
     successors: tuple[str, ...] = ()
     left_neighbour: str | None = None
     right_neighbour: str | None = None
-    left_paint: Paint = "unknown"
-    right_paint: Paint = "unknown"
+    left_mark_type: LaneMarkType = "unknown"
+    right_mark_type: LaneMarkType = "unknown"
     is_intersection: bool = False
     speed_limit_mps: float | None = None
 
@@ -55,7 +55,7 @@ class Marking:
     """A lane marking that the map gives as a line of its own, not as a lane's edge."""
 
     xyz: F64  # (N, 3) metres, world
-    paint: Paint
+    mark_type: LaneMarkType
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from alpasim_plugin.core.map_types import Box as Box
 from alpasim_plugin.core.map_types import HeightField as HeightField
 from alpasim_plugin.core.map_types import Lane as Lane
 from alpasim_plugin.core.map_types import LaneMap as LaneMap
+from alpasim_plugin.core.map_types import LaneMarkType as LaneMarkType
 from alpasim_plugin.core.map_types import Marking as Marking
-from alpasim_plugin.core.map_types import Paint as Paint
 from alpasim_plugin.core.map_types import Route as Route
 from alpasim_plugin.core.map_types import Signal as Signal
 from alpasim_plugin.core.metric_types import Aggregation as Aggregation

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
-from alpasim_plugin.core.types import F64, I64, Lane, LaneMap, Paint
+from alpasim_plugin.core.types import F64, I64, Lane, LaneMap, LaneMarkType
 
 SAME_EDGE_M = 0.45  # edges of two lanes nearer than this are one edge
 SAMPLE_M = 2.0
@@ -30,7 +30,7 @@ class _Edge:
     lane_id: str
     side: int  # +1 left, -1 right, 0 a marking line
     line: F64  # (N, 3) metres, world
-    paint: Paint
+    mark_type: LaneMarkType
     in_junction: bool
 
 
@@ -79,7 +79,7 @@ class _Edges:
         ]
 
 
-def marking_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
+def marking_lines(lane_map: LaneMap) -> list[tuple[F64, LaneMarkType]]:
     """Return what is painted along lanes, each place once.
 
     Returns:
@@ -90,7 +90,7 @@ def marking_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     edges = _Edges(lane_map)
     taken: set[int] = set()
     for i, edge in enumerate(edges.all):
-        if edge.paint in ("none", "unknown"):
+        if edge.mark_type in ("none", "unknown"):
             continue
         samples = edges.beside(i)
         covered = np.mean(
@@ -98,7 +98,7 @@ def marking_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
         )
         if covered <= COVERED:
             taken.add(i)
-    return [(edges.all[i].line, edges.all[i].paint) for i in sorted(taken)]
+    return [(edges.all[i].line, edges.all[i].mark_type) for i in sorted(taken)]
 
 
 def with_default_markings(lane_map: LaneMap) -> LaneMap:
@@ -111,34 +111,36 @@ def with_default_markings(lane_map: LaneMap) -> LaneMap:
     """
     if lane_map.markings:
         markings = tuple(
-            replace(m, paint="solid_white") if m.paint == "unknown" else m
+            replace(m, mark_type="solid_white") if m.mark_type == "unknown" else m
             for m in lane_map.markings
         )
         return replace(lane_map, markings=markings)
     edges = _Edges(lane_map)
-    chosen: dict[tuple[str, int], Paint] = {}
+    chosen: dict[tuple[str, int], LaneMarkType] = {}
     for i, edge in enumerate(edges.all):
-        if edge.paint == "unknown":
+        if edge.mark_type == "unknown":
             chosen[edge.lane_id, edge.side] = "none" if edge.in_junction else _default(edges, i)
     lanes = {name: _marked(lane, chosen) for name, lane in lane_map.lanes.items()}
     return replace(lane_map, lanes=lanes)
 
 
-def _default(edges: _Edges, i: int) -> Paint:
+def _default(edges: _Edges, i: int) -> LaneMarkType:
     """Return the marking of an unknown edge: that of a known one along it, else what its neighbours
     suggest.
     """
     samples = edges.beside(i)
-    for paint in (
+    for mark_type in (
         "none",
-        *dict.fromkeys(edge.paint for edge in edges.all if edge.paint not in ("none", "unknown")),
+        *dict.fromkeys(
+            edge.mark_type for edge in edges.all if edge.mark_type not in ("none", "unknown")
+        ),
     ):
         known = [
-            any(edges.all[j].paint == paint and abs(cosine) > ALONG for j, cosine in here)
+            any(edges.all[j].mark_type == mark_type and abs(cosine) > ALONG for j, cosine in here)
             for here in samples
         ]
         if np.mean(known) > COVERED:
-            return paint
+            return mark_type
     beside = [(edges.all[j], cosine) for here in samples for j, cosine in here]
     shared = sum(other.side == -edges.all[i].side and cosine > ALONG for other, cosine in beside)
     opposing = sum(other.side == edges.all[i].side and cosine < -ALONG for other, cosine in beside)
@@ -148,19 +150,21 @@ def _default(edges: _Edges, i: int) -> Paint:
 
 
 def _edges_of(lane_map: LaneMap) -> list[_Edge]:
-    out = [_Edge("", 0, marking.xyz, marking.paint, False) for marking in lane_map.markings]
+    out = [_Edge("", 0, marking.xyz, marking.mark_type, False) for marking in lane_map.markings]
     for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
-        for side, line, paint in (
-            (1, lane.left, lane.left_paint),
-            (-1, lane.right, lane.right_paint),
+        for side, line, mark_type in (
+            (1, lane.left, lane.left_mark_type),
+            (-1, lane.right, lane.right_mark_type),
         ):
             if line is not None and lane.kind != "parking":
-                out.append(_Edge(lane.lane_id, side, line, paint, lane.is_intersection))
+                out.append(_Edge(lane.lane_id, side, line, mark_type, lane.is_intersection))
     return out
 
 
-def _marked(lane: Lane, chosen: dict[tuple[str, int], Paint]) -> Lane:
-    left = chosen.get((lane.lane_id, 1), lane.left_paint)
+def _marked(lane: Lane, chosen: dict[tuple[str, int], LaneMarkType]) -> Lane:
+    left = chosen.get((lane.lane_id, 1), lane.left_mark_type)
     return replace(
-        lane, left_paint=left, right_paint=chosen.get((lane.lane_id, -1), lane.right_paint)
+        lane,
+        left_mark_type=left,
+        right_mark_type=chosen.get((lane.lane_id, -1), lane.right_mark_type),
     )

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Paint
+from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Marking
 from alpasim_plugin.world.path import offset_line, smoothstep
 
 Turn = Literal["left", "straight", "right"]
@@ -32,9 +32,9 @@ class Profile:
     shoulder_m: float = 0.0  # paved strip outside the outer lanes
     parking_m: float = 0.0  # parking strip outside the outer lanes, instead of the shoulder
     speed_limit_mps: float | None = None
-    centre_paint: Paint = "double_yellow"
-    lane_paint: Paint = "dashed_white"
-    edge_paint: Paint = "solid_white"
+    centre_paint: LaneMarkType = "double_yellow"
+    lane_mark_type: LaneMarkType = "dashed_white"
+    edge_mark_type: LaneMarkType = "solid_white"
 
     @property
     def strip_m(self) -> float:
@@ -250,8 +250,8 @@ def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profil
                     left,
                     right,
                     kind,
-                    left_paint="none",
-                    right_paint="none",
+                    left_mark_type="none",
+                    right_mark_type="none",
                     speed_limit_mps=limit,
                 )
             )
@@ -270,7 +270,7 @@ def _ring(left: F64, right: F64) -> F64:
     return np.concatenate([left, right[::-1], left[:1]])
 
 
-def inner_paint(profile: Profile) -> Paint:
+def inner_mark_type(profile: Profile) -> LaneMarkType:
     """Return the lane marking left of the innermost lane."""
     return "solid_yellow" if profile.backward == 0 or profile.median_m > 0 else profile.centre_paint
 
@@ -289,8 +289,8 @@ def _lane(
         lines[f"{side}{k + 1}"],
         left_neighbour=f"{name}_{side}{k - 1}" if k > 0 else None,
         right_neighbour=None if outermost else f"{name}_{side}{k + 1}",
-        left_paint=inner_paint(profile) if k == 0 else profile.lane_paint,
-        right_paint=profile.edge_paint if outermost else profile.lane_paint,
+        left_mark_type=inner_mark_type(profile) if k == 0 else profile.lane_mark_type,
+        right_mark_type=profile.edge_mark_type if outermost else profile.lane_mark_type,
         speed_limit_mps=profile.speed_limit_mps,
     )
 
@@ -345,15 +345,15 @@ def build_taper(
         right[-1] = lines[f"f{n}"][-1]
     strip = _add_lanes(draft, name, lines, profile)
     outermost = draft.lanes[strip.forward[-1]]  # the slanting lane crosses its edge
-    draft.lanes[outermost.lane_id] = replace(outermost, right_paint="dashed_white")
+    draft.lanes[outermost.lane_id] = replace(outermost, right_mark_type="dashed_white")
     slant = draft.add(
         Lane(
             f"{name}_{kind}",
             centre,
             left,
             right,
-            left_paint="none",
-            right_paint=profile.edge_paint,
+            left_mark_type="none",
+            right_mark_type=profile.edge_mark_type,
             speed_limit_mps=profile.speed_limit_mps,
         )
     )

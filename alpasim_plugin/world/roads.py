@@ -116,7 +116,7 @@ def _grow_intersection(
                 if a.name == element.turn and b.name == "entry":
                     backward[j] = lane
     _kerbs(draft, arms)
-    _paint(draft, element, arms, [lane for lane, _ in forward.values()])
+    _mark_type(draft, element, arms, [lane for lane, _ in forward.values()])
     tip.forward, tip.backward, tip.after_junction = (), (), True
     taken = [forward.get(i, (None, None)) for i in range(len(arriving))]
     return Stretch(
@@ -158,8 +158,8 @@ def _connector(name: str, a: Arm, b: Arm, i: int, j: int) -> Lane:
         left,
         right,
         is_intersection=True,
-        left_paint="none",
-        right_paint="none",
+        left_mark_type="none",
+        right_mark_type="none",
         speed_limit_mps=a.profile.speed_limit_mps,
     )
 
@@ -178,7 +178,7 @@ def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
     draft.drivable_areas.append(np.concatenate([*ring, ring[0][:1]]))
 
 
-def _paint(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list[str]) -> None:
+def _mark_type(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list[str]) -> None:
     for arm in arms:
         outward = np.array([np.cos(arm.heading_rad), np.sin(arm.heading_rad), 0.0])
         left = arm.joint["left"]

@@ -94,7 +94,7 @@ def drive(steps, parts_at=0, aside_mps=0.0, brake_mps2=0.0, **options):
 
 
 def picture(asked):
-    """Paint stripes that move with the camera: a function of the request alone."""
+    """Draw stripes that move with the camera: a function of the request alone."""
     end = asked.sensor_pose.end_pose.vec
     y, x = np.mgrid[0 : asked.resolution_h, 0 : asked.resolution_w].astype(np.float64)
     waves = [np.sin(x / 4 + end.x * k + end.y) * np.cos(y / 5 + end.y * 3) for k in (1.0, 1.7, 2.3)]
@@ -149,12 +149,12 @@ class StandInRenderer:
         return sensorsim_pb2.LidarRenderReturn(point_xyzs=[1.0, 2.0, 3.0], num_points=1)
 
     def render_rgb(self, asked, context):
-        """Paint one frame."""
+        """Draw one frame."""
         self.calls.append("render_rgb")
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self._image(asked, context))
 
     def batch_render_rgb(self, asked, context):
-        """Paint one frame a camera."""
+        """Draw one frame a camera."""
         self.calls.append("batch_render_rgb")
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
         images = [self._image(i.request, context) for i in asked.items]
@@ -165,7 +165,7 @@ class StandInRenderer:
         return sensorsim_pb2.BatchRGBRenderReturn(items=made)
 
     def render_aggregated(self, asked, context):
-        """Paint frames, with bytes for the driver."""
+        """Draw frames, with bytes for the driver."""
         rgb = [
             sensorsim_pb2.RGBRenderReturn(image_bytes=self._image(r, context))
             for r in asked.rgb_requests

@@ -37,13 +37,14 @@ SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135],
 
 def road(aside_m=0.0, dashed=False):
     """A straight road along x with three lines; the middle of its right lane is y = 0."""
-    paints = ("solid_white", "dashed_white" if dashed else "solid_yellow", "solid_white")
+    mark_types = ("solid_white", "dashed_white" if dashed else "solid_yellow", "solid_white")
     lines = [
         np.array([[-10.0, y + aside_m, 0.0], [150.0, y + aside_m, 0.0]])
         for y in (5.25, 1.75, -1.75)
     ]
     return LaneMap(
-        {}, markings=tuple(Marking(line, paint) for line, paint in zip(lines, paints, strict=True))
+        {},
+        markings=tuple(Marking(line, paint) for line, paint in zip(lines, mark_types, strict=True)),
     )  # type: ignore[arg-type]
 
 

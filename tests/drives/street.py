@@ -43,13 +43,13 @@ class Street:
         """Return the road's height at stations."""
         return self.bow_m * np.sin(np.pi * np.clip(x, -10, 40) / 30)
 
-    def pose(self, x, aside=0.0):
+    def pose(self, x, lateral_m=0.0):
         """Return ``T_world_camera`` at a station; the world is x along, y left, z up."""
         T = np.eye(4)
         slope = float(self.ground(np.array(x + 0.5)) - self.ground(np.array(x - 0.5)))
         c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
         T[:3, :3] = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ RIG_FROM_CAMERA
-        T[:3, 3] = x, -aside, float(self.ground(np.array(x))) + CAMERA_M
+        T[:3, 3] = x, -lateral_m, float(self.ground(np.array(x))) + CAMERA_M
         return T
 
     def photograph(self, T, bend=None, fisheye=False):
@@ -167,12 +167,12 @@ def write_kitti(folder, street=None, spare_pictures=0, stereo=True):
     """Write the street as a KITTI odometry folder; ``spare_pictures`` have no pose."""
     chosen = street or Street()
     base = 0.54
-    for name, aside in (("image_l", 0.0), ("image_r", base))[: 2 if stereo else 1]:
+    for name, lateral_m in (("image_l", 0.0), ("image_r", base))[: 2 if stereo else 1]:
         (folder / name).mkdir(parents=True)
         for i, x in enumerate(np.arange(COUNT + spare_pictures) * STEP_M):
             cv2.imwrite(
                 str(folder / name / f"{i:06d}.png"),
-                cv2.cvtColor(chosen.photograph(chosen.pose(x, aside)), cv2.COLOR_BGR2GRAY),
+                cv2.cvtColor(chosen.photograph(chosen.pose(x, lateral_m)), cv2.COLOR_BGR2GRAY),
             )
     first = np.linalg.inv(chosen.pose(0.0))
     poses = [first @ chosen.pose(x) for x in stations()]

@@ -35,7 +35,7 @@ def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
     assert all(Path(one.path).is_file() for one in scenario.recording)
     assert scenario.recording[0].exposure == (1.1, 1.0, 0.9)
     (lane,) = scenario.lane_map.lanes.values()
-    assert (lane.left_paint, lane.right_paint) == ("none", "none")
+    assert (lane.left_mark_type, lane.right_mark_type) == ("none", "none")
     assert scenario.cameras[0].name == "front"
     assert (scenario.cameras[0].width % 16, scenario.cameras[0].height % 16) == (0, 0)
     assert any("000024.png" in note for note in scenario.notes)

@@ -114,8 +114,8 @@ def test_contact_with_what_stands_is_reported_apart(imported):
 
     scenario = load_scenario(imported / "scenario.yaml")
     assert scenario.scene.standing == "found"
-    for aside, touched in ((0.0, 0.0), (2.5, 1.0)):
-        log = rollout_along(scenario, aside, box=(np.array([14.0, 2.5]), 1.0))
+    for lateral_m, touched in ((0.0, 0.0), (2.5, 1.0)):
+        log = rollout_along(scenario, lateral_m, box=(np.array([14.0, 2.5]), 1.0))
         values = {
             one.name: one for one in evaluate_collision(log, scenario.scene, preset("strict"))
         }

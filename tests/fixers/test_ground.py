@@ -106,9 +106,9 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground():
     held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}, box), rig(0.0))
     assert (free[22:24, 30:34] > 0).all()
     assert (held[rear] == 0).all()
-    aside = np.ones(depth.shape, bool)
-    aside[rear] = False
-    assert_array_equal(free[aside & (depth < 5)], held[aside & (depth < 5)])
+    elsewhere = np.ones(depth.shape, bool)
+    elsewhere[rear] = False
+    assert_array_equal(free[elsewhere & (depth < 5)], held[elsewhere & (depth < 5)])
 
 
 @pytest.mark.parametrize(("share", "is_free"), [(0.3, False), (0.5, True)])

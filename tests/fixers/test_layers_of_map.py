@@ -11,14 +11,20 @@ from alpasim_plugin.world.markings import marking_lines
 from tests.examples import examples
 
 
-def lane(key, y, left_paint="unknown", right_paint="unknown", reverse=False, **more):
+def lane(key, y, left_mark_type="unknown", right_mark_type="unknown", reverse=False, **more):
     """A straight lane of 3.5 m width along x, driven backwards where asked."""
     x = np.arange(0.0, 61.0, 10.0)
     edges = [np.column_stack([x, np.full(7, y + side), np.zeros(7)]) for side in (1.75, 0.0, -1.75)]
     if reverse:
         edges = [e[::-1] for e in edges[::-1]]
     return Lane(
-        key, edges[1], edges[0], edges[2], left_paint=left_paint, right_paint=right_paint, **more
+        key,
+        edges[1],
+        edges[0],
+        edges[2],
+        left_mark_type=left_mark_type,
+        right_mark_type=right_mark_type,
+        **more,
     )
 
 
@@ -57,7 +63,7 @@ def test_edges_that_cross_are_both_drawn():
         turned.centre @ quarter.T,
         turned.left @ quarter.T + [20.0, -30.0, 0.0],
         None,
-        left_paint="solid_white",
+        left_mark_type="solid_white",
     )
     assert len(drawn(one, two)) == 2
 

@@ -66,8 +66,8 @@ def road_lanes(
             lane_id = f"{name}-{way}{i}"
             known = (
                 {
-                    "left_paint": "double_yellow" if i == 0 else "dashed_white",
-                    "right_paint": "solid_white",
+                    "left_mark_type": "double_yellow" if i == 0 else "dashed_white",
+                    "right_mark_type": "solid_white",
                 }
                 if paint
                 else {}

@@ -93,7 +93,7 @@ def test_dashes_run_on_from_lane_to_lane():
 def test_known_paint_is_believed_and_shared_edges_are_painted_once():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     lanes["r-a0"] = replace(
-        lanes["r-a0"], right_paint="solid_yellow"
+        lanes["r-a0"], right_mark_type="solid_yellow"
     )  # the same place is r-a1's unknown left edge
     strokes, middle = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
@@ -130,7 +130,7 @@ def test_zebra_bars_lie_along_the_road_across_the_walk():
 
 def test_edge_known_to_be_bare_stays_bare():
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
-    lanes["r-a1"] = replace(lanes["r-a1"], left_paint="none")
+    lanes["r-a1"] = replace(lanes["r-a1"], left_mark_type="none")
     _, middle = strokes_of(make_scenario(with_default_markings(LaneMap(lanes)), PATH))
     assert not at(middle, -LANE_M).any()
     assert at(middle, LANE_M).any()

@@ -36,8 +36,8 @@ def recorded_drive(folder, count=9, long_m=60.0):
     model.save(folder / "model", {})
     scenario = with_camera(straight(actors=(parked("obstacle-001", 19.0, -1.8),)), WIDE, HIGH)
     shots = tuple(
-        _photograph(scenario, folder, camera, i, aside)
-        for camera, aside in (("front", 0.0), ("right", -0.5))
+        _photograph(scenario, folder, camera, i, lateral_m)
+        for camera, lateral_m in (("front", 0.0), ("right", -0.5))
         for i in range(count)
     )
     return replace(scenario, model=str(folder / "model"), recording=shots)

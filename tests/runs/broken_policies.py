@@ -72,5 +72,5 @@ class ShiversByTheClock(LogReplay):
 
     def act(self, observation):
         plan = super().act(observation)
-        aside = np.array([0.0, 1e-3 * (time.monotonic_ns() % 11)])
-        return Plan(plan.t_us, plan.times_us, plan.xy + aside, plan.yaw)
+        lateral_m = np.array([0.0, 1e-3 * (time.monotonic_ns() % 11)])
+        return Plan(plan.t_us, plan.times_us, plan.xy + lateral_m, plan.yaw)

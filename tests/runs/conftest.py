@@ -73,7 +73,7 @@ def straight_road():
             line(1.75),
             line(-1.75),
             left_neighbour="left",
-            left_paint="dashed_white",
+            left_mark_type="dashed_white",
         ),
         "left": Lane(
             "left",
@@ -81,7 +81,7 @@ def straight_road():
             line(5.25),
             line(1.75),
             right_neighbour="right",
-            left_paint="solid_white",
+            left_mark_type="solid_white",
         ),
     }
     camera = CameraSpec(

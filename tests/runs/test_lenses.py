@@ -19,7 +19,7 @@ class Directions(Renderer):
         self.asked = []
 
     def render(self, request):
-        """Paint one frame."""
+        """Draw one frame."""
         self.asked.append(request)
         spec = request.camera
         assert spec.lens is None

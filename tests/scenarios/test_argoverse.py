@@ -71,7 +71,10 @@ def test_map_layers_arrive(log):
     lanes = log.lane_map.lanes
     assert lanes["1"].successors == ("2", "999")
     assert [k.kind for k in lanes.values()] == ["vehicle", "vehicle", "bike"]
-    assert (lanes["1"].left_paint, lanes["1"].right_paint) == ("dashed_white", "solid_white")
+    assert (lanes["1"].left_mark_type, lanes["1"].right_mark_type) == (
+        "dashed_white",
+        "solid_white",
+    )
     assert len(log.lane_map.crosswalks[0]) == 5
     assert shapely.Polygon(log.lane_map.crosswalks[0][:, :2]).area == pytest.approx(4 * 16)
 
@@ -107,7 +110,7 @@ def test_unknown_mark_type_and_category_are_noted(tmp_path):
     document["lane_segments"]["1"]["left_lane_mark_type"] = "ZIGZAG"
     rows = cuboids([("a", "UNICORN", CAR, range(3), place(30.0, 5.0, 1.5))])
     log = read_argoverse(write_argoverse(tmp_path / "x", annotations=rows, document=document))
-    assert log.lane_map.lanes["1"].left_paint == "unknown"
+    assert log.lane_map.lanes["1"].left_mark_type == "unknown"
     assert log.actors[0].label == "other"
     assert "1 lane edges have the mark type 'ZIGZAG': taken as unknown lane markings" in log.notes
     assert "1 tracks of the unknown category 'UNICORN' are labelled 'other'" in log.notes

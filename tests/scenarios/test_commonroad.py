@@ -120,7 +120,7 @@ def test_lanelet_attributes_arrive(log):
         "1",
     )
     assert (lanes["1"].speed_limit_mps, lanes["2"].speed_limit_mps) == (13.5, None)
-    assert {k.left_paint for k in lanes.values()} == {"unknown"}
+    assert {k.left_mark_type for k in lanes.values()} == {"unknown"}
     assert any("no line markings" in note for note in log.notes)
 
 
@@ -161,8 +161,12 @@ def test_version_2020a(tmp_path):
     lanes_ = log.lane_map.lanes
     assert list(lanes_) == ["1", "3", "4"]
     assert [k.kind for k in lanes_.values()] == ["bus", "vehicle", "bike"]
-    paints = [(k.left_paint, k.right_paint) for k in lanes_.values()]
-    assert paints == [("dashed_white", "solid_white"), ("solid_white", "none"), ("unknown", "none")]
+    mark_types = [(k.left_mark_type, k.right_mark_type) for k in lanes_.values()]
+    assert mark_types == [
+        ("dashed_white", "solid_white"),
+        ("solid_white", "none"),
+        ("unknown", "none"),
+    ]
     assert lanes_["1"].speed_limit_mps == 10.0
     assert_allclose(log.lane_map.stop_lines[0][:, :2], [[180, 6], [180, 2]])
     assert len(log.lane_map.crosswalks) == 1

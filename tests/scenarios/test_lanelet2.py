@@ -99,8 +99,8 @@ def test_lanes_run_with_the_left_bound_on_the_left_and_follow_by_shared_ends(tmp
     )
     assert lanes["-2"].centre[0, :2] + made.origin[:2] == pytest.approx([1300.0, 5.25])
     assert (lanes["1"].left_neighbour, lanes["3"].right_neighbour) == ("3", "1")
-    assert (lanes["1"].left_paint, lanes["1"].right_paint) == ("solid_yellow", "none")
-    assert lanes["2"].left_paint == lanes["-2"].right_paint == "dashed_white"
+    assert (lanes["1"].left_mark_type, lanes["1"].right_mark_type) == ("solid_yellow", "none")
+    assert lanes["2"].left_mark_type == lanes["-2"].right_mark_type == "dashed_white"
     assert lanes["1"].speed_limit_mps == pytest.approx(30 / 3.6)
     assert lanes["2"].speed_limit_mps is None
 

@@ -412,4 +412,4 @@ def test_paint_of_marks():
     )
     sides = f"{middle}<right>{lane(-1, more=mark.format('broken', 'white'))}</right>"
     one = lanes_of(road(sections=f'<laneSection s="0">{sides}</laneSection>')).lanes["1.0.-1"]
-    assert (one.left_paint, one.right_paint) == ("double_yellow", "dashed_white")
+    assert (one.left_mark_type, one.right_mark_type) == ("double_yellow", "dashed_white")

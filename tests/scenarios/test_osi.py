@@ -79,7 +79,7 @@ def test_the_host_vehicle_is_the_ego_among_recorded_traffic(tmp_path):
     one, other = made.lane_map.lanes["1"], made.lane_map.lanes["2"]
     assert one.centre[-1, 0] > one.centre[0, 0]
     assert other.centre[-1, 0] < other.centre[0, 0]
-    assert (one.left_paint, one.right_paint) == ("solid_yellow", "none")
+    assert (one.left_mark_type, one.right_mark_type) == ("solid_yellow", "none")
     assert len(one.left) == 3
     assert made.route.lane_ids == ("1",)
 

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Actor, Bool, Box, LaneMap, Paint
+from alpasim_plugin.core.types import F64, Actor, Bool, Box, LaneMap, LaneMarkType
 from alpasim_plugin.fixers.semantic_map.style import (
     COLOURS,
     DASH_M,
@@ -133,7 +133,7 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     origin = np.zeros(3)
     if len(everywhere):  # in whole metres, so that subtracting it loses nothing
         origin = np.round((everywhere.min(axis=0) + everywhere.max(axis=0)) / 2)
-    pieces = [piece for line, paint in painted for piece in _painted(line - origin, paint)]
+    pieces = [piece for line, mark_type in painted for piece in _painted(line - origin, mark_type)]
     pieces += [(name, width_px, line - origin) for name, width_px, line in lines]
     rings = [triangulate("crosswalk", ring - origin) for ring in lane_map.crosswalks]
     signs = [box_corners(pose, box, origin)[TRIANGLES] for pose, box in lane_map.signs]
@@ -170,9 +170,9 @@ def _pole(line: F64) -> F64:
     return line
 
 
-def _painted(line: F64, paint: Paint) -> list[Polyline]:
+def _painted(line: F64, mark_type: LaneMarkType) -> list[Polyline]:
     """Return what is drawn of a lane line: two lines for a double one, the dashes of a dashed one."""
-    pattern, _, colour = paint.partition("_")
+    pattern, _, colour = mark_type.partition("_")
     pieces = [line]
     if len(line) < 2:
         pieces = []

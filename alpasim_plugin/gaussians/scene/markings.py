@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
-from alpasim_plugin.core.types import F64, I64, Paint
+from alpasim_plugin.core.types import F64, I64, LaneMarkType
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site, left_of, unit
 from alpasim_plugin.world.markings import marking_lines
 
@@ -39,13 +39,17 @@ def marking_strokes(site: Site) -> Strokes:
     """Return all lane markings near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    painted = [(site.frame.to_ground(line), paint) for line, paint in marking_lines(lane_map)]
+    painted = [
+        (site.frame.to_ground(line), mark_type) for line, mark_type in marking_lines(lane_map)
+    ]
     lines = [
         edge
         for edge in painted
         if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)
     ]
-    pieces = [_line_strokes(line, paint, phase) for line, paint, phase in _with_phase(lines)]
+    pieces = [
+        _line_strokes(line, mark_type, phase) for line, mark_type, phase in _with_phase(lines)
+    ]
     pieces += [_zebra(site.frame.to_ground(ring)) for ring in lane_map.crosswalks]
     for stop in lane_map.stop_lines:
         line = site.frame.to_ground(stop)
@@ -59,16 +63,16 @@ def marking_strokes(site: Site) -> Strokes:
     return Strokes._make(column[inside] for column in joined)
 
 
-def _with_phase(lines: list[tuple[F64, Paint]]) -> list[tuple[F64, Paint, float]]:
+def _with_phase(lines: list[tuple[F64, LaneMarkType]]) -> list[tuple[F64, LaneMarkType, float]]:
     """Give each line the distance painted before it, so that dashes run on from lane to lane."""
     if not lines:
         return []
     tree = scipy.spatial.KDTree([line[0] for line, _ in lines])
     following: list[list[int]] = [[] for _ in lines]
     has_one_before = [False] * len(lines)
-    for i, (line, paint) in enumerate(lines):
+    for i, (line, mark_type) in enumerate(lines):
         for j in sorted(tree.query_ball_point(line[-1], JOINED_M)):
-            if j != i and not has_one_before[j] and lines[j][1] == paint:
+            if j != i and not has_one_before[j] and lines[j][1] == mark_type:
                 following[i].append(j)
                 has_one_before[j] = True
     phase: dict[int, float] = {}
@@ -81,13 +85,13 @@ def _with_phase(lines: list[tuple[F64, Paint]]) -> list[tuple[F64, Paint, float]
                 phase[i] = begin_m
                 end_m = begin_m + float(arc_lengths(lines[i][0])[-1])
                 waiting += [(j, end_m) for j in following[i]]
-    return [(line, paint, phase[i]) for i, (line, paint) in enumerate(lines)]
+    return [(line, mark_type, phase[i]) for i, (line, mark_type) in enumerate(lines)]
 
 
-def _line_strokes(line: F64, paint: Paint, phase_m: float) -> Strokes:
-    colour = YELLOW if "yellow" in paint else WHITE
+def _line_strokes(line: F64, mark_type: LaneMarkType, phase_m: float) -> Strokes:
+    colour = YELLOW if "yellow" in mark_type else WHITE
     length = float(arc_lengths(line)[-1])
-    if paint.startswith("dashed"):
+    if mark_type.startswith("dashed"):
         period = LINE_M + GAP_M
         first = np.floor(phase_m / period)
         dashes = np.arange(first, np.ceil((phase_m + length) / period))[:, None] * period - phase_m
@@ -98,7 +102,7 @@ def _line_strokes(line: F64, paint: Paint, phase_m: float) -> Strokes:
     s0 = np.clip(s0, 0.0, length)
     keep = s1 - s0 > 0.05
     a, b = resample(line, s0[keep]), resample(line, s1[keep])
-    if paint != "double_yellow":
+    if mark_type != "double_yellow":
         return _strokes(a, b, LINE_WIDTH_M, colour)
     side = DOUBLE_OFFSET_M * left_of(unit(b - a))
     return _strokes(

@@ -31,7 +31,7 @@ from alpasim_plugin.lab.training.scene_draws import (
 )
 
 Family = Callable[[Rng, float], Spec]
-PAINTS = ("double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white")
+MARK_TYPES = ("double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white")
 
 
 def _street(rng: Rng, time_s: float) -> Spec:
@@ -40,7 +40,7 @@ def _street(rng: Rng, time_s: float) -> Spec:
     road: Spec = {
         "lane_width_m": number(rng, 3.0, 3.9),
         "parking_m": number(rng, 2.2, 2.8),
-        "centre_paint": pick(rng, *PAINTS),
+        "centre_paint": pick(rng, *MARK_TYPES),
     }
     road["segments"] = to_length(
         [straight(number(rng, 30, 80)), arc(number(rng, 40, 120), k)], path_m(v, time_s)
@@ -62,7 +62,7 @@ def _long_bend(rng: Rng, time_s: float) -> Spec:
     road = {
         "segments": to_length(segments, path_m(v, time_s)),
         "lane_width_m": number(rng, 3.2, 3.9),
-        "centre_paint": pick(rng, *PAINTS),
+        "centre_paint": pick(rng, *MARK_TYPES),
     }
     actors = [
         leader(rng, v * 0.95, 0),
@@ -205,7 +205,7 @@ def _winding(rng: Rng, time_s: float) -> Spec:
     road = {
         "lane_width_m": number(rng, 3.1, 3.5),
         "shoulder_m": number(rng, 0.2, 0.8),
-        "centre_paint": pick(rng, *PAINTS),
+        "centre_paint": pick(rng, *MARK_TYPES),
     }
     road["segments"] = to_length(segments, path_m(v, time_s))
     actors = [
@@ -264,7 +264,7 @@ def _cyclists(rng: Rng, time_s: float) -> Spec:
     road = {
         "lane_width_m": width,
         "shoulder_m": number(rng, 0.4, 1.6),
-        "centre_paint": pick(rng, *PAINTS),
+        "centre_paint": pick(rng, *MARK_TYPES),
     }
     road["segments"] = to_length(
         [straight(number(rng, 30, 60)), arc(80, sign(rng) * number(rng, 0.001, 0.009, 5))],
@@ -324,7 +324,7 @@ def _composed(rng: Rng, time_s: float) -> Spec:
         "lanes_forward": lanes,
         "lanes_backward": lanes,
         "lane_width_m": number(rng, 3.1, 3.8),
-        "centre_paint": pick(rng, *PAINTS),
+        "centre_paint": pick(rng, *MARK_TYPES),
         "shoulder_m": number(rng, 0.2, 1.2),
     }
     actors = [bystanders(rng, "right"), bystanders(rng, "left")]

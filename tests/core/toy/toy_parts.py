@@ -116,8 +116,8 @@ class Csv:
         drive = Trajectory(
             rows[:, 0].astype(np.int64), xyz, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))
         )
-        aside = np.array([0.0, 2.0, 0.0])
-        lane = Lane("lane", xyz, xyz + aside, xyz - aside)
+        lateral_m = np.array([0.0, 2.0, 0.0])
+        lane = Lane("lane", xyz, xyz + lateral_m, xyz - lateral_m)
         return RecordedLog(
             path.stem,
             "toy",
