@@ -12,7 +12,7 @@ from alpasim_plugin.renderers import weather
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.renderers.lights import STREET_CD, SceneLights, Spot, drawn
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
-from alpasim_plugin.renderers.snow import ALBEDO, BESIDE, LANE, TRACK
+from alpasim_plugin.renderers.snow import ALBEDO, BESIDE, LANE, TRACK, SnowCover
 from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
@@ -199,6 +199,10 @@ def test_snow_lies_by_the_map_and_not_on_road_users():
     np.testing.assert_allclose(
         lit[row, columns], ALBEDO * np.array([LANE, TRACK, TRACK, BESIDE]), atol=0.02
     )
+    wide = np.array([[30.0, 0, 50], [0, 30, 30], [0, 0, 1]])
+    near = SnowCover(scenario).on(view_of(depth_of_road() * 0.3, wide, AHEAD, flat()))
+    columns = (50 + 30 * np.array([0.0, 0.8, -0.8, 2.3]) / 1.58).astype(int)
+    np.testing.assert_allclose(near[58, columns], [LANE, TRACK, TRACK, BESIDE], atol=0.02)
     wall = depth_of_wall(12.9)  # the rear of the car, whose lower part is as low as the ground
     assert shown(scenario, wall, np.zeros_like(GREY), poses)[40, 50].max() < 20
 
