@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import msgpack
@@ -29,6 +30,8 @@ from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 from scenarios.recorded import actors_of_track, checked_trajectory
 
+_Member = TypeVar("_Member")
+UNIT = 0.01  # how far from 1 the length of a quaternion may be
 SYNC_FILE = "sync.arrow"
 EGO, BOXES, CAMERA = "ego_state_se3", "box_detections_se3", "camera."
 DO_THIS = "convert the log again with py123d 0.1 or later"
@@ -101,7 +104,8 @@ def read_py123d(folder: Path) -> SourceDrive:
     unread = [key for key in keys if key not in ("sync", EGO, BOXES) and not key.startswith(CAMERA)]
     if unread:
         notes.append(f"not read: {', '.join(unread)}")
-    T_front = _T(_modality(folder, CAMERA + front, ())[0]["camera_to_imu_se3"])
+    with parsing(folder / f"{CAMERA}{front}.arrow", DO_THIS):
+        T_front = _T(_modality(folder, CAMERA + front, ())[0]["camera_to_imu_se3"])
     ahead_m, left_m = (inverse(T_imu_axle) @ T_front)[:2, 3].tolist()
     return SourceDrive(
         "py123d",
@@ -130,8 +134,22 @@ def _modality(
 
 
 def _T(pose: Sequence[float]) -> F64:
-    """Return the transform ``(4, 4)`` of x, y, z and ``wxyz``."""
+    """Return the transform ``(4, 4)`` of x, y, z and ``wxyz``.
+
+    Raises:
+        ValueError: It is no rigid motion.
+    """
+    is_unit = abs(np.linalg.norm(pose[3:7]) - 1) < UNIT
+    if not is_unit or not np.isfinite(pose).all():
+        raise ValueError(f"the pose {list(pose)} is no rigid motion")
     return se3(pose[:3], pose[3:7])
+
+
+def _numbered(members: Sequence[_Member], number: int, what: str) -> _Member:
+    """Return the member of a number that a log states."""
+    if not 0 <= number < len(members):
+        raise ValueError(f"{what} {number} of {len(members)}")
+    return members[number]
 
 
 def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[PosedPhotograph]:
@@ -155,7 +173,10 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
             raise ValueError("times that do not increase")
         of_ego = interpolate(ego, t_us.clip(ego.t_us[0], ego.t_us[-1]))
         poses = of_ego @ _T(facts["camera_to_imu_se3"])
-        film = _film(path.with_suffix(".mp4")) if pa.types.is_integer(data.type) else []
+        is_film = pa.types.is_integer(data.type)
+        film = _film(path.with_suffix(".mp4")) if is_film else []
+        if not is_film and not pa.types.is_string(data.type) and not pa.types.is_binary(data.type):
+            raise ValueError(f"images of the type {data.type}")
         photographs = []
         for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
             where = f"{path}, row {i}"
@@ -167,7 +188,8 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
                     raise ValueError(f"row {i}: the path {name_in_log} leads out of the log")
                 file = folder / name_in_log
             else:
-                encoded = memoryview(film[value.as_py()] if film else value.as_buffer())
+                frame = _numbered(film, value.as_py(), "frame") if is_film else value.as_buffer()
+                encoded = memoryview(frame)
             photographs.append(
                 PosedPhotograph(file, lens, T, where, int(t_us[i]), name, {}, encoded)
             )
@@ -201,7 +223,8 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
         found: list[Actor] = []
         for token in sorted(tracks):
             table = np.array(tracks[token], np.float64).reshape(-1, 12)
-            letter = CLASSES[kind][int(table[0, 11])] if kind in CLASSES else "o"
+            number = int(table[0, 11])
+            letter = _numbered(CLASSES[kind], number, "label") if kind in CLASSES else "o"
             times = table[:, 0].astype(np.int64)
             where = f"{path}, track {token}"
             track = checked_trajectory(where, times, table[:, 1:4], table[:, 4:8])

@@ -38,13 +38,21 @@ def write_modality(
         file.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
 
-def write_py123d(folder: Path, codec: str = "jpeg_binary", implicit_poses: bool = False) -> Path:
+def write_py123d(
+    folder: Path,
+    codec: str = "jpeg_binary",
+    implicit_poses: bool = False,
+    label: int = 0,
+    first_frame: int = 0,
+) -> Path:
     """Write the street with a car that drives ahead at 5 m/s and one that stands.
 
     Args:
         folder: Of the log.
         codec: How images are kept.
         implicit_poses: Leave the cameras' poses to those of the ego.
+        label: Number of the moving car's class.
+        first_frame: Of the film, by the log's numbers.
     """
     (folder / "samples").mkdir(parents=True)
     street, times = Street(), [START_US + 100_000 * i for i in range(COUNT)]
@@ -70,7 +78,7 @@ def write_py123d(folder: Path, codec: str = "jpeg_binary", implicit_poses: bool 
         for image in images:
             film.write(image)
         film.release()
-        data = list(range(COUNT))
+        data = [first_frame + i for i in range(COUNT)]
     write_modality(folder, "sync", {"log_name": "street-1"}, {"timestamp_us": (pa.int64(), times)})
     body = {"length": 5.0, "width": 2.0, "height": 1.7, "wheel_base": 3.0}
     mounts = {
@@ -107,16 +115,16 @@ def write_py123d(folder: Path, codec: str = "jpeg_binary", implicit_poses: bool 
         parked = np.eye(4)
         parked[:3, 3] = 16.0, 2.9, 1.0
         boxes.append([[*_placed(T), 4.0, 1.8, 1.5] for T in (mover, parked)])
-    label = "py123d.parser.registry.NuScenesBoxDetectionLabel"
+    classes = "py123d.parser.registry.NuScenesBoxDetectionLabel"
     write_modality(
         folder,
         "box_detections_se3",
-        {"box_detection_label_class": label},
+        {"box_detection_label_class": classes},
         {
             "timestamp_us": (pa.int64(), times),
             "bounding_box_se3": (pa.list_(pa.list_(pa.float64(), 10)), boxes),
             "track_token": (pa.list_(pa.string()), [["a1", "b2"]] * COUNT),
-            "label": (pa.list_(pa.uint16()), [[0, 1]] * COUNT),
+            "label": (pa.list_(pa.uint16()), [[label, 1]] * COUNT),
         },
     )
     write_modality(folder, "lidar.lidar_top", {}, {"timestamp_us": (pa.int64(), times)})

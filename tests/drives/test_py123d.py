@@ -75,3 +75,28 @@ def test_a_file_that_is_none_of_py123d_is_named(log, tmp_path, name, fault):
     with pytest.raises(InputError) as caught:
         read_source(folder)
     assert f"{name}.arrow" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "fact"),
+    [
+        ("ego_state_se3", {"center_to_imu_se3": [float("nan"), 0, 0, 1, 0, 0, 0]}),
+        ("camera.pcam_f0", {"camera_to_imu_se3": [0.0] * 7}),
+        ("camera.pcam_f0", {"first_frame": -1}),
+        ("box_detections_se3", {"box_detection_label_class": "WODPerceptionBoxDetectionLabel"}),
+    ],
+)
+def test_facts_that_cannot_be_are_refused(tmp_path, name, fact):
+    """A frame before the film's first, a label beyond the last of the classes among them."""
+    codec = "mp4" if "first_frame" in fact else "jpeg_binary"
+    folder = write_py123d(tmp_path / "log", codec, label=9, first_frame=fact.get("first_frame", 0))
+    path = folder / f"{name}.arrow"
+    with pa.ipc.open_file(pa.BufferReader(path.read_bytes())) as file:
+        table = file.read_all()
+    facts = msgpack.unpackb(table.schema.metadata[b"metadata"]) | fact
+    table = table.replace_schema_metadata({b"metadata": msgpack.packb(facts)})
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(table)
+    with pytest.raises(InputError) as caught:
+        read_source(folder)
+    assert f"{name}.arrow" in str(caught.value)
