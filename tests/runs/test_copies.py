@@ -67,7 +67,7 @@ def origins(root):
 
 def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
     plan = plan_of()
-    summary, _ = drive(plan, tmp_path / "run", workers=2)
+    summary, _ = drive(plan, tmp_path / "run")
     assert summary["copies"] == 2
     paired = summary["paired"][DARKER]
     assert {one["diff"] for one in paired.values()} <= {0.0, None}

@@ -14,6 +14,7 @@ from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.runs.executors import local
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
+from tests.examples import first_of
 
 
 def work(item):
@@ -108,7 +109,7 @@ def test_work_that_is_left_early_ends_its_workers(item):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", first_of([2, 1]))
 def test_workers_end_when_their_parent_is_killed(tmp_path, repo, threads):
     (tmp_path / "driver.py").write_text(
         "import os, time\n"

@@ -29,7 +29,7 @@ def test_the_library_is_as_large_as_promised():
     assert count("real") >= 1
 
 
-@pytest.mark.parametrize("name", first_of(BUILT, 12))
+@pytest.mark.parametrize("name", first_of(BUILT, 6))
 def test_expert_drives_smoothly(name):
     log = scenario(name).ego_log
     assert (np.diff(log.t_us) == 10_000).all()
@@ -47,7 +47,7 @@ def test_expert_drives_smoothly(name):
     assert slip[moving].max() < 0.02, "the rear axle moves where the car points"
 
 
-@pytest.mark.parametrize("name", [*BUILT, "real/us101"])
+@pytest.mark.parametrize("name", ["real/us101", *first_of(BUILT, 12)])
 def test_scenario_is_complete(name):
     s = scenario(name)
     assert (
