@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
+
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 
 if TYPE_CHECKING:
@@ -56,6 +58,13 @@ def share_card(device: str, workers: int) -> None:
         import torch
 
         torch.cuda.set_per_process_memory_fraction(1 / workers, device)
+
+
+def upload(array: npt.ArrayLike, place: device | str) -> Tensor:
+    """Return a copy of an array as a tensor of a device, for which the host does not wait."""
+    import torch
+
+    return torch.tensor(array).to(place, non_blocking=True)
 
 
 def download(*parts: Tensor) -> list[Any]:
@@ -117,8 +126,23 @@ class CapturedFunction:
             return [part.clone() for part in self._made]
 
 
+def is_on_host(tensor: Tensor) -> bool:
+    """Return whether the host reads a tensor without waiting for a device."""
+    return tensor.device.type == "cpu"
+
+
 def known_false(mask: Tensor) -> bool:
-    """Return whether a mask is false everywhere, where that is known without waiting for a
-    device.
+    """Return whether a mask is false everywhere, where that is known without waiting."""
+    return is_on_host(mask) and not bool(mask.any())
+
+
+def true_rows(mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rows ``(S,)`` and their weights ``(S,)``: those where a mask ``(N,)`` is true, with
+    weight 1; of a device, whose count the host would wait for, all of them with weights 1 and 0.
     """
-    return mask.device.type == "cpu" and not bool(mask.any())
+    import torch
+
+    if is_on_host(mask):
+        rows = torch.nonzero(mask)[:, 0]
+        return rows, torch.ones(len(rows))
+    return torch.arange(len(mask), device=mask.device), mask.float()

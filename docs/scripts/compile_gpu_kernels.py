@@ -24,9 +24,9 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
 CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK}
 TYPES = {
     "*fp64": ("poses", "camera", "means"),
-    "*fp32": ("factors", "opacities", "extents", "sh_ptr", "records", "depths", "image"),
+    "*fp32": "factors opacities extents sh_ptr records depths image gradients pairs".split(),
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
-    "*i64": ("order", "ends"),
+    "*i64": ("order", "ends", "places"),
     "fp32": ("near_m",),
     "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height"),
     "constexpr": tuple(CONSTANTS),
@@ -55,5 +55,5 @@ def resources(kernel: Any, capability: int) -> str:
 
 if __name__ == "__main__":
     for wanted in map(int, sys.argv[1:]):
-        for kernel in (kernels.project, kernels.list_tiles, kernels.composite):
-            print(f"{kernel.fn.__name__} sm_{wanted} {resources(kernel, wanted)}")
+        for name in ("project", "list_tiles", "composite", "composite_backward"):
+            print(f"{name} sm_{wanted} {resources(getattr(kernels, name), wanted)}")

@@ -105,14 +105,15 @@ def weighted(out, s):
     return (image * torch.as_tensor(weights_of(s.camera), dtype=image.dtype)).sum()
 
 
-def kernel_gradients(s, threads=1, dtype=torch.float32):
+def kernel_gradients(s, compositor=None):
     """Return the gradients of the compiled kernels, and the image that they belong to."""
     tensors = {
-        k: torch.tensor(a, dtype=dtype if k == "means" else torch.float32).requires_grad_(True)
-        for k, a in s.arrays().items()
+        k: torch.tensor(a, dtype=torch.float32, requires_grad=True) for k, a in s.arrays().items()
     }
     background = torch.tensor(s.background, requires_grad=True)
-    out = rasterize_gradient(Splats(**tensors), s.camera, background=background, threads=threads)
+    out = rasterize_gradient(
+        Splats(**tensors), s.camera, background=background, threads=1, compositor=compositor
+    )
     weighted(out, s).backward()
     leaves = {**tensors, "background": background}
     return {name: t.grad.double().numpy() for name, t in leaves.items()}, out

@@ -142,7 +142,12 @@ def test_kernels_compile_without_spilling(capability):
         check=True,
     )
     lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines] == ["project", "list_tiles", "composite"]
+    assert [line.split()[0] for line in lines] == [
+        "project",
+        "list_tiles",
+        "composite",
+        "composite_backward",
+    ]
     assert all("stack 0 " in line for line in lines), lines
 
 

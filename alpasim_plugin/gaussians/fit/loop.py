@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,8 +18,9 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.atomic import write_safetensors
+from alpasim_plugin.core.devices import require_device, true_rows, upload
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.image_metrics import CAP_DB, decibels
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.core.seeding import stream
@@ -39,6 +41,7 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
@@ -56,6 +59,7 @@ def fit(
     folder: Path | None = None,
     report: Report | None = None,
     threads: int | None = None,
+    device: str = "cpu",
 ) -> Reconstruction:
     """Fit a background, and the actors that ``start`` holds, to posed views.
 
@@ -70,6 +74,8 @@ def fit(
         report: Called after every update with loss, psnr_db (of the training view just seen) and
             gaussians.
         threads: Of the CPU rasteriser; None leaves it as it is.
+        device: Where to fit; a folder begun on one may go on on another. The host waits for a GPU
+            once an update.
 
     Returns:
         Background, actors, the sky that the views saw, and their exposures.
@@ -77,10 +83,10 @@ def fit(
     Raises:
         InputError: A folder begun with other views or another recipe.
         InfrastructureError: The loss or a gradient is not finite; the folder keeps the state before
-            it.
+            it; or there is no such device.
     """
     begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
-    run = SplatFit(views, begin, recipe, scene_id, threads, folder)
+    run = SplatFit(views, begin, recipe, scene_id, threads, folder, device)
     while run.step < recipe.steps:
         numbers = run.update()
         if report is not None:
@@ -106,7 +112,7 @@ class _Target:
     counts: Tensor | None  # (H, W, 1) bool
     motion: Motion
     ssim: SsimTarget
-    depth: Tensor | None  # (H, W) metres, 0 where unknown
+    depth: tuple[Tensor, Tensor] | None  # numbers (K,) of the pixels of known depth, metres (K,)
     index: int  # of the view
 
 
@@ -121,7 +127,10 @@ class SplatFit:
         scene_id: str,
         threads: int | None,
         folder: Path | None,
+        device: str = "cpu",
     ) -> None:
+        self.device = require_device(device)
+        self.compositor = None if self.device == "cpu" else TileCompositor(self.device)
         centres = np.array([view.camera.centre_world for view in views])
         origin = centres.mean(axis=0)
         self.recipe, self.scene_id, self.threads, self.folder = recipe, scene_id, threads, folder
@@ -129,16 +138,15 @@ class SplatFit:
             1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M
         )
         self.sky = sky_of(views)
-        self.model = SplatModel.from_start(start, origin, recipe.sh_degree)
+        self.model = SplatModel.from_start(start, origin, recipe.sh_degree, self.device)
         self.adam = RowAdam(self.model.params)
-        self.gradients = ScreenGradients(len(self.model))
+        self.gradients = ScreenGradients(len(self.model), self.device)
         self.step = 0
         small = [halved(view) for view in views] if recipe.coarse_share > 0 else []
         self.targets, self.coarse = (
-            [_target(i, view, self.model, self.sky, recipe) for i, view in enumerate(some)]
-            for some in (views, small)
+            [self._target(i, view) for i, view in enumerate(some)] for some in (views, small)
         )
-        self.exposure = Exposure(np.array([view.gain for view in views]))
+        self.exposure = Exposure(np.array([view.gain for view in views]), self.device)
         self._facts = json.dumps(
             {"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)},
             sort_keys=True,
@@ -153,32 +161,61 @@ class SplatFit:
             InfrastructureError: The loss or a gradient is not finite.
         """
         target, recipe = self._next_view(), self.recipe
-        splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
-        out = rasterize_gradient(
-            splats, target.camera, background=target.behind, threads=self.threads
-        )
-        lit = out.rgb * self.exposure.gain(target.index)
-        rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
-        loss = _loss(rgb, out, target, recipe)
-        if recipe.needle_weight > 0:
-            loss = loss + recipe.needle_weight * needles(
-                splats.log_scales[out.index[out.on_screen]], recipe.needle_ratio
-            )
-        if not torch.isfinite(loss):
-            self._stop(target, f"loss {float(loss.detach())}")
-        loss.backward()  # type: ignore[no-untyped-call]
-        for name, p in self.model.params.items():
-            if p.grad is not None and not torch.isfinite(p.grad.sum()):
+        numbers = self._differentiate(target)
+        if not math.isfinite(numbers["loss"]):
+            self._stop(target, f"loss {numbers['loss']}")
+        for name in self.model.params:
+            if not math.isfinite(numbers.get(name, 0.0)):
                 self._stop(target, f"a gradient of {name} that is not finite")
-        assert out.uv.grad is not None  # the backward pass has run
-        pull = out.uv.grad[out.on_screen].norm(dim=1) * (target.camera.width / 2)
-        self.gradients.add(rows[out.index[out.on_screen]], pull)
         self.adam.update(self.model.params, self._rates())
         self.exposure.update(recipe.lr_exposure)
         self.step += 1
         self._control_density()
-        psnr = psnr_db(rgb.detach().clamp(0, 1).numpy(), target.rgb.numpy(), peak=1.0)
-        return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
+        psnr = min(CAP_DB, decibels(max(numbers["mse"], 1e-30), peak=1.0))
+        return {"loss": numbers["loss"], "psnr_db": psnr, "gaussians": len(self.model)}
+
+    def _differentiate(self, target: _Target) -> dict[str, float]:
+        """Give the parameters the gradients of a view's loss, and count what the view pulls at.
+
+        Returns:
+            ``loss``, ``mse``, and the sum of each parameter's gradient by its name; all in one copy
+            from the device.
+        """
+        recipe = self.recipe
+        splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
+        out = rasterize_gradient(
+            splats,
+            target.camera,
+            background=target.behind,
+            threads=self.threads,
+            compositor=self.compositor,
+        )
+        lit = out.rgb * self.exposure.gain(target.index)
+        rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
+        loss = _loss(rgb, out, target, recipe)
+        seen, weight = true_rows(out.on_screen)
+        shown = out.index[seen]
+        if recipe.needle_weight > 0:
+            loss = loss + recipe.needle_weight * needles(
+                splats.log_scales[shown], weight, recipe.needle_ratio
+            )
+        loss.backward()  # type: ignore[no-untyped-call]
+        off = rgb.detach().clamp(0, 1) - target.rgb
+        facts = {"loss": loss.detach(), "mse": off.double().square().mean(), "pairs": out.pairs}
+        for name, p in self.model.params.items():
+            if p.grad is not None:
+                facts[name] = p.grad.sum()
+        values = torch.stack([fact.double() for fact in facts.values()]).cpu().tolist()
+        numbers = dict(zip(facts, values, strict=True))
+        card = self.compositor
+        if card is not None and not card.had_room(card.capacity, int(numbers["pairs"])):
+            for tensor in (*self.model.params.values(), self.exposure.log_gain):
+                tensor.grad = None
+            return self._differentiate(target)
+        assert out.uv.grad is not None  # the backward pass has run
+        pull = out.uv.grad[seen].norm(dim=1) * (target.camera.width / 2)
+        self.gradients.add(rows[shown], pull, weight)
+        return numbers
 
     def save(self) -> None:
         """Write everything that later updates depend on, whole or not at all."""
@@ -213,6 +250,7 @@ class SplatFit:
         meta, tensors = read_checkpoint(path, self._facts)
         with parsing(path, START_ANEW, "not a whole checkpoint"):
             self.model.node = tensors["node"]
+            tensors = {name: part.to(self.device) for name, part in tensors.items()}
             for name, parts in self._named().items():
                 parts.update({part: tensors[f"{name}.{part}"] for part in parts})
             for value in self.model.params.values():
@@ -245,7 +283,29 @@ class SplatFit:
         if self.recipe.densifies_after(self.step):
             rng = stream(self.scene_id, self.recipe.seed, "fit.split", self.step)
             densify(self.model, self.adam, self.gradients, self.recipe, self.extent_m, rng)
-            self.gradients = ScreenGradients(len(self.model))
+            self.gradients = ScreenGradients(len(self.model), self.device)
+
+    def _target(self, index: int, view: PosedView) -> _Target:
+        camera, device = view.camera, self.device
+        T = camera.T_camera_world.copy()
+        T[:3, 3] += T[:3, :3] @ self.model.origin
+        rgb = upload(view.rgb, device).float() / 255
+        depth = None
+        if view.depth is not None and self.recipe.depth_weight > 0:
+            known = np.flatnonzero(view.depth)
+            depth = upload(known, device), upload(view.depth.reshape(-1)[known], device)
+        return _Target(
+            view.name,
+            replace(camera, T_camera_world=T),
+            rgb,
+            None if self.sky is None else upload(self.sky.image(camera), device),
+            None if view.sky is None else upload(view.sky, device).float(),
+            None if view.mask is None else upload(view.mask, device)[..., None],
+            self.model.motion(view.actors),
+            SsimTarget(rgb),
+            depth,
+            index,
+        )
 
     def _stop(self, target: _Target, found: str) -> None:
         if self.folder is not None:
@@ -254,32 +314,6 @@ class SplatFit:
             f"view {target.name!r}, update {self.step}: {found}",
             "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update",
         )
-
-
-def _target(
-    index: int,
-    view: PosedView,
-    model: SplatModel,
-    sky: Sky | None,
-    recipe: SplatRecipe,
-) -> _Target:
-    camera = view.camera
-    T = camera.T_camera_world.copy()
-    T[:3, 3] += T[:3, :3] @ model.origin
-    behind = None if sky is None else torch.as_tensor(sky.image(camera))
-    rgb = torch.as_tensor(view.rgb.astype(np.float32) / 255)
-    return _Target(
-        view.name,
-        replace(camera, T_camera_world=T),
-        rgb,
-        behind,
-        None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32)),
-        None if view.mask is None else torch.as_tensor(view.mask)[..., None],
-        model.motion(view.actors),
-        SsimTarget(rgb),
-        None if view.depth is None or recipe.depth_weight == 0 else torch.as_tensor(view.depth),
-        index,
-    )
 
 
 def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe) -> Tensor:
@@ -291,18 +325,17 @@ def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe
     if target.sky is not None:
         loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
     if target.depth is not None:
-        loss = loss + recipe.depth_weight * _depth_error(out, target.depth)
+        loss = loss + recipe.depth_weight * _depth_error(out, *target.depth)
     return loss
 
 
-def _depth_error(out: GradientOutput, depth: Tensor) -> Tensor:
-    """Return the mean difference of inverse depths as a share of the true one, over pixels of known
-    depth, at most `DEPTH_CLIP` each.
+def _depth_error(out: GradientOutput, pixels: Tensor, depth: Tensor) -> Tensor:
+    """Return the mean difference of inverse depths as a share of the true one, over pixels ``(K,)``
+    of known depth ``(K,)``, at most `DEPTH_CLIP` each.
     """
-    rows, columns = torch.nonzero(depth, as_tuple=True)
-    if not len(rows):
+    if not len(pixels):
         return out.depth.new_zeros(())
-    off = depth[rows, columns] / out.depth[rows, columns].clamp(min=0.1) - 1
+    off = depth / out.depth.view(-1)[pixels].clamp(min=0.1) - 1
     return off.abs().clamp(max=DEPTH_CLIP).mean()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.devices import download, upload
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
@@ -34,7 +35,7 @@ class Motion:
     still.
 
     Attributes:
-        present: ``(M,)`` bool.
+        present: ``(M,)`` bool, on the host.
         rotation: ``(M, 3, 3)``; identity where absent.
         shift: ``(M, 3)`` metres, in the fit's frame.
         quat: ``(M, 4, 4)``, the matrix that multiplies a quaternion from the left.
@@ -57,7 +58,8 @@ class SplatModel:
             wherever the scene lies.
         params: Name (`NAMES`) to a leaf tensor with N rows: means in the node's frame, logarithms
             of scales, quaternions, logits of opacity, constant and further colour coefficients.
-        node: ``(N,)`` the node of each Gaussian, ascending.
+        node: ``(N,)`` the node of each Gaussian, ascending; on the host, which thus knows how many
+            are in view.
     """
 
     def __init__(
@@ -67,7 +69,9 @@ class SplatModel:
         self.params = {name: params[name].detach().requires_grad_() for name in NAMES}
 
     @classmethod
-    def from_start(cls, start: Start, origin: F64, sh_degree: int) -> SplatModel:
+    def from_start(
+        cls, start: Start, origin: F64, sh_degree: int, device: str = "cpu"
+    ) -> SplatModel:
         """Take over a start's Gaussians; their colours are padded or cut to the degree."""
         names = tuple(sorted(start.actors))
         clouds = [start.background, *(start.actors[name] for name in names)]
@@ -85,9 +89,7 @@ class SplatModel:
             "sh_rest": sh[:, 1:],
         }
         node = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-        tensors = {
-            name: torch.as_tensor(np.array(a, dtype=np.float32)) for name, a in arrays.items()
-        }
+        tensors = {name: upload(a.astype(np.float32), device) for name, a in arrays.items()}
         return cls(names, origin, tensors, torch.as_tensor(node))
 
     def __len__(self) -> int:
@@ -108,8 +110,9 @@ class SplatModel:
                     _left_product(quat_from_matrix(T[i, :3, :3])),
                     _harmonics(T[i, :3, :3].tobytes(), size),
                 )
+        device = self.params["means"].device
         tensors = (
-            torch.as_tensor(a, dtype=torch.float32)
+            upload(a.astype(np.float32), device)
             for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
         )
         return Motion(torch.as_tensor(present), *tensors)
@@ -126,6 +129,7 @@ class SplatModel:
             that each is, ``(M,)``.
         """
         p = self.params
+        device = p["means"].device
         still = int(torch.searchsorted(self.node, 1))
         sh = (
             torch.cat([p["sh_dc"], p["sh_rest"][:, : sh_size - 1]], dim=1)
@@ -135,8 +139,8 @@ class SplatModel:
         moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
         if not len(moving):
             parts = [*(p[name][:still] for name in NAMES[:4]), sh[:still]]
-            return Splats(*parts), torch.arange(still)
-        node = self.node[moving]
+            return Splats(*parts), torch.arange(still, device=device)
+        node, moving = (rows.to(device, non_blocking=True) for rows in (self.node[moving], moving))
         means = (
             torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
             + motion.shift[node]
@@ -152,13 +156,13 @@ class SplatModel:
             torch.cat([p["logit_opacities"][:still], p["logit_opacities"][moving]]),
             torch.cat([sh[:still], turned]),
         )
-        return splats, torch.cat([torch.arange(still), moving])
+        return splats, torch.cat([torch.arange(still, device=device), moving])
 
     def clouds(self) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
         """Return the background in world coordinates and each actor in its box frame, as ordinary
         clouds; actors without Gaussians too.
         """
-        p = {name: t.detach().double().numpy() for name, t in self.params.items()}
+        p = {name: t.detach().cpu().double().numpy() for name, t in self.params.items()}
         sh = np.concatenate([p["sh_dc"], p["sh_rest"]], axis=1).astype(np.float32)
         first = np.searchsorted(self.node.numpy(), np.arange(len(self.actors) + 2))
         out: list[GaussianCloud] = []
@@ -235,12 +239,14 @@ class RowAdam:
             p.addcdiv_(m, (v / correct2).sqrt_().add_(EPS), value=-rates[name] / correct1)
             p.grad = None
 
-    def take(self, rows: Tensor, fresh: Tensor) -> None:
-        """Follow a choice of rows ``(M,)``; the moments of ``fresh (M,)`` ones begin at zero."""
+    def take(self, rows: Tensor, old: int) -> None:
+        """Follow a choice of rows ``(M,)``; the moments of all behind the ``old`` ones begin at
+        zero.
+        """
         for moments in (self.first, self.second):
             for name, m in moments.items():
                 chosen = m[rows]
-                chosen[fresh] = 0
+                chosen[old:] = 0
                 moments[name] = chosen
 
 
@@ -253,14 +259,15 @@ class Exposure:
 
     Args:
         begin: ``(V, 3)`` of red, green and blue.
+        device: Where to keep it.
 
     Attributes:
         log_gain: ``(V, 3)``.
         adam: Its optimiser.
     """
 
-    def __init__(self, begin: F64) -> None:
-        self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32)
+    def __init__(self, begin: F64, device: str = "cpu") -> None:
+        self.begin = upload(np.log(begin).astype(np.float32), device)
         self.log_gain = self.begin.clone().requires_grad_()
         self.adam = RowAdam({"log_gain": self.log_gain})
 
@@ -270,7 +277,7 @@ class Exposure:
 
     def gains(self) -> F64:
         """Return all gains ``(V, 3)``."""
-        return self.log_gain.detach().double().exp().numpy()
+        return self.log_gain.detach().cpu().double().exp().numpy()
 
     @torch.no_grad()
     def update(self, rate: float) -> None:
@@ -283,12 +290,13 @@ class Exposure:
             self.log_gain.grad = None
 
 
-def needles(log_scales: Tensor, ratio: float) -> Tensor:
+def needles(log_scales: Tensor, weight: Tensor, ratio: float) -> Tensor:
     """Return by how much, in logarithms, the longest axes of Gaussians ``(N, 3)`` exceed ``ratio``
-    times the middle ones: the mean.
+    times the middle ones: the mean by weight ``(N,)``.
     """
     axes = log_scales.sort(dim=1).values
-    return (axes[:, 2] - axes[:, 1] - math.log(ratio)).clamp(min=0).mean()
+    excess = (axes[:, 2] - axes[:, 1] - math.log(ratio)).clamp(min=0)
+    return (excess * weight).sum() / weight.sum().clamp(min=1)
 
 
 SPLIT_SHRINK = 1.6  # of scales when a Gaussian becomes two
@@ -302,13 +310,15 @@ class ScreenGradients:
         count: ``(N,)`` views that showed it.
     """
 
-    def __init__(self, n: int) -> None:
-        self.total, self.count = torch.zeros(n), torch.zeros(n)
+    def __init__(self, n: int, device: str = "cpu") -> None:
+        self.total, self.count = (torch.zeros(n, device=device) for _ in range(2))
 
-    def add(self, rows: Tensor, norms: Tensor) -> None:
-        """Count one view: the rows ``(M,)`` of the Gaussians that it shows, and the norms ``(M,)``."""
+    def add(self, rows: Tensor, norms: Tensor, weight: Tensor) -> None:
+        """Count one view: rows ``(M,)`` of Gaussians, the norms ``(M,)``, and 1 for those that it
+        shows, 0 for others.
+        """
         self.total.index_add_(0, rows, norms)
-        self.count.index_add_(0, rows, torch.ones(len(rows)))
+        self.count.index_add_(0, rows, weight)
 
     def mean(self) -> Tensor:
         """Return ``(N,)``; 0 for what no view showed."""
@@ -330,7 +340,13 @@ def densify(
     A clone starts where its original is. A split one is replaced by two, drawn from it, smaller by
     1.6. Where the cap leaves too little room the strongest gradients come first.
     """
-    pull, size = gradients.mean(), model.params["log_scales"].max(dim=1).values
+    p = model.params
+    pull, size, logits = (
+        torch.from_numpy(part)
+        for part in download(
+            gradients.mean(), p["log_scales"].max(dim=1).values, p["logit_opacities"]
+        )
+    )
     wanted = torch.nonzero(pull >= recipe.densify_gradient)[:, 0]
     room = max(recipe.cap - len(model), 0)
     wanted = wanted[torch.sort(pull[wanted], descending=True, stable=True).indices[:room]]
@@ -340,23 +356,29 @@ def densify(
     kept[splits] = False
     old = torch.nonzero(kept)[:, 0]
     rows = torch.cat([old, clones, splits, splits])
-    fresh = torch.arange(len(rows)) >= len(old)
-    _take(model, adam, rows, fresh)
+    _take(model, adam, rows, len(old))
     halves = slice(len(old) + len(clones), len(rows))
     _scatter(model, halves, rng)
-    _prune(model, adam, recipe, extent_m)
+    size, logits = size[rows], logits[rows]
+    size[halves] -= math.log(SPLIT_SHRINK)
+    faint = logits < math.log(recipe.prune_opacity / (1 - recipe.prune_opacity))
+    oversized = size > math.log(recipe.prune_share * extent_m)
+    left = torch.nonzero(~(faint | oversized))[:, 0]
+    left = left[torch.sort(model.node[left], stable=True).indices]  # in the order of their nodes
+    _take(model, adam, left, len(left))
 
 
-def _take(model: SplatModel, adam: RowAdam, rows: Tensor, fresh: Tensor) -> None:
-    model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
+def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
     model.node = model.node[rows]
-    adam.take(rows, fresh)
+    rows = rows.to(model.params["means"].device)
+    model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
+    adam.take(rows, old)
 
 
 def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
     """Draw new centres from the Gaussians of a part, and shrink them."""
     p = model.params
-    draw = torch.as_tensor(rng.standard_normal(p["means"][part].shape, dtype=np.float32))
+    draw = upload(rng.standard_normal(p["means"][part].shape, dtype=np.float32), p["means"].device)
     w, x, y, z = torch.nn.functional.normalize(p["quaternions"][part], dim=1).unbind(1)
     along = draw * p["log_scales"][part].exp()
     # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).
@@ -364,13 +386,3 @@ def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
     turned = along + 2 * torch.linalg.cross(u, torch.linalg.cross(u, along) + w[:, None] * along)
     p["means"][part] += turned
     p["log_scales"][part] -= math.log(SPLIT_SHRINK)
-
-
-def _prune(model: SplatModel, adam: RowAdam, recipe: SplatRecipe, extent_m: float) -> None:
-    """Remove what is too faint or too large, and put the rows in the order of their nodes."""
-    p = model.params
-    faint = p["logit_opacities"] < math.log(recipe.prune_opacity / (1 - recipe.prune_opacity))
-    large = p["log_scales"].max(dim=1).values > math.log(recipe.prune_share * extent_m)
-    rows = torch.nonzero(~(faint | large))[:, 0]
-    rows = rows[torch.sort(model.node[rows], stable=True).indices]
-    _take(model, adam, rows, torch.zeros(len(rows), dtype=torch.bool))

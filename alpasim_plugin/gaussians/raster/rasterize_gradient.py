@@ -1,5 +1,5 @@
-"""Render splats for training: torch projects them, compiled CPU kernels composite the tiles and take
-the image's gradient back to the projected splats.
+"""Render splats for training: torch projects them, compiled kernels composite the tiles and take the
+image's gradient back to the projected splats, on the CPU or on a GPU.
 
 `rasterize_reference` is the definition.
 """
@@ -7,14 +7,14 @@ the image's gradient back to the projected splats.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.constants import (
@@ -25,11 +25,12 @@ from alpasim_plugin.gaussians.constants import (
     EXTENT_MAX_SIGMA,
     LOG_SCALE_LIMIT,
     NEAR_M,
+    PEAK,
     RADIUS_X,
-    RADIUS_Y,
     RECORD,
+    TILE,
     U,
-    V,
+    Z,
 )
 from alpasim_plugin.gaussians.raster.gradient_kernels import (
     PAIR,
@@ -54,6 +55,7 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     run_on_threads,
     thread_count,
 )
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, tile_grid
 from alpasim_plugin.gaussians.sh import C0, sh_terms
 
 _OPACITY_LIMIT = 1e-6  # opacities of exactly 0 and 1 have no finite logit
@@ -98,9 +100,11 @@ class GradientOutput:
         rgb: ``(H, W, 3)``, background included, not clamped.
         alpha: ``(H, W)`` accumulated opacity.
         depth: ``(H, W)`` metres along the optical axis, alpha-weighted mean; 0 where alpha is 0.
-        index: ``(M,)`` the Gaussians that may reach the image, nearest first.
+        index: ``(M,)`` the Gaussians that may reach the image, nearest first; on a GPU all of them,
+            whose number the host knows.
         uv: ``(M, 2)`` their centres, pixels; keeps its gradient.
         on_screen: ``(M,)`` bool, which of them do reach it.
+        pairs: ``()`` pairs of splat and tile, for which a GPU's lists may have lacked room.
     """
 
     rgb: Tensor
@@ -109,6 +113,7 @@ class GradientOutput:
     index: Tensor
     uv: Tensor
     on_screen: Tensor
+    pairs: Tensor
 
 
 def rasterize_gradient(
@@ -118,6 +123,7 @@ def rasterize_gradient(
     background: Tensor | None = None,
     near_m: float = NEAR_M,
     threads: int | None = None,
+    compositor: TileCompositor | None = None,
 ) -> GradientOutput:
     """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of
     the background.
@@ -127,12 +133,13 @@ def rasterize_gradient(
     covariance's Jacobian, a colour clamped at 0.
 
     Args:
-        splats: What to draw; tensors on the CPU.
+        splats: What to draw; tensors of the compositor's device.
         camera: From where.
         background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
         near_m: Gaussians whose centre is nearer are left out.
         threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients
             depend on it.
+        compositor: Of a GPU; None composites on the CPU.
 
     Returns:
         The image with its graph; second derivatives are not available.
@@ -149,28 +156,39 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
         (True, torch.Size([1, 2]))
     """
-    with torch.no_grad():
-        index = _candidates(splats, camera, near_m)
-    seen = Splats(*(tensor.index_select(0, index) for tensor in splats))
-    local = _in_camera(seen.means, camera)
+    seen = splats
+    if compositor is None:
+        with torch.no_grad():
+            index = _candidates(splats, camera, near_m)
+        seen = Splats(*(tensor.index_select(0, index) for tensor in splats))
+        local = _in_camera(seen.means, camera)
+    else:
+        local = _in_camera(splats.means, camera)
+        drawn = _is_drawn(local, splats, near_m)
+        index = torch.arange(len(drawn), device=drawn.device)
+        # What is behind the camera has no projection: its gradient would be 0 times infinity.
+        local = torch.where(drawn, local, 1.0)
     uv, m, n = _ellipses(local, seen, camera)
     if uv.requires_grad:
         uv.retain_grad()
     log_opacity = torch.nn.functional.logsigmoid(seen.logit_opacities)
     projected = (uv, m, n, log_opacity, _colours(seen.sh, local, camera), local[2])
     with torch.no_grad():
-        records = _records(*projected)
-        centre, reach = records[:, [U, V]], records[:, [RADIUS_X, RADIUS_Y]]
-        last = torch.tensor([camera.width, camera.height]) - 0.5
-        on_screen = ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
-    colour_sum, alpha, depth_sum = _Composite.apply(
-        *projected, records.numpy().reshape(-1), camera, thread_count(threads)
-    )  # type: ignore[no-untyped-call]
+        scale = EXPONENT_SCALE if compositor is None else 1.0
+        records = _records(*projected, scale)
+        on_screen = _reach_image(records, camera)
+        tiled: _Tiled
+        if compositor is None:
+            tiled = _TiledByCpu(records, camera, thread_count(threads))
+        else:
+            on_screen &= drawn
+            tiled = _TiledByGpu(records, log_opacity, on_screen, camera, compositor)
+    colour_sum, alpha, depth_sum = _Composite.apply(*projected, tiled, scale)  # type: ignore[no-untyped-call]
     rgb = colour_sum
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
-    return GradientOutput(rgb, alpha, depth, index, uv, on_screen)
+    return GradientOutput(rgb, alpha, depth, index, uv, on_screen, tiled.pairs)
 
 
 def rasterize_torch(
@@ -207,8 +225,7 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     bounds the ellipse.
     """
     local = _in_camera(splats.means, camera)
-    drawn = (local[2] >= near_m) & (splats.logit_opacities >= float(logit(np.array(ALPHA_MIN))))
-    index = torch.nonzero(drawn)[:, 0]
+    index = torch.nonzero(_is_drawn(local, splats, near_m))[:, 0]
     x, y, z = local[:, index]
     low_x, high_x, low_y, high_y = camera.slope_limits()
     largest = splats.log_scales.index_select(0, index).amax(dim=1).exp() / z
@@ -228,6 +245,21 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     return index[torch.from_numpy(depth_order(z[inside].numpy(), index.numpy()))]
 
 
+def _is_drawn(local: Tensor, splats: Splats, near_m: float) -> Tensor:
+    """Return which Gaussians ``(N,)`` are far and opaque enough."""
+    least = float(logit(np.array(ALPHA_MIN)))
+    return (local[2] >= near_m) & (splats.logit_opacities >= least)
+
+
+def _reach_image(records: Tensor, camera: PinholeCamera) -> Tensor:
+    """Return which records ``(M,)`` have a pixel centre in the box around their ellipse."""
+    on_screen = torch.ones(len(records), dtype=torch.bool, device=records.device)
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        centre, reach = records[:, U + axis], records[:, RADIUS_X + axis]
+        on_screen &= (centre + reach >= 0.5) & (centre - reach <= size - 0.5)
+    return on_screen
+
+
 # Vectors are tensors (3, N): operations on whole components are several times as fast.
 
 
@@ -243,8 +275,8 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 def _in_camera(means: Tensor, camera: PinholeCamera) -> Tensor:
     """Return points ``(3, N)`` in the camera's axes; large coordinates cancel in float64."""
-    relative = means.double() - torch.as_tensor(camera.centre_world)
-    return (torch.as_tensor(camera.T_camera_world[:3, :3].copy()) @ relative.T).float()
+    relative = means.double() - upload(camera.centre_world, means.device)
+    return (upload(camera.T_camera_world[:3, :3], means.device) @ relative.T).float()
 
 
 def _ellipses(
@@ -254,7 +286,7 @@ def _ellipses(
     diag(s)``: the screen covariance is ``M M^T`` and the low-pass.
     """
     low_x, high_x, low_y, high_y = camera.slope_limits()
-    right, down, ahead = torch.as_tensor(camera.T_camera_world[:3, :3, None]).float()
+    right, down, ahead = upload(camera.T_camera_world[:3, :3, None], local.device).float()
     x, y, z = local
     slope_x, slope_y = x / z, y / z
     uv = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=1)
@@ -273,7 +305,7 @@ def _ellipses(
 
 def _colours(sh: Tensor, local: Tensor, camera: PinholeCamera) -> Tensor:
     """Return colours ``(N, 3)`` from the camera's side, clamped at 0 below."""
-    world = torch.as_tensor(camera.T_camera_world[:3, :3].T.copy()).float() @ local
+    world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
     terms = sh_terms(*(world * _dot(world, world).rsqrt()))
     constant, *higher = sh.unbind(1)
     colour = 0.5 + C0 * constant
@@ -298,24 +330,102 @@ def _extent(log_opacity: Tensor) -> Tensor:
 
 
 def _records(
-    uv: Tensor, m: Tensor, n: Tensor, log_opacity: Tensor, colour: Tensor, depth: Tensor
+    uv: Tensor,
+    m: Tensor,
+    n: Tensor,
+    log_opacity: Tensor,
+    colour: Tensor,
+    depth: Tensor,
+    scale: float,
 ) -> Tensor:
-    """Return projected splats ``(M, RECORD)`` as the kernels read them: see `constants`."""
+    """Return projected splats ``(M, RECORD)`` as the kernels read them: see `constants`; the
+    whitening times a scale.
+    """
     c11, c12, c22, det = _covariance(m, n)
     extent = _extent(log_opacity)
     radius_x, radius_y = extent * c11.sqrt(), extent * c22.sqrt()
-    l11 = EXPONENT_SCALE * (c22 / det).sqrt()
+    l11 = scale * (c22 / det).sqrt()
     l12 = -l11 * c12 / c22
-    l22 = EXPONENT_SCALE * c22.rsqrt()
+    l22 = scale * c22.rsqrt()
     peak = (log_opacity / np.log(2) + 4) / 8
     corner = torch.hypot(BLOCK_HALF * (l11 + l12.abs()), BLOCK_HALF * l22)
     block = (peak - CUT).clamp(min=0).sqrt() + corner + 1e-3
     reach = radius_x + MARGIN_PX, radius_y + MARGIN_PX
     columns = [*uv.T, l11, l12, l22, peak, *colour.T, depth, *reach]
-    records = torch.zeros(len(uv), RECORD)
+    records = torch.zeros(len(uv), RECORD, device=uv.device)
     records[:, : len(columns)] = torch.stack(columns, dim=1)
     records[:, BLOCK_REACH] = block.square()
     return records
+
+
+class _Tiled(Protocol):
+    """Splats of one view, listed by tile."""
+
+    pairs: Tensor
+
+    def images(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the sums of weighted colours ``(H, W, 3)``, alpha ``(H, W)`` and the sums of
+        weighted depths ``(H, W)``.
+        """
+
+    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
+        """Return what each splat receives of the images' gradients, ``(M, PAIR)``."""
+
+
+class _TiledByCpu:
+    def __init__(self, records: Tensor, camera: PinholeCamera, threads: int) -> None:
+        self.records, self.camera, self.threads = records.numpy().reshape(-1), camera, threads
+        self.tiles = list_per_tile(np.arange(len(records)), self.records, camera, threads)
+        self.kept = np.empty((len(self.tiles.starts) - 1) * 16 * KEPT, np.float32)
+        self.pairs = torch.tensor(len(self.tiles.lists))
+
+    def images(self) -> tuple[Tensor, Tensor, Tensor]:
+        images = composite(self.tiles, self.records, self.kept, self.camera, self.threads)
+        colour, alpha, depth = (torch.from_numpy(image) for image in images)
+        return colour, alpha, depth
+
+    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
+        tiles, images = self.tiles, (by_colour, by_alpha, by_depth)
+        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
+        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, self.records)
+        gradients = (g.to(torch.float32).contiguous().numpy() for g in images)
+        run_on_threads(self.threads, tile_gradients, *lists, self.kept, *gradients, pairs)
+        rows = np.zeros((len(self.records) // RECORD, PAIR), np.float32)
+        add_pairs(tiles.lists, pairs, rows)
+        return torch.from_numpy(rows)
+
+
+class _TiledByGpu:
+    def __init__(
+        self,
+        records: Tensor,
+        log_opacity: Tensor,
+        on_screen: Tensor,
+        camera: PinholeCamera,
+        compositor: TileCompositor,
+    ) -> None:
+        edges = []
+        for axis, count in enumerate(tile_grid(camera)):
+            centre, reach = records[:, U + axis], records[:, RADIUS_X + axis]
+            edges.append(((centre - reach) / TILE).floor().clamp(0, count))
+            edges.append(((centre + reach) / TILE).floor().clamp(-1, count - 1) + 1)
+        boxes = torch.stack(edges, dim=1).nan_to_num().to(torch.int32)
+        x0, x1, y0, y1 = boxes.unbind(1)
+        counts = (x1 - x0).clamp(min=0) * (y1 - y0).clamp(min=0) * on_screen
+        rows = records[:, : compositor.kernels.RECORD].contiguous()
+        rows[:, PEAK] = log_opacity.exp()
+        depths = torch.where(on_screen, records[:, Z], torch.inf)
+        self.compositor = compositor
+        self.view = compositor.composite(rows, depths, boxes, counts, camera)
+        self.pairs = counts.sum()
+
+    def images(self) -> tuple[Tensor, Tensor, Tensor]:
+        image = self.view.image
+        return image[..., :3], 1 - image[..., 4], image[..., 3]
+
+    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
+        by_pixel = torch.cat([by_colour, by_depth[..., None], by_alpha[..., None]], dim=2)
+        return self.compositor.gradient(self.view, by_pixel.contiguous(), PAIR)
 
 
 class _Composite(torch.autograd.Function):
@@ -330,17 +440,12 @@ class _Composite(torch.autograd.Function):
         log_opacity: Tensor,
         colour: Tensor,
         depth: Tensor,
-        records: F32,
-        camera: PinholeCamera,
-        threads: int,
+        tiled: _Tiled,
+        scale: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        tiles = list_per_tile(np.arange(len(uv)), records, camera, threads)
-        kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, np.float32)
-        images = composite(tiles, records, kept, camera, threads)
         ctx.save_for_backward(m, n, colour)
-        ctx.tiles, ctx.records, ctx.kept, ctx.threads = tiles, records, kept, threads
-        colour_sum, alpha, depth_sum = (torch.from_numpy(image) for image in images)
-        return colour_sum, alpha, depth_sum
+        ctx.tiled, ctx.scale = tiled, scale
+        return tiled.images()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -351,18 +456,10 @@ class _Composite(torch.autograd.Function):
         needles of thousands of pixels lose nothing.
         """
         m, n, colour = ctx.saved_tensors
-        g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
-        tiles = ctx.tiles
-        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
-        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, ctx.records)
-        images = (ctx.kept, g_colour, g_alpha, g_depth)
-        run_on_threads(ctx.threads, tile_gradients, *lists, *images, pairs)
-        rows = np.zeros((len(colour), PAIR), np.float32)
-        add_pairs(tiles.lists, pairs, rows)
-        sums = torch.from_numpy(rows).T.contiguous()
+        sums = ctx.tiled.sums(*gradients).T.contiguous()
         _, c12, c22, det = _covariance(m, n)
-        # The moments are over whitened coordinates times EXPONENT_SCALE: each w holds one.
-        w11, w22 = (c22 / det).sqrt() / EXPONENT_SCALE, c22.rsqrt() / EXPONENT_SCALE
+        # The moments are over whitened coordinates times the scale: each w holds one.
+        w11, w22 = (c22 / det).sqrt() / ctx.scale, c22.rsqrt() / ctx.scale
         w12 = -w11 * c12 / c22
         by_u = w11 * sums[PAIR_S]
         by_v = w12 * sums[PAIR_S] + w22 * sums[PAIR_T]
@@ -377,7 +474,6 @@ class _Composite(torch.autograd.Function):
             sums[PAIR_H],
             by_colour,
             sums[PAIR_Z],
-            None,
             None,
             None,
         )

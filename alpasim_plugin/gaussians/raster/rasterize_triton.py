@@ -7,6 +7,8 @@ compiled for GPUs of compute capability 8.0 and 9.0; they have not been run on a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,7 +51,141 @@ def triton_kernels() -> Any:
     return kernels
 
 
-class UploadedClouds:
+@dataclass(frozen=True, eq=False)
+class TiledImage:
+    """A view that a device composited, with what its gradient needs.
+
+    Attributes:
+        image: ``(H, W, PIXEL)``, see `triton_kernels.composite`.
+        records: ``(N, RECORD)`` projected splats.
+        order: ``(N,)`` splats, nearest first.
+        ends: ``(N,)`` where the pairs of each end, in this order.
+        splats: ``(capacity,)`` the splat of each pair, by tile.
+        places: ``(capacity,)`` its place in the order of ``ends``.
+        starts: ``(tiles + 1,)`` where each tile's pairs begin, and the end of the last.
+    """
+
+    image: Tensor
+    records: Tensor
+    order: Tensor
+    ends: Tensor
+    splats: Tensor
+    places: Tensor
+    starts: Tensor
+
+
+class TileCompositor:
+    """Lists projected splats by tile and blends them on a device, in lists that grow.
+
+    Args:
+        device: A torch device, ``cuda:0``.
+
+    Raises:
+        RendererError: Triton is not installed.
+        InfrastructureError: There is no such device.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.kernels = triton_kernels()
+        self.device = torch.device(require_device(device))
+        self.capacity = FIRST_CAPACITY
+
+    def had_room(self, capacity: int, count: int) -> bool:
+        """Return whether lists of a capacity held so many pairs; make room for the next ones."""
+        if count > capacity:  # the lists were cut short
+            self.capacity = max(self.capacity, count + count // 4)
+        return count <= capacity
+
+    def composite(
+        self, records: Tensor, depths: Tensor, boxes: Tensor, counts: Tensor, camera: PinholeCamera
+    ) -> TiledImage:
+        """Blend projected splats; the view is whole if their pairs are at most `capacity`.
+
+        Args:
+            records: ``(N, RECORD)``.
+            depths: ``(N,)``.
+            boxes: ``(N, BOX)``.
+            counts: ``(N,)`` int32, tiles of each; 0 for what is not drawn.
+            camera: Gives the image's size.
+        """
+        kernels, width, height = self.kernels, camera.width, camera.height
+        tiles_x, tiles_y = tile_grid(camera)
+        total = len(records)
+        order = torch.sort(depths, stable=True).indices
+        ends = torch.cumsum(counts[order], dim=0)
+        tiles = torch.full(
+            (self.capacity,), tiles_x * tiles_y, dtype=torch.int32, device=self.device
+        )
+        splats = torch.zeros_like(tiles)
+        if total:
+            kernels.list_tiles[(-(-total // BLOCK),)](
+                order,
+                ends,
+                boxes,
+                counts,
+                tiles,
+                splats,
+                total,
+                self.capacity,
+                tiles_x,
+                BLOCK=BLOCK,
+            )
+        sorted_tiles, places = torch.sort(tiles, stable=True)
+        every = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=self.device)
+        starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
+        splats = splats[places]
+        image = self._empty((height, width, kernels.PIXEL), torch.float32)
+        kernels.composite[(tiles_x * tiles_y,)](
+            records,
+            splats,
+            starts,
+            image,
+            width,
+            height,
+            tiles_x,
+            TILE=TILE,
+            CHUNK=CHUNK,
+        )
+        return TiledImage(image, records, order, ends, splats, places, starts)
+
+    def gradient(self, view: TiledImage, by_pixel: Tensor, columns: int) -> Tensor:
+        """Return the sums ``(N, columns)`` of `triton_kernels.composite_backward` over the tiles of
+        each splat, always added in one order.
+
+        Args:
+            view: What was composited.
+            by_pixel: ``(H, W, 5)`` gradients of colour, weighted depth and opacity.
+            columns: Numbers per pair.
+        """
+        height, width = view.image.shape[:2]
+        pairs = by_pixel.new_zeros(len(view.splats), columns)
+        self.kernels.composite_backward[(len(view.starts) - 1,)](
+            view.records,
+            view.splats,
+            view.starts,
+            view.image,
+            by_pixel,
+            view.places,
+            pairs,
+            width,
+            height,
+            -(-width // TILE),
+            TILE=TILE,
+        )
+        offsets = torch.nn.functional.pad(view.ends.clamp(max=len(pairs)), (1, 0))
+        sums = torch.segment_reduce(pairs, "sum", offsets=offsets, axis=0, unsafe=True)
+        return torch.empty_like(sums).index_copy_(0, view.order, sums)
+
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+
+def tile_grid(camera: PinholeCamera) -> tuple[int, int]:
+    """Return how many tiles an image has in a row and in a column."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+class UploadedClouds(TileCompositor):
     """Clouds in a device's memory, drawn from there in any poses.
 
     Args:
@@ -63,8 +199,7 @@ class UploadedClouds:
     """
 
     def __init__(self, clouds: Sequence[GaussianCloud], device: str) -> None:
-        self.kernels = triton_kernels()
-        self.device = torch.device(require_device(device))
+        super().__init__(device)
         for cloud in clouds:
             cloud.require_drawable()
         self.sizes = [len(cloud) for cloud in clouds]
@@ -88,7 +223,6 @@ class UploadedClouds:
             ),
             np.float32,
         )
-        self.capacity = FIRST_CAPACITY
 
     def draw(
         self,
@@ -116,16 +250,12 @@ class UploadedClouds:
         spans = self._spans([cloud for cloud, _ in nodes])
         poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
         poses[:, POSE_ANTIALIAS] = [self.antialias_px2[cloud] for cloud, _ in nodes]
-        capacity = self.capacity
+        had_room = partial(self.had_room, self.capacity)
         image, pairs = self._image(spans, poses, camera, near_m)
-        alpha = image[..., 4]
-        rgb = (image[..., :3] + (1 - alpha[..., None]) * behind).clamp(0, 1)
+        transmittance = image[..., 4]
+        alpha = 1 - transmittance
+        rgb = (image[..., :3] + transmittance[..., None] * behind).clamp(0, 1)
         depth = torch.where(alpha > 0, image[..., 3] / alpha, 0.0)
-
-        def had_room(count: int) -> bool:
-            if count > capacity:  # the lists were cut short
-                self.capacity = max(self.capacity, count + count // 4)
-            return count <= capacity
 
         def again() -> DeviceOutput:
             return self.draw(nodes, camera, background, near_m)
@@ -137,11 +267,8 @@ class UploadedClouds:
     def _image(
         self, spans: npt.NDArray[np.int32], poses: F64, camera: PinholeCamera, near_m: float
     ) -> tuple[Tensor, Tensor]:
-        """Return colour, weighted depth and opacity ``(H, W, 5)``, and the number of pairs of
-        splat and tile; the image is whole if the pairs are at most `capacity`.
-        """
-        kernels, width, height = self.kernels, camera.width, camera.height
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        """Return what `composite` does of the clouds, and the number of pairs of splat and tile."""
+        kernels, (tiles_x, tiles_y) = self.kernels, tile_grid(camera)
         total = len(spans) * BLOCK
         records = self._empty((total, kernels.RECORD), torch.float32)
         depths = self._empty((total,), torch.float32)
@@ -169,41 +296,8 @@ class UploadedClouds:
                 TILE=TILE,
                 BLOCK=BLOCK,
             )
-        order = torch.sort(depths, stable=True).indices
-        ends = torch.cumsum(counts[order], dim=0)
-        tiles = torch.full(
-            (self.capacity,), tiles_x * tiles_y, dtype=torch.int32, device=self.device
-        )
-        splats = torch.zeros_like(tiles)
-        if total:
-            kernels.list_tiles[(len(spans),)](
-                order,
-                ends,
-                boxes,
-                counts,
-                tiles,
-                splats,
-                total,
-                self.capacity,
-                tiles_x,
-                BLOCK=BLOCK,
-            )
-        sorted_tiles, place = torch.sort(tiles, stable=True)
-        every = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=self.device)
-        starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
-        image = self._empty((height, width, 5), torch.float32)
-        kernels.composite[(tiles_x * tiles_y,)](
-            records,
-            splats[place],
-            starts,
-            image,
-            width,
-            height,
-            tiles_x,
-            TILE=TILE,
-            CHUNK=CHUNK,
-        )
-        return image, counts.sum(dtype=torch.int32)
+        view = self.composite(records, depths, boxes, counts, camera)
+        return view.image, counts.sum(dtype=torch.int32)
 
     def _spans(self, clouds: Sequence[int]) -> npt.NDArray[np.int32]:
         """Return the table of blocks ``(B, 3)``: node, first Gaussian, number of Gaussians."""
@@ -218,9 +312,6 @@ class UploadedClouds:
 
     def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
         return torch.from_numpy(np.array(array, dtype)).to(self.device)
-
-    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        return torch.empty(shape, dtype=dtype, device=self.device)
 
 
 def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:

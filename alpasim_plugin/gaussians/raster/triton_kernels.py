@@ -19,6 +19,7 @@ POSE = 13  # float64 per node: rotation node to camera by rows, camera centre in
 CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
 RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
 BOX = 4  # int32 per splat: first and last + 1 tile column, first and last + 1 tile row
+PIXEL = 6  # float32 per pixel: see `composite`
 
 _EPS2D_PX2 = tl.constexpr(constants.EPS2D_PX2)
 _ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
@@ -232,6 +233,14 @@ def list_tiles(
 
 
 @triton.jit
+def _pixels(tile, tiles_x, TILE: tl.constexpr):
+    """Return the columns and the rows of a tile's pixels."""
+    column = (tile % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
+    row = (tile // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
+    return tl.broadcast(column, row)
+
+
+@triton.jit
 def composite(
     records,
     splats,
@@ -243,11 +252,11 @@ def composite(
     TILE: tl.constexpr,
     CHUNK: tl.constexpr,
 ):
-    """Blend a tile's splats, nearest first, into colour, weighted depth and opacity per pixel."""
+    """Blend a tile's splats, nearest first, into colour, weighted depth and transmittance per pixel;
+    the last of the six numbers is the place in the tile's list behind the last splat drawn.
+    """
     tile = tl.program_id(0)
-    column = (tile % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
-    row = (tile // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
-    column, row = tl.broadcast(column, row)
+    column, row = _pixels(tile, tiles_x, TILE)
     px = column.to(tl.float32) + 0.5
     py = row.to(tl.float32) + 0.5
     transmittance = tl.full((TILE, TILE), 1.0, tl.float32)
@@ -255,9 +264,11 @@ def composite(
     green = tl.zeros((TILE, TILE), tl.float32)
     blue = tl.zeros((TILE, TILE), tl.float32)
     depth = tl.zeros((TILE, TILE), tl.float32)
+    last = tl.zeros((TILE, TILE), tl.int32)
     inside = (column < width) & (row < height)
     open_ = inside
-    begin = tl.load(starts + tile)
+    first = tl.load(starts + tile)
+    begin = first
     end = tl.load(starts + tile + 1)
     while begin < end:
         stop = tl.minimum(begin + CHUNK, end)
@@ -280,12 +291,87 @@ def composite(
             blue += weight * tl.load(record + 8)
             depth += weight * tl.load(record + 9)
             transmittance = tl.where(drawn, after, transmittance)
+            last = tl.where(drawn, k + 1 - first, last)
         begin = stop
         if tl.max(open_.to(tl.int32)) == 0:
             begin = end
-    pixel = image + (row * width + column) * 5
+    pixel = image + (row * width + column) * 6
     tl.store(pixel, red, inside)
     tl.store(pixel + 1, green, inside)
     tl.store(pixel + 2, blue, inside)
     tl.store(pixel + 3, depth, inside)
-    tl.store(pixel + 4, 1.0 - transmittance, inside)
+    tl.store(pixel + 4, transmittance, inside)
+    tl.store(pixel + 5, last.to(tl.float32), inside)
+
+
+@triton.jit
+def composite_backward(
+    records,
+    splats,
+    starts,
+    image,
+    gradients,
+    places,
+    pairs,
+    width,
+    height,
+    tiles_x,
+    TILE: tl.constexpr,
+):
+    """Walk a tile's splats from the last that was drawn to the nearest, and write what each receives
+    in this tile to its row of ``pairs``: see `gradient_kernels`, whose equations and columns
+    these are.
+
+    ``gradients`` holds five numbers per pixel, of colour, weighted depth and opacity; ``places``
+    the row of each entry of ``splats``.
+    """
+    tile = tl.program_id(0)
+    column, row = _pixels(tile, tiles_x, TILE)
+    px = column.to(tl.float32) + 0.5
+    py = row.to(tl.float32) + 0.5
+    inside = (column < width) & (row < height)
+    pixel = row * width + column
+    transmittance = tl.load(image + pixel * 6 + 4, inside, 1.0)
+    last = tl.load(image + pixel * 6 + 5, inside, 0.0).to(tl.int32)
+    gradient = gradients + pixel * 5
+    g_red = tl.load(gradient, inside, 0.0)
+    g_green = tl.load(gradient + 1, inside, 0.0)
+    g_blue = tl.load(gradient + 2, inside, 0.0)
+    g_depth = tl.load(gradient + 3, inside, 0.0)
+    g_alpha = tl.load(gradient + 4, inside, 0.0)
+    behind = tl.zeros((TILE, TILE), tl.float32)
+    begin = tl.load(starts + tile)
+    count = tl.max(last)
+    for back in range(count):
+        i = count - 1 - back
+        record = records + tl.load(splats + begin + i).to(tl.int64) * 12
+        dx = px - tl.load(record)
+        dy = py - tl.load(record + 1)
+        s = tl.load(record + 2) * dx + tl.load(record + 3) * dy
+        t = tl.load(record + 4) * dy
+        full = tl.load(record + 5) * tl.exp(-0.5 * (s * s + t * t))
+        alpha = tl.minimum(full, _ALPHA_MAX)
+        drawn = (alpha >= _ALPHA_MIN) & (i < last)
+        if tl.max(drawn.to(tl.int32)) > 0:
+            inverse = 1.0 / (1.0 - alpha)
+            before = transmittance * inverse
+            q = g_alpha + g_depth * tl.load(record + 9)
+            q += g_red * tl.load(record + 6)
+            q += g_green * tl.load(record + 7)
+            q += g_blue * tl.load(record + 8)
+            weight = tl.where(drawn, before * alpha, 0.0)
+            # The clamp of alpha ends the gradient; colour and depth still receive theirs.
+            h = tl.where(drawn & (full <= _ALPHA_MAX), before * q - behind * inverse, 0.0) * alpha
+            transmittance = tl.where(drawn, before, transmittance)
+            behind += weight * q
+            pair = pairs + tl.load(places + begin + i) * 10
+            tl.store(pair, tl.sum(weight * g_red))
+            tl.store(pair + 1, tl.sum(weight * g_green))
+            tl.store(pair + 2, tl.sum(weight * g_blue))
+            tl.store(pair + 3, tl.sum(weight * g_depth))
+            tl.store(pair + 4, tl.sum(h))
+            tl.store(pair + 5, tl.sum(h * s))
+            tl.store(pair + 6, tl.sum(h * t))
+            tl.store(pair + 7, tl.sum(h * s * s))
+            tl.store(pair + 8, tl.sum(h * s * t))
+            tl.store(pair + 9, tl.sum(h * t * t))

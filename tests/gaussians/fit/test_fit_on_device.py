@@ -1,0 +1,66 @@
+"""The fit on a pretended device: the gradients of the CPU, one wait an update, and checkpoints that
+go on on the CPU.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.gaussians.fit import loop
+from alpasim_plugin.gaussians.fit.loop import SplatFit, fit
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.start import Start
+from alpasim_plugin.gaussians.fit.views import halved
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+from tests.pretended_device import pretended_device
+
+RECIPE = replace(
+    SplatRecipe.street(), steps=20, save_every=2, densify_every=3, densify_from=0.0, sh_share=0.0
+)
+
+
+@pytest.fixture(scope="module")
+def case(posed):
+    """Give two small views, one with a mask and without the car, and a start of 30 Gaussians."""
+    first, second = (halved(view) for view in posed.views[:2])
+    second = replace(second, actors={}, mask=np.arange(24) < np.full((16, 1), 20))
+    car = posed.start.actors["car"].take(np.arange(10))
+    return [first, second], Start(posed.start.background.take(np.arange(0, 280, 14)), {"car": car})
+
+
+def begun(case, device, folder=None):
+    return SplatFit(*case, RECIPE, "s", 1, folder, device)
+
+
+def test_every_view_gives_the_processors_gradients(case, monkeypatch):
+    host = begun(case, "cpu")
+    with pretended_device(monkeypatch):
+        card = begun(case, "cuda")
+        for ours, theirs in zip(card.targets, host.targets, strict=True):
+            found, wanted = card._differentiate(ours), host._differentiate(theirs)
+            assert found["loss"] == pytest.approx(wanted["loss"], rel=1e-5)
+            assert found["mse"] == pytest.approx(wanted["mse"], rel=1e-5)
+            for name, p in host.model.params.items():
+                gradients = card.model.params[name].grad.cpu(), p.grad
+                atol = 1e-3 * float(p.grad.abs().max()) + 1e-9
+                torch.testing.assert_close(*gradients, rtol=0, atol=atol)
+                p.grad = card.model.params[name].grad = None
+        for name in ("total", "count"):
+            found, wanted = getattr(card.gradients, name).cpu(), getattr(host.gradients, name)
+            torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-6)
+
+
+def test_an_update_waits_once_and_one_that_lacked_room_twice(case, monkeypatch):
+    with pretended_device(monkeypatch) as traffic:
+        card = begun(case, "cuda")
+        for capacity, waits in ((10, 2), (1 << 16, 1)):
+            card.compositor.capacity = capacity
+            traffic.reset()
+            card.update()
+            assert sum(traffic.waits.values()) == waits
+            assert traffic.bytes_up < 2_000
+            assert traffic.bytes_down < 200
