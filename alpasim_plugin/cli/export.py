@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import (
     Json,
-    Overwrite,
     refuse_existing,
     run_and_cell,
     run_or_newest,
@@ -57,7 +56,6 @@ def export(
     mcap: Annotated[
         Path | None, Flag("Write a recording for Foxglove and Rerun; extra [mcap].", metavar="FILE")
     ] = None,
-    overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Write a run as AlpaSim run folders and scenes, or one cell as a recording for Foxglove and
@@ -82,7 +80,7 @@ def export(
         _export_to_alpasim(items, alpasim, as_json)
         return
     assert mcap is not None
-    facts = export_recording(items, wanted, mcap, overwrite)
+    facts = export_recording(items, wanted, mcap)
     size = f"{facts['bytes'] / 1e6:.1f} MB, {facts['messages']} messages"
     lines = [f"note     {note}" for note in facts["notes"]]
     show(as_json, facts, *lines, f"mcap     {mcap}  {size}: {facts['recording']}")
@@ -110,16 +108,13 @@ def _export_to_alpasim(items: Sequence[str], folder: Path, as_json: bool) -> Non
     show(as_json, facts, *lines)
 
 
-def export_recording(
-    items: Sequence[str], asked: Wanted, path: Path, overwrite: bool
-) -> dict[str, Any]:
+def export_recording(items: Sequence[str], asked: Wanted, path: Path) -> dict[str, Any]:
     """Write an MCAP recording of one scene, policy and seed.
 
     Args:
         items: The run folder or the rollout's folder; one.
         asked: Which cell of a run, and which renderers.
         path: The file.
-        overwrite: Replace a file that is there.
 
     Returns:
         As `export_mcap`.
@@ -134,7 +129,7 @@ def export_recording(
             f"{' '.join(items)}: several items",
             "Give one run folder, or the folder of one rollout.",
         )
-    refuse_existing(path, "--mcap", overwrite)
+    refuse_existing(path, "--mcap")
     require_mcap()  # before anything is read
     root, cell = run_and_cell(Path(items[0]))
     if os.path.exists(root / SUMMARY):

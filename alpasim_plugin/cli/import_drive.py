@@ -43,10 +43,11 @@ def drive(
             "--map",
         ),
     ] = None,
+    device: Annotated[str, Flag("Where to fit: cpu, cuda or cuda:N.")] = "cpu",
     as_json: Json = False,
 ) -> None:
     """Make a scenario of a recorded drive: photographs with poses."""
-    _import(lambda tell: import_drive(folder, out, camera_height, road, tell), out, as_json)
+    _import(lambda tell: import_drive(folder, out, camera_height, road, tell, device), out, as_json)
 
 
 def splat(

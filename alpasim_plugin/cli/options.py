@@ -238,15 +238,15 @@ def parse_seeds(text: str) -> list[int]:
     )
 
 
-def refuse_existing(path: Path | None, option: str, overwrite: bool = False) -> None:
+def refuse_existing(path: Path | None, option: str) -> None:
     """Refuse to write over a file, or into a folder that is not there.
 
     Raises:
-        InputError: It exists, and ``--overwrite`` was not given; or its folder does not.
+        InputError: It exists, or its folder does not.
     """
     if path is not None and not os.path.isdir(path.parent):
         raise InputError(f"{option} {path}: there is no folder {path.parent}", "Make it first.")
-    if path is not None and os.path.exists(path) and not overwrite:
+    if path is not None and os.path.exists(path):
         raise InputError(f"{option} {path}: the file exists already", "Name another file.")
 
 

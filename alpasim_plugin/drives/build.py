@@ -14,14 +14,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
 from alpasim_plugin.core.reading.images import PNG
-from alpasim_plugin.core.types import F64, Box, CameraSpec, LaneMap
+from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import (
@@ -101,6 +101,7 @@ def import_drive(
     camera_height_m: float | None = None,
     lane_map: Path | None = None,
     report: Report | None = None,
+    device: str = "cpu",
 ) -> JsonObject:
     """Make a scenario of a recorded drive.
 
@@ -113,6 +114,7 @@ def import_drive(
         lane_map: OpenDRIVE map in the drive's coordinates; None makes a corridor of the driven
             path.
         report: Called as the work goes on.
+        device: Where to fit.
 
     Returns:
         What ``quality.json`` holds.
@@ -120,15 +122,16 @@ def import_drive(
     Raises:
         InputError: Anything wrong with the recording, or ``out`` is something else; nothing is left
             behind then.
-        InfrastructureError: The disk refuses.
+        InfrastructureError: The disk refuses, or there is no such device.
     """
+    require_device(device)
     tell = report or (lambda stage, done, all: None)
     with working_folder(out) as work:
         drive = checked(read_source(folder), folder)
         key = key_of(drive, camera_height_m, lane_map)
         if os.path.exists(out):
             return finished(out, key)
-        return _built(drive, folder, work, key, camera_height_m, lane_map, tell)
+        return _built(drive, folder, work, key, camera_height_m, lane_map, tell, device)
 
 
 @contextmanager
@@ -156,6 +159,7 @@ def _built(
     camera_height_m: float | None,
     map_file: Path | None,
     tell: Report,
+    device: str,
 ) -> JsonObject:
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
@@ -178,16 +182,21 @@ def _built(
         present = actors_at(actors, int(one.photograph.t_us or 0))
         views[one.use].append(replace(one.view(), actors=present))
     seen = {name for view in views["fitted"] for name in _in_view(view)}
-    model, exposures = fitted(
+    near = placed.points.chosen(placed.points.spread < np.percentile(placed.points.spread, 90))
+    done = fit_drive(
         views["fitted"],
-        views["held-out"],
-        placed.points,
-        {one.actor_id: one.box for one in actors if one.actor_id in seen},
-        scene_id_of(drive),
-        work / FIT_FOLDER,
-        tell,
+        cloud_from_points(near.xyz, near.rgb),
+        kept=views["held-out"],
+        boxes={one.actor_id: one.box for one in actors if one.actor_id in seen},
+        scene_id=scene_id_of(drive),
+        folder=work / FIT_FOLDER,
+        seed=SEED,
+        report=lambda stage, at, all, numbers: tell(stage, at, all),
+        device=device,
     )
-    quality = write_folder(work, drive, placed, roads, model, shown, views, exposures, tell)
+    quality = write_folder(
+        work, drive, placed, roads, done.model, shown, views, done.exposures, tell
+    )
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
 
@@ -446,42 +455,3 @@ def scene_id_of(drive: SourceDrive) -> str:
     """Return a name that a scenario may have."""
     letters = "".join(c if c.isalnum() or c in "_.-" else "-" for c in drive.scene_id).strip("-_.")
     return letters[:80] or "drive"
-
-
-def fitted(
-    views: Sequence[PosedView],
-    kept: Sequence[PosedView],
-    points: Points,
-    boxes: Mapping[str, Box],
-    scene_id: str,
-    folder: Path,
-    tell: Report,
-) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
-    """Fit a model to views.
-
-    Args:
-        views: To fit to.
-        kept: Held out.
-        points: To start from.
-        boxes: Sizes of the road users that move.
-        scene_id: Key of the random streams.
-        folder: Keeps the fit's state; the same call goes on from it.
-        tell: Called as the fit goes on.
-
-    Returns:
-        The model, and the exposure of each view by its name.
-    """
-    torch.set_num_threads(1)
-    near = points.chosen(points.spread < np.percentile(points.spread, 90))
-    start = cloud_from_points(near.xyz, near.rgb)
-    done = fit_drive(
-        views,
-        start,
-        kept=kept,
-        boxes=boxes,
-        scene_id=scene_id,
-        folder=folder,
-        seed=SEED,
-        report=lambda stage, at, all, numbers: tell(stage, at, all),
-    )
-    return done.model, dict(done.exposures)

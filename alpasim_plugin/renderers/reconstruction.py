@@ -80,7 +80,8 @@ class ReconstructionRenderer(Renderer):
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
         self.device = require_device(device)
-        self.model = model_of(scenario, threads)
+        self.recipe = recipe_of(scenario, device)
+        self.model = model_of(scenario, self.recipe, threads, device)
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
@@ -94,12 +95,11 @@ class ReconstructionRenderer(Renderer):
         """Return what the scenario's cameras saw along the log, at the believed poses; the drives
         of a process share what was read.
         """
-        recipe = recipe_of(self.scenario)
-        key = f"recording:{reconstruction_key(self.scenario, recipe)}"
+        key = f"recording:{reconstruction_key(self.scenario, self.recipe)}"
         return in_memory(
             key,
             lambda: built_recording(
-                self.scenario, scene_of(self.scenario), self.model.graph.render, recipe
+                self.scenario, scene_of(self.scenario), self.model.graph.render, self.recipe
             ),
         )
 
@@ -126,18 +126,19 @@ def reconstruction_renderer(
     return ReconstructionRenderer(scenario, device, threads)
 
 
-def model_of(scenario: Scenario, threads: int | None = None) -> Model:
+def model_of(
+    scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, device: str
+) -> Model:
     """Return the scenario's reconstruction as a scene, read or fitted once per process.
 
     Raises:
-        InputError: The scenario's degradation names no fit, or it has no camera to fit with.
+        InputError: The scenario has no camera to fit with.
         InfrastructureError: The cache cannot be written.
     """
-    recipe = recipe_of(scenario)
     key = reconstruction_key(scenario, recipe)
 
     def read() -> Model:
-        model, sky_views = ensure(scenario, recipe, threads)
+        model, sky_views = ensure(scenario, recipe, threads, device)
         return Model(_graph(model, scenario), SkyMask(sky_views))
 
     return in_memory(f"reconstruction:{key}", read)
@@ -147,6 +148,7 @@ def ensure(
     scenario: Scenario,
     recipe: ReconstructionRecipe,
     threads: int | None = None,
+    device: str = "cpu",
     *,
     again: bool = False,
 ) -> tuple[Reconstruction, list[SkyView]]:
@@ -159,9 +161,8 @@ def ensure(
     )  # needs torch, which a cached reconstruction does not
 
     what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
-    return cached(
-        KIND, key, partial(build, scenario, recipe, threads), read_model, what, again=again
-    )
+    make = partial(build, scenario, recipe, threads, device)
+    return cached(KIND, key, make, read_model, what, again=again)
 
 
 def _graph(model: Reconstruction, scenario: Scenario) -> SceneGraph:

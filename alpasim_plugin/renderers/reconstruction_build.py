@@ -7,14 +7,12 @@ matching images gives both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
@@ -34,7 +32,11 @@ FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is
 
 
 def build(
-    scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, folder: Path
+    scenario: Scenario,
+    recipe: ReconstructionRecipe,
+    threads: int | None,
+    device: str,
+    folder: Path,
 ) -> None:
     """Fit a reconstruction, from misplaced poses and rough depth, and write it into an empty folder.
 
@@ -64,34 +66,21 @@ def build(
     boxes = {one.actor_id: one.box for one in scenario.actors}
     start = rough_start(believed, boxes, recipe, scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})
-    with _one_torch_thread():
-        fitted = fit(
-            believed,
-            start,
-            splat,
-            scene_id=scene_id,
-            report=lambda step, _: announce(f"fitting {scene_id}", step, splat.steps),
-            threads=threads,
-        )
+    fitted = fit(
+        believed,
+        start,
+        splat,
+        scene_id=scene_id,
+        report=lambda step, _: announce(f"fitting {scene_id}", step, splat.steps),
+        threads=threads,
+        device=device,
+    )
     actors = {
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
     }
     sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in believed if v.sky is not None]
     facts = {"scene_id": scene_id, "recipe": asdict(recipe), "views": len(views)}
     write_model(folder, Reconstruction(fitted.background, actors, fitted.sky), sky_views, facts)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Let torch sum in one order, so that the model is the same on any number of cores; its share
-    of a fit is too small to divide.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong together

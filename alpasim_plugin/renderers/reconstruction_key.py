@@ -59,6 +59,7 @@ class ReconstructionRecipe:
         opacity: Of the Gaussians at the start.
         pose_error_m: Spread of the views' believed places, metres; their directions err in
             proportion.
+        place: Where it is fitted, ``cpu`` or ``cuda``: their last digits differ.
     """
 
     splat: SplatRecipe
@@ -69,9 +70,10 @@ class ReconstructionRecipe:
     size: float = 0.6
     opacity: float = 0.2
     pose_error_m: float = 0.0
+    place: str = "cpu"
 
 
-def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
+def recipe_of(scenario: Scenario, device: str = "cpu") -> ReconstructionRecipe:
     """Return the recipe of a scenario's degradation, which is fitted to what its cameras saw along
     the log.
 
@@ -121,6 +123,7 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
         depth_every=INSTANTS_RIG if is_rig else INSTANTS_ONE_CAMERA,
         range_error=amount.depth_error,
         pose_error_m=amount.pose_error_m,
+        place=device.partition(":")[0],
     )
 
 
@@ -171,13 +174,13 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
     return digest.hexdigest()
 
 
-def model_key(scenario: Scenario) -> str | None:
-    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is
+def model_key(scenario: Scenario, device: str) -> str | None:
+    """Return the key of what the renderer ``3dgs`` shows of a scenario on a device; None where nothing is
     fitted.
     """
     if scenario.degradation.kind == "none":
         return None
-    return reconstruction_key(scenario, recipe_of(scenario))
+    return reconstruction_key(scenario, recipe_of(scenario, device))
 
 
 def _content(value: object) -> object:

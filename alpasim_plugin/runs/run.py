@@ -365,7 +365,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "policies": [spec.name for spec in plan.policies],
             "seeds": list(plan.seeds),
             "scenes": {
-                name: _scene_facts(scenario, refs[name])
+                name: _scene_facts(scenario, refs[name], plan.options.device)
                 for name, scenario in plan.scenarios.items()
             },
             "bases": {spec.name: spec.base.name for spec in fixed},
@@ -395,7 +395,7 @@ def origin_of(command: Sequence[str]) -> JsonObject:
     }
 
 
-def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> JsonObject:
+def _scene_facts(scenario: Scenario, ref: ScenarioRef, device: str) -> JsonObject:
     return {
         "source": scenario.source,
         "ref": vars(ref) | {"path": str(Path(ref.path).absolute())},
@@ -406,6 +406,6 @@ def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> JsonObject:
         "rates": asdict(scenario.rates),
         "latency": asdict(scenario.latency),
         "degradation": asdict(scenario.degradation),
-        "reconstruction": model_key(scenario),
+        "reconstruction": model_key(scenario, device),
         "notes": list(scenario.notes),
     }

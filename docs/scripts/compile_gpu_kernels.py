@@ -24,7 +24,6 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
 CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK}
 TYPES = {
     "*fp64": ("poses", "camera", "means"),
-    "*fp32": "factors opacities extents sh_ptr records depths image gradients pairs".split(),
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
     "*i64": ("order", "ends", "places"),
     "fp32": ("near_m",),
@@ -39,7 +38,7 @@ def resources(kernel: Any, capability: int) -> str:
     type_of = {name: kind for kind, names in TYPES.items() for name in names}
     source = ASTSource(
         fn=kernel,
-        signature={name: type_of[name] for name in names},
+        signature={name: type_of.get(name, "*fp32") for name in names},
         constexprs={name: CONSTANTS[name] for name in names if name in CONSTANTS},
     )
     compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))

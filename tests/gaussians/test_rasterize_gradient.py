@@ -6,11 +6,11 @@ import torch
 
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
 from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid

@@ -57,6 +57,7 @@ def fit_drive(
     report: Report | None = None,
     threads: int | None = None,
     recipe: SplatRecipe | None = None,
+    device: str = "cpu",
 ) -> FittedDrive:
     """Fit a street to the photographs of a drive.
 
@@ -73,6 +74,7 @@ def fit_drive(
             gaussians.
         threads: Of the rasteriser.
         recipe: How to fit; None is `SplatRecipe.street`.
+        device: Where to fit; what comes before is measured on the CPU.
 
     Raises:
         InputError: No view, or neither points nor depth to start from.
@@ -101,6 +103,7 @@ def fit_drive(
         scene_id=scene_id,
         folder=folder,
         threads=threads,
+        device=device,
         report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
     )
     after = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]

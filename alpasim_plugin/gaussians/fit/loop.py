@@ -8,7 +8,8 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -86,18 +87,33 @@ def fit(
             it; or there is no such device.
     """
     begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
-    run = SplatFit(views, begin, recipe, scene_id, threads, folder, device)
-    while run.step < recipe.steps:
-        numbers = run.update()
-        if report is not None:
-            report(run.step, numbers)
-        if folder is not None and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
-            run.save()
+    with _one_torch_thread():
+        run = SplatFit(views, begin, recipe, scene_id, threads, folder, device)
+        while run.step < recipe.steps:
+            numbers = run.update()
+            if report is not None:
+                report(run.step, numbers)
+            is_due = run.step % recipe.save_every == 0 or run.step == recipe.steps
+            if folder is not None and is_due:
+                run.save()
     background, actors = run.model.clouds()
     gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
     return Reconstruction(
         background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains
     )
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Let torch sum in one order, so that the model is the same on any number of cores; its share
+    of a fit is too small to divide.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True, eq=False)

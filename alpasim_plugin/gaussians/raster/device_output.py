@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.devices import download
+from alpasim_plugin.core.devices import download, upload
 from alpasim_plugin.core.types import F32, Bool, DevicePlanes, Frame
 from alpasim_plugin.gaussians.raster.output import OPAQUE, RasterOutput
 
@@ -63,12 +63,12 @@ class DeviceOutput(RasterOutput):
 
     def covered(self, share: F32) -> DeviceOutput:
         """See `RasterOutput.covered`."""
-        cover = self._upload(share)
+        cover = upload(share, self.alpha.device)
         return self.changed(lambda out: {"alpha": torch.maximum(out.alpha, cover)})
 
     def with_sky(self, above: Bool) -> DeviceOutput:
         """See `RasterOutput.with_sky`."""
-        high = self._upload(above)
+        high = upload(above, self.alpha.device)
 
         def change(out: DeviceOutput) -> Mapping[str, Tensor]:
             sky = (out.alpha < OPAQUE) & high
@@ -81,7 +81,7 @@ class DeviceOutput(RasterOutput):
 
     def exposed(self, gain: F32) -> DeviceOutput:
         """See `RasterOutput.exposed`."""
-        factor = self._upload(gain.astype(np.float32))
+        factor = upload(gain.astype(np.float32), self.alpha.device)
         return self.changed(lambda out: {"rgb": (out.rgb * factor).clamp(0, 1)})
 
     def frame(self, t_us: int, camera: str) -> Frame:
@@ -92,6 +92,3 @@ class DeviceOutput(RasterOutput):
     def changed(self, change: Callable[[DeviceOutput], Mapping[str, Any]]) -> DeviceOutput:
         """Return the view with other planes, which it also has when it is drawn again."""
         return replace(self, **change(self), again=lambda: self.again().changed(change))
-
-    def _upload(self, array: Any) -> Tensor:
-        return torch.from_numpy(np.asarray(array, order="C")).to(self.alpha.device)

@@ -6,8 +6,9 @@ image's gradient back to the projected splats, on the CPU or on a GPU.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,9 +28,11 @@ from alpasim_plugin.gaussians.constants import (
     NEAR_M,
     PEAK,
     RADIUS_X,
+    RADIUS_Y,
     RECORD,
     TILE,
     U,
+    V,
     Z,
 )
 from alpasim_plugin.gaussians.raster.gradient_kernels import (
@@ -176,19 +179,20 @@ def rasterize_gradient(
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
         records = _records(*projected, scale)
-        on_screen = _reach_image(records, camera)
-        tiled: _Tiled
+        centre, reach = records[:, U : V + 1], records[:, RADIUS_X : RADIUS_Y + 1]
+        last = upload([camera.width - 0.5, camera.height - 0.5], records.device)
+        on_screen = ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
         if compositor is None:
-            tiled = _TiledByCpu(records, camera, thread_count(threads))
+            images, sums, pairs = _on_cpu(records, camera, thread_count(threads))
         else:
             on_screen &= drawn
-            tiled = _TiledByGpu(records, log_opacity, on_screen, camera, compositor)
-    colour_sum, alpha, depth_sum = _Composite.apply(*projected, tiled, scale)  # type: ignore[no-untyped-call]
+            images, sums, pairs = _on_gpu(records, log_opacity, on_screen, camera, compositor)
+    colour_sum, alpha, depth_sum = _Composite.apply(*projected, images, sums, scale)  # type: ignore[no-untyped-call]
     rgb = colour_sum
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
-    return GradientOutput(rgb, alpha, depth, index, uv, on_screen, tiled.pairs)
+    return GradientOutput(rgb, alpha, depth, index, uv, on_screen, pairs)
 
 
 def rasterize_torch(
@@ -249,15 +253,6 @@ def _is_drawn(local: Tensor, splats: Splats, near_m: float) -> Tensor:
     """Return which Gaussians ``(N,)`` are far and opaque enough."""
     least = float(logit(np.array(ALPHA_MIN)))
     return (local[2] >= near_m) & (splats.logit_opacities >= least)
-
-
-def _reach_image(records: Tensor, camera: PinholeCamera) -> Tensor:
-    """Return which records ``(M,)`` have a pixel centre in the box around their ellipse."""
-    on_screen = torch.ones(len(records), dtype=torch.bool, device=records.device)
-    for axis, size in ((0, camera.width), (1, camera.height)):
-        centre, reach = records[:, U + axis], records[:, RADIUS_X + axis]
-        on_screen &= (centre + reach >= 0.5) & (centre - reach <= size - 0.5)
-    return on_screen
 
 
 # Vectors are tensors (3, N): operations on whole components are several times as fast.
@@ -358,74 +353,56 @@ def _records(
     return records
 
 
-class _Tiled(Protocol):
-    """Splats of one view, listed by tile."""
-
-    pairs: Tensor
-
-    def images(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the sums of weighted colours ``(H, W, 3)``, alpha ``(H, W)`` and the sums of
-        weighted depths ``(H, W)``.
-        """
-
-    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
-        """Return what each splat receives of the images' gradients, ``(M, PAIR)``."""
+Images = tuple[Tensor, Tensor, Tensor]  # sums of weighted colours, alpha, sums of weighted depths
+Sums = Callable[
+    [Tensor, Tensor, Tensor], Tensor
+]  # their gradients to what a splat receives (M, PAIR)
 
 
-class _TiledByCpu:
-    def __init__(self, records: Tensor, camera: PinholeCamera, threads: int) -> None:
-        self.records, self.camera, self.threads = records.numpy().reshape(-1), camera, threads
-        self.tiles = list_per_tile(np.arange(len(records)), self.records, camera, threads)
-        self.kept = np.empty((len(self.tiles.starts) - 1) * 16 * KEPT, np.float32)
-        self.pairs = torch.tensor(len(self.tiles.lists))
+def _on_cpu(records: Tensor, camera: PinholeCamera, threads: int) -> tuple[Images, Sums, Tensor]:
+    flat = records.numpy().reshape(-1)
+    tiles = list_per_tile(np.arange(len(records)), flat, camera, threads)
+    kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, np.float32)
+    colour, alpha, depth = (
+        torch.from_numpy(image) for image in composite(tiles, flat, kept, camera, threads)
+    )
 
-    def images(self) -> tuple[Tensor, Tensor, Tensor]:
-        images = composite(self.tiles, self.records, self.kept, self.camera, self.threads)
-        colour, alpha, depth = (torch.from_numpy(image) for image in images)
-        return colour, alpha, depth
-
-    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
-        tiles, images = self.tiles, (by_colour, by_alpha, by_depth)
+    def sums(*gradients: Tensor) -> Tensor:
         pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
-        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, self.records)
-        gradients = (g.to(torch.float32).contiguous().numpy() for g in images)
-        run_on_threads(self.threads, tile_gradients, *lists, self.kept, *gradients, pairs)
-        rows = np.zeros((len(self.records) // RECORD, PAIR), np.float32)
+        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, flat)
+        images = (g.to(torch.float32).contiguous().numpy() for g in gradients)
+        run_on_threads(threads, tile_gradients, *lists, kept, *images, pairs)
+        rows = np.zeros((len(records), PAIR), np.float32)
         add_pairs(tiles.lists, pairs, rows)
         return torch.from_numpy(rows)
 
+    return (colour, alpha, depth), sums, torch.tensor(len(tiles.lists))
 
-class _TiledByGpu:
-    def __init__(
-        self,
-        records: Tensor,
-        log_opacity: Tensor,
-        on_screen: Tensor,
-        camera: PinholeCamera,
-        compositor: TileCompositor,
-    ) -> None:
-        edges = []
-        for axis, count in enumerate(tile_grid(camera)):
-            centre, reach = records[:, U + axis], records[:, RADIUS_X + axis]
-            edges.append(((centre - reach) / TILE).floor().clamp(0, count))
-            edges.append(((centre + reach) / TILE).floor().clamp(-1, count - 1) + 1)
-        boxes = torch.stack(edges, dim=1).nan_to_num().to(torch.int32)
-        x0, x1, y0, y1 = boxes.unbind(1)
-        counts = (x1 - x0).clamp(min=0) * (y1 - y0).clamp(min=0) * on_screen
-        rows = records[:, : compositor.kernels.RECORD].contiguous()
-        rows[:, PEAK] = log_opacity.exp()
-        depths = torch.where(on_screen, records[:, Z], torch.inf)
-        self.compositor = compositor
-        self.view = compositor.composite(rows, depths, boxes, counts, camera)
-        self.pairs = counts.sum()
 
-    def images(self) -> tuple[Tensor, Tensor, Tensor]:
-        image = self.view.image
-        return image[..., :3], 1 - image[..., 4], image[..., 3]
+def _on_gpu(
+    records: Tensor,
+    log_opacity: Tensor,
+    on_screen: Tensor,
+    camera: PinholeCamera,
+    compositor: TileCompositor,
+) -> tuple[Images, Sums, Tensor]:
+    centre, reach = records[:, U : V + 1], records[:, RADIUS_X : RADIUS_Y + 1]
+    tiles = upload(tile_grid(camera), records.device)
+    first = ((centre - reach) / TILE).floor().clamp(min=0).minimum(tiles)
+    end = ((centre + reach) / TILE).floor().clamp(min=-1).minimum(tiles - 1) + 1
+    boxes = torch.stack([first, end], dim=2).nan_to_num().to(torch.int32).flatten(1)
+    counts = ((end - first).clamp(min=0).prod(dim=1) * on_screen).to(torch.int32)
+    rows = records[:, : compositor.kernels.RECORD].contiguous()
+    rows[:, PEAK] = log_opacity.exp()
+    depths = torch.where(on_screen, records[:, Z], torch.inf)
+    view = compositor.composite(rows, depths, boxes, counts, camera)
 
-    def sums(self, by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
+    def sums(by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
         by_pixel = torch.cat([by_colour, by_depth[..., None], by_alpha[..., None]], dim=2)
-        return self.compositor.gradient(self.view, by_pixel.contiguous(), PAIR)
+        return compositor.gradient(view, by_pixel, PAIR)
+
+    image = view.image
+    return (image[..., :3], 1 - image[..., 4], image[..., 3]), sums, counts.sum()
 
 
 class _Composite(torch.autograd.Function):
@@ -440,12 +417,13 @@ class _Composite(torch.autograd.Function):
         log_opacity: Tensor,
         colour: Tensor,
         depth: Tensor,
-        tiled: _Tiled,
+        images: Images,
+        sums: Sums,
         scale: float,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> Images:
         ctx.save_for_backward(m, n, colour)
-        ctx.tiled, ctx.scale = tiled, scale
-        return tiled.images()
+        ctx.sums, ctx.scale = sums, scale
+        return images
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -456,7 +434,7 @@ class _Composite(torch.autograd.Function):
         needles of thousands of pixels lose nothing.
         """
         m, n, colour = ctx.saved_tensors
-        sums = ctx.tiled.sums(*gradients).T.contiguous()
+        sums = ctx.sums(*gradients).T.contiguous()
         _, c12, c22, det = _covariance(m, n)
         # The moments are over whitened coordinates times the scale: each w holds one.
         w11, w22 = (c22 / det).sqrt() / ctx.scale, c22.rsqrt() / ctx.scale
@@ -474,6 +452,7 @@ class _Composite(torch.autograd.Function):
             sums[PAIR_H],
             by_colour,
             sums[PAIR_Z],
+            None,
             None,
             None,
         )

@@ -164,7 +164,7 @@ class TileCompositor:
             view.splats,
             view.starts,
             view.image,
-            by_pixel,
+            by_pixel.contiguous(),
             view.places,
             pairs,
             width,

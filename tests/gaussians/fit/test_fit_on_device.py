@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.gaussians.fit import loop
-from alpasim_plugin.gaussians.fit.loop import SplatFit, fit
+from alpasim_plugin.gaussians.fit.loop import SplatFit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import halved
