@@ -17,6 +17,7 @@ from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasteriz
 from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.examples import first_of
+from tests.gaussians import test_rasterize_gradient
 from tests.gaussians.gaussian_scenes import (
     HARD,
     LSB,
@@ -26,10 +27,11 @@ from tests.gaussians.gaussian_scenes import (
     random_rigid,
     splats,
 )
+from tests.gaussians.gradient_scenes import assert_close, kernel_gradients, numeric_gradients
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, UploadedClouds
 
 
 def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0), near_m=0.1):
@@ -118,6 +120,12 @@ def test_a_window_shows_what_the_whole_image_does():
     np.testing.assert_allclose(part.rgb, whole.rgb[8:40, 16:80], atol=1e-4)
 
 
+@pytest.mark.parametrize("make", first_of(test_rasterize_gradient.HARD))
+def test_the_gradient_of_a_hard_case_is_that_of_the_reference(make):
+    found, _ = kernel_gradients(make(), TileCompositor("cpu"))
+    assert_close(found, numeric_gradients(make()), test_rasterize_gradient.TOLERANCE)
+
+
 def test_bad_devices_are_refused():
     with pytest.raises(InputError):
         UploadedClouds([], "gpu")
@@ -142,12 +150,8 @@ def test_kernels_compile_without_spilling(capability):
         check=True,
     )
     lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines] == [
-        "project",
-        "list_tiles",
-        "composite",
-        "composite_backward",
-    ]
+    names = "project list_tiles composite composite_backward"
+    assert [line.split()[0] for line in lines] == names.split()
     assert all("stack 0 " in line for line in lines), lines
 
 

@@ -12,9 +12,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.cli.image_sizes import parse_size
-from alpasim_plugin.lab.cli.training_options import AsJson, Debug, scene_files
+from alpasim_plugin.lab.cli.training_options import AsJson, Debug, Device, scene_files
 from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.lab.training.pair_pack import write_pack
 from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
@@ -80,6 +81,7 @@ def pairs(
             help="Also write the sequences into this file of at most 40 MB, images as video: it stands for a folder of pairs in training.",
         ),
     ] = None,
+    device: Device = "cpu",
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
@@ -96,7 +98,8 @@ def pairs(
     made: Iterable[tuple[Path, bool]]  # folder of a sequence, and whether it is new
     if len(sources) == 1 and sources[0].is_dir():
         scenes = scenes_of(sources[0], split, count)
-        maker = _Maker(out, PairRecipe(source, max_offset_m=max_offset_m, offset_m=offset_m), seed)
+        recipe = PairRecipe(source, max_offset_m=max_offset_m, offset_m=offset_m)
+        maker = _Maker(out, recipe, seed, require_device(device))
         made = (result for _, result in map_jobs(maker, scenes, jobs))
     else:
         sizes = [parse_size(text) for text in size or ["256x144"]]
@@ -131,13 +134,20 @@ class _Maker:
     out: Path
     recipe: PairRecipe
     seed: int
+    device: str
 
     def __call__(self, scene: _Scene) -> tuple[Path, bool]:
         family = scene.path.stem.rsplit("_", 1)[0]
         folder = self.out / scene.split / scene.path.stem
         scenario = load_scenario(scene.path)
         is_new = make_sequence(
-            scenario, folder, self.recipe, self.seed, split=scene.split, family=family
+            scenario,
+            folder,
+            self.recipe,
+            self.seed,
+            split=scene.split,
+            family=family,
+            device=self.device,
         )
         return folder, is_new
 

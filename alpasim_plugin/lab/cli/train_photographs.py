@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.drives.build import SCENARIO_FILE
-from alpasim_plugin.lab.cli.training_options import AsJson, Debug
+from alpasim_plugin.lab.cli.training_options import AsJson, Debug, Device
 from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
 from alpasim_plugin.lab.training.photographs import read_photographs
@@ -47,6 +48,7 @@ def photographs(
         int, typer.Option("--steps", min=1, help="Updates of the fit; few leave it under-trained.")
     ] = 300,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fit.")] = 0,
+    device: Device = "cpu",
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
@@ -65,10 +67,12 @@ def photographs(
         name or folder.resolve().name,
     )
     if (folder / DRIVE_FILE).is_file():
-        made = make_drive_pairs(load_scenario(str(folder / SCENARIO_FILE)), named, out, recipe)
+        scenario = load_scenario(str(folder / SCENARIO_FILE))
+        made = make_drive_pairs(scenario, named, out, recipe, require_device(device))
     else:
         found = read_photographs(folder, width)
-        missing, made = found.missing, make_photograph_pairs(found, named, out, recipe)
+        missing = found.missing
+        made = make_photograph_pairs(found, named, out, recipe, require_device(device))
     if missing:
         shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
         console.print(

@@ -133,9 +133,7 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
             "split": split,
             "family": DRIVE,
         }
-        write_drive_sequence(
-            scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1
-        )
+        write_drive_sequence(scenario, shown, fitted, root / "pairs" / split / "drive_0", info)
     return PairSequence(root / "pairs" / "held_out" / "drive_0")
 
 

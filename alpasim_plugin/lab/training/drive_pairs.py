@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
@@ -84,7 +83,7 @@ class Shot:
 
 
 def make_drive_pairs(
-    scenario: Scenario, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1
+    scenario: Scenario, name: str, out: Path, recipe: PhotographRecipe, device: str = "cpu"
 ) -> Iterator[PhotographPairs]:
     """Write the sequences ``out/SPLIT/NAME_CAMERA_PHASE``; equal ones are kept.
 
@@ -93,7 +92,7 @@ def make_drive_pairs(
         name: Of the sequences.
         out: Folder of pairs.
         recipe: How.
-        threads: Of the rasteriser.
+        device: Where to fit and to render.
 
     Raises:
         InputError: A camera that took too few photographs.
@@ -114,7 +113,7 @@ def make_drive_pairs(
             made = not is_made(folder, info)
             if made:
                 shots = [Shot.read(one, recipe.width) for one in taken]
-                _write(scenario, shots, points, folder, recipe, phase, info, threads)
+                _write(scenario, shots, points, folder, recipe, phase, info, device)
             yield PhotographPairs(folder, made, PairSequence(folder).info["psnr_db"])
 
 
@@ -142,13 +141,13 @@ def _write(
     recipe: PhotographRecipe,
     phase: int,
     info: dict[str, Any],
-    threads: int,
+    device: str,
 ) -> None:
     held = [shot for i, shot in enumerate(shots) if i % recipe.every == phase]
     fitted = [shot for i, shot in enumerate(shots) if i % recipe.every != phase]
     with tempfile.TemporaryDirectory(prefix="simrun-pairs-") as scratch:
-        known = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, threads)
-        write_drive_sequence(known, held, fitted, folder, info, threads)
+        known = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, device)
+        write_drive_sequence(known, held, fitted, folder, info, device)
 
 
 def write_drive_sequence(
@@ -157,7 +156,7 @@ def write_drive_sequence(
     recorded: Sequence[Shot],
     folder: Path,
     info: dict[str, Any],
-    threads: int,
+    device: str = "cpu",
 ) -> None:
     """Write what a drive's model shows where photographs were taken, those photographs, and its
     recording.
@@ -169,9 +168,9 @@ def write_drive_sequence(
             training.
         folder: ROOT/SPLIT/SEQUENCE.
         info: Of sequence.json.
-        threads: Of the rasteriser.
+        device: Where to render.
     """
-    renderer = make_renderer("3dgs", scenario, seed=int(info["seed"]), threads=threads)
+    renderer = make_renderer("3dgs", scenario, int(info["seed"]), device, threads=1)
     geometry: list[FrameGeometry] = []
     pairs = list(_frames(scenario, shown, renderer, geometry))
     frames = [_recorded(scenario, shot, renderer) for shot in recorded]
@@ -203,25 +202,21 @@ def _fitted(
     scratch: Path,
     recipe: PhotographRecipe,
     phase: int,
-    threads: int,
+    device: str,
 ) -> Scenario:
     """Return the scenario with a model that was fitted to these photographs alone."""
     views = [shot.view(scenario, i) for i, shot in enumerate(shots)]
     splat = replace(SplatRecipe.street(), steps=recipe.steps)
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        done = fit_drive(
-            views,
-            points,
-            boxes={actor.actor_id: actor.box for actor in scenario.actors},
-            scene_id=f"{scenario.scene_id}-{phase}",
-            seed=recipe.seed,
-            threads=threads,
-            recipe=splat,
-        )
-    finally:
-        torch.set_num_threads(before)
+    done = fit_drive(
+        views,
+        points,
+        boxes={actor.actor_id: actor.box for actor in scenario.actors},
+        scene_id=f"{scenario.scene_id}-{phase}",
+        seed=recipe.seed,
+        threads=1,
+        recipe=splat,
+        device=device,
+    )
     done.model.save(scratch, {"scene_id": scenario.scene_id, "views": len(views)})
     recording = [
         replace(shot.photograph, use="fitted", exposure=done.exposures[view.name])

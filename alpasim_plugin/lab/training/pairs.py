@@ -57,7 +57,7 @@ def make_sequence(
     *,
     split: str,
     family: str,
-    threads: int = 1,
+    device: str = "cpu",
 ) -> bool:
     """Render one sequence of a scenario unless an equal one exists.
 
@@ -68,7 +68,7 @@ def make_sequence(
         recipe: Definition of the sequence.
         seed: Of the lateral offset and the source renderer.
         split, family: Stored in sequence.json.
-        threads: Threads of the rasteriser.
+        device: Where to fit and to render.
 
     Returns:
         Whether it was rendered now.
@@ -97,7 +97,7 @@ def make_sequence(
         "T_rig_camera": camera.T_rig_camera.tolist(),
     }
     facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
-    source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
+    source = make_renderer(recipe.source, scenario, seed, device, threads=1)
     geometry: list[FrameGeometry] = []
     recorded = [frame for frame in source.recorded() if frame.camera == camera.name]
 
@@ -107,7 +107,7 @@ def make_sequence(
 
     write_sequence(
         folder,
-        pair_frames(scenario, camera, recipe, seed, threads, source, geometry),
+        pair_frames(scenario, camera, recipe, seed, source, geometry, device),
         len(times),
         facts,
         beside,
@@ -120,14 +120,14 @@ def pair_frames(
     camera: CameraSpec,
     recipe: PairRecipe,
     seed: int,
-    threads: int,
     source: Renderer,
     geometry: list[FrameGeometry],
+    device: str,
 ) -> Iterator[Pair]:
     """Yield the frames of one sequence in order of time, and append depth and actors of each to
     ``geometry``.
     """
-    target = make_renderer(recipe.target, scenario, seed=seed, threads=threads)
+    target = make_renderer(recipe.target, scenario, seed, device, threads=1)
     layers = prepare_map(scenario.lane_map)
     offset_m = lateral_offsets(scenario, recipe, seed)
     for i, t_us in enumerate(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)):
@@ -143,7 +143,7 @@ def pair_frames(
         geometry.append(FrameGeometry(damaged.depth.astype(np.float16), actors))
         opacity = np.rint(damaged.alpha * 255).clip(0, 255).astype(np.uint8)
         sdmap = draw_map(
-            layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=threads
+            layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=1
         )
         yield Pair(damaged.rgb, target.render(request).rgb, opacity, sdmap, T_world_camera, t_us)
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
@@ -92,7 +91,7 @@ class PhotographPairs:
 
 
 def make_photograph_pairs(
-    photographs: Photographs, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1
+    photographs: Photographs, name: str, out: Path, recipe: PhotographRecipe, device: str = "cpu"
 ) -> Iterator[PhotographPairs]:
     """Write the sequences ``out/SPLIT/NAME_PHASE``; equal ones are kept.
 
@@ -101,7 +100,7 @@ def make_photograph_pairs(
         name: Of the sequences.
         out: Folder of pairs.
         recipe: How.
-        threads: Of the rasteriser.
+        device: Where to fit and to render.
 
     Raises:
         InputError: Too few photographs, or none that overlap.
@@ -118,8 +117,8 @@ def make_photograph_pairs(
         made = not is_made(folder, info)
         if made:
             matched = matches(photographs.views) if matched is None else matched
-            graph = _fitted(photographs, matched, recipe, phase, name, threads)
-            shown = [graph.render(view.camera, {}, threads) for view in photographs.views]
+            graph = _fitted(photographs, matched, recipe, phase, name, device)
+            shown = [graph.render(view.camera, {}, 1, device) for view in photographs.views]
             images = [
                 (one.to_uint8(), np.rint(one.alpha * 255).clip(0, 255).astype(np.uint8))
                 for one in shown
@@ -163,20 +162,14 @@ def _fitted(
     recipe: PhotographRecipe,
     phase: int,
     name: str,
-    threads: int,
+    device: str,
 ) -> SceneGraph:
     used = [i for i in range(len(photographs.views)) if i % recipe.every != phase]
     rng = stream(f"photographs-{name}", recipe.seed, "photographs.start", phase)
     start = triangulated(photographs.views, found, used, recipe.points, rng)
     views = [resized(photographs.views[i], min(FITTED_PX, recipe.width)) for i in used]
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return fit(
-            views, start, recipe.splat(), scene_id=f"photographs-{name}", threads=threads
-        ).graph()
-    finally:
-        torch.set_num_threads(before)
+    scene_id = f"photographs-{name}"
+    return fit(views, start, recipe.splat(), scene_id=scene_id, threads=1, device=device).graph()
 
 
 def _psnr(photographs: Photographs, images: list[U8], held_out: set[int]) -> dict[str, float]:
