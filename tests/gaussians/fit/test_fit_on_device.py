@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.loop import SplatFit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.start import Start
-from alpasim_plugin.gaussians.fit.views import halved
+from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
+from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from tests.gaussians.gaussian_scenes import camera
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
@@ -53,13 +55,34 @@ def test_every_view_gives_the_processors_gradients(case, monkeypatch):
             torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-6)
 
 
-def test_an_update_waits_once_and_one_that_lacked_room_twice(case, monkeypatch):
+def test_an_update_waits_once_and_goes_on_on_the_cpu(case, tmp_path, monkeypatch):
     with pretended_device(monkeypatch) as traffic:
-        card = begun(case, "cuda")
-        for capacity, waits in ((10, 2), (1 << 16, 1)):
+        card = begun(case, "cuda", tmp_path)
+        # An update whose lists lacked room; one as usual; one that densifies.
+        for capacity, waits in ((10, 2), (1 << 16, 1), (1 << 16, 2)):
             card.compositor.capacity = capacity
             traffic.reset()
             card.update()
             assert sum(traffic.waits.values()) == waits
-            assert traffic.bytes_up < 2_000
-            assert traffic.bytes_down < 200
+            assert traffic.bytes_up < 2_500
+            assert traffic.bytes_down < 600
+        card.save()
+        wanted = {name: p.cpu() for name, p in card.model.params.items()}
+        background, actors = card.model.clouds()
+    host = begun(case, "cpu", tmp_path)
+    assert host.step == 3
+    assert all(torch.equal(p, wanted[name]) for name, p in host.model.params.items())
+    assert len(background) + len(actors["car"]) == len(host.model) > 30
+    assert host.update()["loss"] < 1
+
+
+def test_a_drive_is_fitted_where_it_was_asked_for(monkeypatch):
+    views = [PosedView(camera(32, 16, 20.0), np.full((16, 32, 3), 90, np.uint8))]
+    points = cloud_from_points(np.array([[0.0, 0, 4], [0.5, 0, 5]]), np.full((2, 3), 0.5))
+    recipe = replace(RECIPE, steps=1)
+    wanted = fit_drive(views, points, recipe=recipe).model.background
+    with pretended_device(monkeypatch) as traffic:
+        found = fit_drive(views, points, recipe=recipe, device="cuda").model.background
+        assert traffic.launches
+    for name in ("means", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-4)

@@ -96,7 +96,7 @@ def test_rows_keep_their_moments_when_others_come_and_go():
     p.sum().backward()
     adam.update({"p": p}, {"p": 0.1})
     before = adam.first["p"].clone()
-    adam.take(torch.tensor([2, 0, 0]), torch.tensor([False, False, True]))
+    adam.take(torch.tensor([2, 0, 0]), 2)
     assert torch.equal(adam.first["p"], torch.stack([before[2], before[0], torch.zeros(2)]))
 
 
@@ -154,7 +154,7 @@ def density_case(cap=100):
     )
     model = model_of(cloud, {"car": cloud.take([0])})
     gradients = ScreenGradients(4)
-    gradients.add(torch.arange(4), torch.tensor([1e-3, 2e-3, 0.0, 5e-3]))
+    gradients.add(torch.arange(4), torch.tensor([1e-3, 2e-3, 0.0, 5e-3]), torch.ones(4))
     return (
         model,
         RowAdam(model.params),
