@@ -87,8 +87,8 @@ class View:
 
 FRONT = View("front", 0.0, 192, 80, 125.0, 18.0)  # 75 degrees across
 SIDES = (
-    View("left", 60.0, 128, 32, 83.4, 10.0),
-    View("right", -60.0, 128, 32, 83.4, 10.0),
+    View("left", 60.0, 160, 32, 104.3, 10.0),
+    View("right", -60.0, 160, 32, 104.3, 10.0),
 )
 
 

@@ -43,6 +43,7 @@ _SPEED_SCALE = [1.5 * t for t in TIMES_S]  # metres per second
 _PARTS = [len(KNOTS_M), len(TIMES_S), 2, 2]
 _MIN_SIGMA = 0.02
 PROXIMITY_M = 20.0
+ASIDE = 32  # features of a view to a side
 VIEWS = "views"  # entry in the header of the weights
 MOST_PIXELS = 512
 
@@ -58,38 +59,54 @@ class Prediction:
     sigma: Tensor
     # (B, 2) proximity of the leader, exp(-gap / 20 m), and its speed, metres per second; auxiliary
     leader: Tensor
+    # (B, V - 1, 2) who comes, in each view to a side: proximity of the nearest that moves, and
+    # whether it is let pass, before the sigmoid; auxiliary
+    comes: Tensor
+
+
+def _convolutions() -> list[nn.Module]:
+    """Return six convolutions over a view, to 24 channels of a sixteenth of its size, in a row."""
+    return [
+        nn.Conv2d(CHANNELS, 16, 5, 2, 2),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, 3, 2, 1),
+        nn.GroupNorm(4, 32),
+        nn.ReLU(),
+        nn.Conv2d(32, 48, 3, 2, 1),
+        nn.GroupNorm(6, 48),
+        nn.ReLU(),
+        nn.Conv2d(48, 64, 3, 1, 1),
+        nn.GroupNorm(8, 64),
+        nn.ReLU(),
+        nn.Conv2d(64, 96, 3, 2, 1),
+        nn.GroupNorm(12, 96),
+        nn.ReLU(),
+        nn.Conv2d(96, 24, 1),
+        nn.ReLU(),
+        nn.Flatten(),
+    ]
 
 
 class LearnedNet(nn.Module):
-    """Six convolutions over each view, then two fully connected layers with speeds and command;
+    """Convolutions over each view, then two fully connected layers with speeds and command;
     attribute names are checkpoint keys.
+
+    The first view is the front one. The others share convolutions of their own, and a view to the
+    right is mirrored, so that who comes does so from the same side.
     """
 
     def __init__(self, seed: int = 0, views: Sequence[View] = (FRONT,)) -> None:
         super().__init__()
         self.views = tuple(views)
-        self.see = nn.Sequential(
-            nn.Conv2d(CHANNELS, 16, 5, 2, 2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3, 2, 1),
-            nn.GroupNorm(4, 32),
-            nn.ReLU(),
-            nn.Conv2d(32, 48, 3, 2, 1),
-            nn.GroupNorm(6, 48),
-            nn.ReLU(),
-            nn.Conv2d(48, 64, 3, 1, 1),
-            nn.GroupNorm(8, 64),
-            nn.ReLU(),
-            nn.Conv2d(64, 96, 3, 2, 1),
-            nn.GroupNorm(12, 96),
-            nn.ReLU(),
-            nn.Conv2d(96, 24, 1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
+        self.see = nn.Sequential(*_convolutions())
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
-        features = sum(24 * (view.height // 16) * (view.width // 16) for view in views)
+        seen = 24 * (self.views[0].height // 16) * (self.views[0].width // 16)
+        for view in self.views[1:2]:
+            beside = 24 * (view.height // 16) * (view.width // 16)
+            self.aside = nn.Sequential(*_convolutions(), nn.Linear(beside, ASIDE), nn.ReLU())
+            self.comes = nn.Linear(ASIDE + 32, 2)
+        features = seen + ASIDE * len(self.views[1:])
         self.plan = nn.Sequential(
             nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
         )
@@ -114,12 +131,23 @@ class LearnedNet(nn.Module):
         """Predict from an image ``(B, 4, H, W)`` of each view, states ``(B, 3)`` and indices of
         commands ``(B,)``.
         """
-        seen = [self.see(image) for image in images]
-        features = torch.cat([*seen, self.state(state), self.word(command)], dim=1)
+        seen = [self.see(images[0])]
+        known = self.state(state)
+        comes = [state.new_zeros(len(state), 0)]
+        for view, image in zip(self.views[1:], images[1:], strict=True):
+            seen.append(self.aside(image if view.yaw_deg > 0 else image.flip(-1)))
+            comes.append(self.comes(torch.cat([seen[-1], known], dim=1)))
+        features = torch.cat([*seen, known, self.word(command)], dim=1)
         heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
-        return Prediction(heading * self.knot_scale, speed * self.speed_scale, sigma, leader)
+        return Prediction(
+            heading * self.knot_scale,
+            speed * self.speed_scale,
+            sigma,
+            leader,
+            torch.cat(comes, dim=1).unflatten(1, (-1, 2)),
+        )
 
 
 def path_grid() -> F64:

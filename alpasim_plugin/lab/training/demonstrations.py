@@ -17,27 +17,31 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import atomic_folder, write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3
+from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3, wrap_angle
 from alpasim_plugin.core.reading import read_json_as, read_json_object
 from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, CameraSpec, RenderRequest, Route, Scenario
 from alpasim_plugin.lab.training.perturbed_rollouts import (
+    KEPT,
     PerturbedRollout,
     RolloutState,
     perturbed_rollouts,
 )
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M, expert_path, expert_speeds, leader_on
 from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.world.idm import NO_LEADER
 from alpasim_plugin.world.route import route_in_rig
 from policies.learned_input import COMMANDS, FRONT, SIDES, View, route_command, view_camera
+from policies.learned_net import PROXIMITY_M
 
 DEMONSTRATIONS_FILE = "demonstrations.json"
-DEMONSTRATIONS_VERSION = 4  # of the format
+DEMONSTRATIONS_VERSION = 5  # of the format
 READING = "reading demonstrations for the learned policy"
 GIVE = "give a folder that 'simrun train policy-data' wrote"
 SKY_SHARE = 0.2  # of a frame's rows: most of the sky, which is cut
 MAX_YAW_RAD = np.deg2rad(8.5)
+COMES_MPS, LETS_PASS_MPS = 1.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,9 @@ _FORMS: dict[str, tuple[int, str]] = {
     "speeds": (2, "float32"),  # (N, 8) metres per second
     "gap": (1, "float32"),  # (N,) metres to the leader, at most SIGHT_M
     "leader": (1, "float32"),  # (N,) its speed, metres per second
+    # (N, V - 1, 2) who comes, in each view to a side: proximity of the nearest, exp(-distance / 20
+    # m), and 1 if the expert lets it pass
+    "comes": (3, "float32"),
 }
 
 
@@ -175,7 +182,7 @@ def _demonstrate(
                 T = state.T_world_rig @ camera.T_rig_camera
                 request = RenderRequest(state.t_us, camera, np.stack([T, T]), state.actors)
                 frames[name].append(renderer.render(request).rgb)
-            speeds = _target_speeds(scenario, rollout, state)
+            speeds = _target_speeds(scenario, rollout, state, tuple(cameras))
             for k in range(recipe.headings):
                 yaw = 0.0 if k == 0 else float(random.uniform(-1, 1))
                 sample = _sample(
@@ -195,16 +202,37 @@ def frames_file(view: str) -> str:
 
 
 def _target_speeds(
-    scenario: Scenario, rollout: PerturbedRollout, state: RolloutState
+    scenario: Scenario, rollout: PerturbedRollout, state: RolloutState, views: Sequence[str]
 ) -> dict[str, Any]:
     """Return the parts of a sample that do not depend on the rig's heading."""
     half_width_m = scenario.vehicle.box.width_m / 2
     leader = leader_on(rollout.line, state.s_m, rollout.others.front_m, half_width_m, state.bodies)
-    speeds = expert_speeds(
-        rollout.line, state.s_m, state.speed_mps, leader, rollout.style, rollout.others, state.t_us
-    )
+    crosses = leader.index >= 0 and sorted(state.actors)[leader.index].startswith(KEPT)
+    followed = NO_LEADER if crosses else leader  # who crosses is let pass, not followed
+    alone = (rollout.line, state.s_m, state.speed_mps, followed, rollout.style)
+    speeds = expert_speeds(*alone, rollout.others, state.t_us)
+    lets_pass = (expert_speeds(*alone) - speeds).max() > LETS_PASS_MPS
     gap_m = min(leader.gap_m, SIGHT_M)
-    return {"speeds": speeds, "gap": gap_m, "leader": leader.speed_mps}
+    sides = [view for view in SIDES if view.name in views]
+    comes = who_comes(state, sides, lets_pass)
+    return {"speeds": speeds, "gap": gap_m, "leader": leader.speed_mps, "comes": comes}
+
+
+def who_comes(state: RolloutState, sides: Sequence[View], lets_pass: bool) -> F64:
+    """Return for each view to a side ``(V, 2)`` the proximity of the nearest road user that it shows
+    on the way to the car's line, and 1 if that one is the nearest of all and is let pass.
+    """
+    T = inverse(state.T_world_rig)
+    x, y = T[:2, :2] @ state.bodies.xy.T + T[:2, 3:]
+    speed_y = T[1, :2] @ state.bodies.velocity.T
+    nearest_m = np.full(len(sides), np.inf)
+    for k, view in enumerate(sides):
+        half_rad = np.arctan(view.width / 2 / view.focal_px)
+        apart_rad = np.abs(wrap_angle(np.arctan2(y, x) - np.deg2rad(view.yaw_deg)))
+        comes = (apart_rad < half_rad) & (-np.sign(view.yaw_deg) * speed_y > COMES_MPS)
+        nearest_m[k] = np.min(np.hypot(x, y)[comes], initial=np.inf)
+    first = np.isfinite(nearest_m) & (nearest_m == np.min(nearest_m, initial=np.inf))
+    return np.column_stack([np.exp(-nearest_m / PROXIMITY_M), first & lets_pass])
 
 
 def _sample(

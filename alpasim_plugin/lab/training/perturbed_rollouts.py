@@ -39,6 +39,8 @@ MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = (
 )  # with a neighbouring lane the nearest lane must not change
 LEADER_SHARE = 0.55  # share of rollouts with a synthetic leader
 KEPT = ("crosses", "beside")  # actors that drive as recorded: the ego gives way to them
+LOOKS_SHARE = 0.5  # share of rollouts in which the driver gives way to who comes from a side
+HESITATES_SHARE = 0.35  # share in which it brakes for nobody, once
 
 
 @dataclass(frozen=True)
@@ -161,6 +163,10 @@ def _drive(
         random,
         MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M,
     )
+    # The speed must not say whether somebody comes: some drivers do not look, some brake for nobody.
+    looks = random.random() < LOOKS_SHARE
+    brakes_s = np.inf if random.random() > HESITATES_SHARE else random.uniform(0.0, drive_s)
+    brakes_until_s, brakes_mps2 = brakes_s + random.uniform(0.5, 3.0), random.uniform(1.0, 4.0)
     states = []
     lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
@@ -172,10 +178,11 @@ def _drive(
         ahead = leader_on(line, s, front, half, bodies)
         if step % round(FRAME_INTERVAL_S / STEP_S) == 0:
             states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
-        most = min(
-            following_acceleration(v, ahead, driven_style),
-            others.acceleration(t, s, v, driven_style),
-        )
+        most = following_acceleration(v, ahead, driven_style)
+        if looks:
+            most = min(most, others.acceleration(t, s, v, driven_style, others.seen(t, s)))
+        if brakes_s < step * STEP_S < brakes_until_s:
+            most = min(most, -brakes_mps2)
         wanted = acceleration(line, s, v, most, driven_style)
         accel += (wanted - accel) * (1.0 - 0.8 * lag)
         if ahead.gap_m < 1.5:
@@ -314,7 +321,8 @@ class _SyntheticLeader:
         vehicles = [
             actor
             for actor in scenario.actors
-            if actor.label in ("car", "truck", "bus", "motorcycle") and actor.actor_id not in KEPT
+            if actor.label in ("car", "truck", "bus", "motorcycle")
+            and not actor.actor_id.startswith(KEPT)
         ]
         if not vehicles or random.random() > LEADER_SHARE:
             return None

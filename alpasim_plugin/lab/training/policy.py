@@ -66,6 +66,7 @@ class PolicyBatch:
     speed: Tensor  # (B,) metres per second
     speeds: Tensor  # (B, 8) changes of speed, metres per second
     leader: Tensor  # (B, 2) proximity of the leader and its speed, as in `Prediction`
+    comes: Tensor  # (B, V - 1, 2) who comes from a side, as in `Prediction`, after the sigmoid
 
 
 def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +116,7 @@ class PolicyTask:
         images = zip(*(views for views, *_ in rows), strict=True)
         return PolicyBatch(
             tuple(torch.from_numpy(np.stack(view)) for view in images),
-            *(torch.from_numpy(np.stack([row[i] for row in rows])) for i in range(1, 8)),
+            *(torch.from_numpy(np.stack([row[i] for row in rows])) for i in range(1, 9)),
         )
 
     def loss(self, batch: PolicyBatch, index: int) -> Loss:
@@ -152,6 +153,8 @@ class PolicyTask:
             "speed": speed,
             "sigma": 0.05 * sigma,
         }
+        if self.net.views[1:]:
+            parts["comes"] = F.binary_cross_entropy_with_logits(prediction.comes, batch.comes)
         numbers = {name: value.detach() for name, value in parts.items()}
         numbers["lateral_m"] = lateral[:, SIGMA_KNOT].detach().abs().mean()
         numbers["speed_mps"] = speed_error.detach().abs().mean()
@@ -215,22 +218,26 @@ class PolicyTask:
             a["speed"][row],
             a["speeds"][row],
             leader,
+            a["comes"][row],
         )
 
 
 def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
     """Give a network of several views the weights of one that has the front view alone.
 
-    All views share the convolutions. What the first full layer makes of the other views begins at
-    zero, so the network begins with the plans of ``front``.
+    The convolutions over the front view stay as they are, those over the others begin with the same
+    weights. What the first full layer makes of the other views begins at zero, so the network begins
+    with the plans of ``front``.
     """
-    state, known = net.state_dict(), front.state_dict()
-    wide, narrow = state["plan.0.weight"], known["plan.0.weight"]
+    known = front.state_dict()
+    wide, narrow = net.plan[0].weight, known["plan.0.weight"]
     others = wide.shape[1] - narrow.shape[1]
     after = narrow.shape[1] - front.state[0].out_features - front.word.embedding_dim
     zeros = torch.zeros(len(wide), others)
     known["plan.0.weight"] = torch.cat([narrow[:, :after], zeros, narrow[:, after:]], dim=1)
-    net.load_state_dict(known)
+    known |= {f"aside.{name}": value for name, value in front.see.state_dict().items()}
+    net.load_state_dict(known, strict=False)
+    net.see.requires_grad_(False)
 
 
 def _jitter_brightness(view: U8, contrast: float, brightness: float) -> U8:

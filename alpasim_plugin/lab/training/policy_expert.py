@@ -8,12 +8,12 @@ pass whoever will come into its way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64, Actor, Box, Vehicle
+from alpasim_plugin.core.geometry import inverse, speeds
+from alpasim_plugin.core.types import F64, Actor, Bool, Box, Vehicle
 from alpasim_plugin.world.idm import (
     Bodies,
     IdmParams,
@@ -28,6 +28,7 @@ from policies.learned_net import KNOTS_M, TIMES_S, path_grid
 from scenarios.expert import PredictedBodies, ScriptedTracks, yielding_acceleration
 
 STEP_S = 0.1
+FORECAST_S = 0.5  # between the instants of a forecast
 DECISION_STEPS = 4  # between two forecasts of the other road users
 LATERAL_MPS2 = 2.0
 ACCEL_MPS2 = 1.5
@@ -36,6 +37,7 @@ HARD_BRAKE_MPS2 = 7.0
 LINE_BEFORE_M, LINE_AHEAD_M = 4.0, 80.0
 MIN_PURSUIT_MPS = 4.0  # so that a stationary car has a path too
 SIGHT_M = 60.0  # objects beyond cover only a few pixels of the image
+SIDE_SIGHT_M = 42.0  # the same, of the smaller views to the sides
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,29 @@ class RightOfWay:
 
     @staticmethod
     def along(path: Path, vehicle: Vehicle, actors: Sequence[Actor], end_us: int) -> RightOfWay:
-        """Return what a car on a path knows until ``end_us``."""
-        front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-        return RightOfWay(ScriptedTracks(actors, end_us), Lines([path]), vehicle.box, front_m)
+        """Return what a car on a path knows until ``end_us``.
 
-    def acceleration(self, t_us: int, s_m: float, speed_mps: float, style: DrivingStyle) -> float:
-        """Return the largest acceleration, m/s^2, behind all who are or will be in the way;
-        infinite without such ones.
+        Who moves is as much longer as it goes between two instants of the forecast, so that it does
+        not pass unnoticed between them.
+        """
+        front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+        longer = []
+        for actor in actors:
+            length_m = actor.box.length_m + FORECAST_S * speeds(actor.track).max()
+            longer.append(replace(actor, box=replace(actor.box, length_m=length_m)))
+        return RightOfWay(ScriptedTracks(longer, end_us), Lines([path]), vehicle.box, front_m)
+
+    def seen(self, t_us: int, s_m: float) -> Bool:
+        """Return which of the others ``(K,)`` are within `SIDE_SIGHT_M` of the car."""
+        here, _ = self.line.at(np.zeros(1, dtype=np.int64), np.array([s_m]))
+        apart = self.table.xy[self.table.rows(t_us)[0]] - here[:, :2]
+        return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) < SIDE_SIGHT_M)
+
+    def acceleration(
+        self, t_us: int, s_m: float, speed_mps: float, style: DrivingStyle, seen: Bool
+    ) -> float:
+        """Return the largest acceleration, m/s^2, behind all whom the driver has seen and who are or
+        will be in the way; infinite without such ones.
         """
         table = self.table
         if not table.boxes:
@@ -100,7 +118,7 @@ class RightOfWay:
             table.xy[rows],
             table.yaw[rows],
             table.velocity[rows],
-            table.present[rows],
+            table.present[rows] & seen,
             tuple(table.boxes),
             np.zeros(len(table.boxes), dtype=np.bool_),
         )
@@ -158,22 +176,23 @@ def expert_speeds(
     t_us: int = 0,
 ) -> F64:
     """Return the changes of speed ``(8,)`` until `TIMES_S`, metres per second; the leader's speed
-    is constant, and the others move on from ``t_us`` as recorded.
+    is constant, and the others that are seen at ``t_us`` move on as recorded.
     """
     s = s_m
     v = speed_mps
     gap = leader.gap_m
-    speeds = [v]
+    driven = [v]
     yields = float("inf")
+    seen = None if others is None else others.seen(t_us, s_m)
     for step in range(round(TIMES_S[-1] / STEP_S)):
         before = s
         most = following_acceleration(v, Leader(gap, leader.speed_mps, leader.index), style)
-        if others is not None and step % DECISION_STEPS == 0:
-            yields = others.acceleration(t_us + round(step * STEP_S * 1e6), s, v, style)
+        if others is not None and seen is not None and step % DECISION_STEPS == 0:
+            yields = others.acceleration(t_us + round(step * STEP_S * 1e6), s, v, style, seen)
         s, v = advance(s, v, acceleration(line, s, v, min(most, yields), style), STEP_S)
         gap += leader.speed_mps * STEP_S - (s - before)
-        speeds.append(v)
-    return np.array([speeds[round(t / STEP_S)] for t in TIMES_S]) - speed_mps
+        driven.append(v)
+    return np.array([driven[round(t / STEP_S)] for t in TIMES_S]) - speed_mps
 
 
 def expert_path(line: Path, s_m: float, T_world_rig: F64, speed_mps: float) -> tuple[F64, F64]:

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Literal
 
 from alpasim_plugin.lab.training.scene_draws import (
+    SPACING_M,
     Rng,
     Spec,
     ego,
@@ -24,19 +25,24 @@ from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES, Family
 CROSSING: Mapping[str, float] = {"car": 0.65, "truck": 0.15, "bus": 0.1, "motorcycle": 0.1}
 START_M = 20.0  # of the ego's rear axle
 FRONT_M = 4.0  # from there to its front
-OPEN: Spec = {"buildings": 0.1, "trees_per_100m": 1.0}  # so that the side roads can be seen
+BARE: Spec = {"buildings": 0.0, "trees_per_100m": 0.0, "poles_spacing_m": 0}
+OPEN: Spec = {"buildings": 0.2, "trees_per_100m": 2.0}  # the side roads can be seen
 
 Side = Literal["left", "right"]
 
 
 def _junction(rng: Rng, time_s: float, turn: str, sides: tuple[Side, ...]) -> Spec:
-    """Return a junction that the ego crosses, or turns at, while someone comes from a side.
+    """Return a junction that the ego crosses, or turns at, while others come from a side.
 
-    Of ten, about seven would meet the ego if it did not slow down, one passes well before or after
-    it, one waits at the line, and one has no such car.
+    They are faster than the ego, so that the front camera shows them too late. Of ten, a row of
+    vehicles meets the ego in five if it does not slow down, one passes well before or after it in
+    two, one waits at the line in one, and nobody comes in two. In three of ten, one of the harmless
+    kinds is on the other side as well.
     """
-    v = number(rng, 7, 10) if turn == "straight" else number(rng, 6, 8)
-    before_m, corner_m = number(rng, 42, 62), number(rng, 7, 11, 1)
+    across = turn == "straight"
+    v = number(rng, 6, 9) if across else number(rng, 6, 8)
+    u = number(rng, 10, 15) if across else number(rng, 8, 11)
+    before_m, corner_m = number(rng, 42, 58), number(rng, 7, 11, 1)
     width_m, shoulder_m = number(rng, 3.2, 3.8), 0.5
     junction = {
         "kind": "intersection",
@@ -51,31 +57,33 @@ def _junction(rng: Rng, time_s: float, turn: str, sides: tuple[Side, ...]) -> Sp
         "lane_width_m": width_m,
         "segments": to_length([straight(before_m), junction], path_m(v, time_s)),
     }
+    around = BARE if rng.random() < 0.8 else OPEN
     side = pick(rng, *sides)
-    down = -1.0 if side == "left" else 1.0  # direction of travel along y
-    middle_m = before_m + corner_m + shoulder_m + width_m  # of the road that crosses
-    x = round(middle_m + 0.5 * down * width_m, 2)
-    meets_s = (x - START_M - FRONT_M) / (v if turn == "straight" else 0.85 * v)
-    u = number(rng, 6, 11)
-    share = rng.random()
-    late_s = number(rng, -1.2, 1.2) if share < 0.7 else pick(rng, -1, 1) * number(rng, 3, 5)
-    kind = label(rng, CROSSING)
-    waits = -down * (corner_m + width_m + 4.0)
-    away_m = (
-        [waits, waits]
-        if 0.8 < share < 0.9
-        else [down * u * (t - meets_s - late_s) for t in (0.0, 20.0)]
-    )
-    points = [
-        [t, x, round(y, 2), round(down * 1.5708, 4)] for t, y in zip((0, 20), away_m, strict=True)
-    ]
-    crosses = {"kind": "logged", "id": "crosses", "label": kind, "points": points}
-    return {
-        "road": road,
-        "ego": ego(rng, v),
-        "actors": [crosses] if share < 0.9 else [],
-        "environment": dict(OPEN),
-    }
+    other_side: Side = "right" if side == "left" else "left"
+    actors: list[Spec] = []
+    for name, from_side, share in (
+        ("crosses", side, rng.random()),
+        ("crosses-other", other_side, 0.5 + rng.random()),
+    ):
+        down = -1.0 if from_side == "left" else 1.0  # direction of travel along y
+        x = round(before_m + corner_m + shoulder_m + width_m + 0.5 * down * width_m, 2)
+        meets_s = (x - START_M - FRONT_M) / (v if across else 0.85 * v)
+        kind = label(rng, CROSSING)
+        headway_s = SPACING_M[kind] / u + number(rng, 0.5, 1.1)
+        first_s, alone_s = number(rng, -1.8, -0.3), pick(rng, -1, 1) * number(rng, 4, 6)
+        places: list[tuple[float, float]] = []  # along y at 0 and 20 s, in the direction of travel
+        if share < 0.7:
+            late_s = [first_s + i * headway_s for i in range(4)] if share < 0.5 else [alone_s]
+            places = [(u * (0 - meets_s - one), u * (20 - meets_s - one)) for one in late_s]
+        elif share < 0.8:
+            places = [(-(corner_m + width_m + 4.0),) * 2]
+        for i, (begins_m, ends_m) in enumerate(places):
+            points = [
+                [t, x, round(down * y, 2), round(down * 1.5708, 4)]
+                for t, y in ((0, begins_m), (20, ends_m))
+            ]
+            actors.append({"kind": "logged", "id": f"{name}-{i}", "label": kind, "points": points})
+    return {"road": road, "ego": ego(rng, v), "actors": actors, "environment": dict(around)}
 
 
 def _merge(rng: Rng, time_s: float) -> Spec:
@@ -107,5 +115,8 @@ SIDE_FAMILIES: Mapping[str, Family] = {
 }
 THREE_FAMILIES: Mapping[str, Family] = {
     **SIDE_FAMILIES,
-    **{name: KNOWN_FAMILIES[name] for name in ("street", "long_bend", "junction_turn", "avenue")},
+    **{
+        name: KNOWN_FAMILIES[name]
+        for name in ("street", "long_bend", "junction_turn", "avenue", "motorway")
+    },
 }

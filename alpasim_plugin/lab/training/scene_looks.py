@@ -85,7 +85,7 @@ def draw_rig(rng: Rng) -> list[Spec]:
     """Return three cameras: front, left and right, of several mounts, the sides alike."""
     front = {"name": "front", "hfov_deg": number(rng, 72, 85, 1), "z_m": number(rng, 1.3, 1.7)}
     front["pitch_down_deg"] = number(rng, 0, 6, 1)
-    side = {"width": 160, "height": 80, "hfov_deg": number(rng, 78, 90, 1)}
+    side = {"width": 200, "height": 100, "hfov_deg": number(rng, 78, 90, 1)}
     side |= {"x_m": number(rng, 1.4, 2.2), "z_m": number(rng, 1.1, 1.6)}
     yaw_deg, out_m = number(rng, 55, 65, 1), number(rng, 0.4, 0.95)
     left = {"name": "left", "y_m": out_m, "yaw_deg": yaw_deg}

@@ -74,9 +74,9 @@ SPLITS: Mapping[Split, SplitRecipe] = {
     "test-unseen": SplitRecipe(UNSEEN_FAMILIES, 14_000_000, 30, 19.8, unseen=True),
     "beside-known": SplitRecipe(KNOWN_FAMILIES, 15_000_000, 12, 9.0, cycles=False),
     "beside-unseen": SplitRecipe(UNSEEN_FAMILIES, 16_000_000, 6, 9.0, unseen=True, cycles=False),
-    "three/train": SplitRecipe(THREE_FAMILIES, 17_000_000, 216, 9.0, three_cameras=True),
-    "three/val": SplitRecipe(THREE_FAMILIES, 18_000_000, 18, 9.0, three_cameras=True),
-    "three/test": SplitRecipe(SIDE_FAMILIES, 19_000_000, 30, 9.0, three_cameras=True),
+    "three/train": SplitRecipe(THREE_FAMILIES, 17_000_000, 240, 9.0, three_cameras=True),
+    "three/val": SplitRecipe(THREE_FAMILIES, 18_000_000, 40, 9.0, three_cameras=True),
+    "three/test": SplitRecipe(SIDE_FAMILIES, 19_000_000, 40, 9.0, three_cameras=True),
 }
 
 
