@@ -53,7 +53,7 @@ def test_the_expert_gives_way_to_who_comes_from_a_side(family, tmp_path):
         assert [camera["name"] for camera in spec["cameras"]] == ["front", "left", "right"]
         for actor in spec["actors"]:
             other = actor["id"].startswith("crosses-other")
-            assert (actor["points"][0][2] > 0) == ((family == "cross_left") != other)
+            assert (actor["points"][0][3] < 0) == ((family == "cross_left") != other)
         path = tmp_path / f"{seed}.yaml"
         path.write_text(yaml.safe_dump(spec))
         driven = speeds(load_scenario(path).ego_log)
