@@ -25,7 +25,8 @@ from policies.learned_input import (
     view_camera,
 )
 
-WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
+FOLDER = Path(__file__).parent / "weights"
+WEIGHTS = FOLDER / "learned.safetensors"
 EARLIER_US = 500_000  # age of the earlier frame, which shows motion
 EARLIEST_US = 700_000
 MAX_SIGMA_M, MAX_SIGMA_SPEED = 0.5, 0.15
@@ -190,3 +191,11 @@ class LearnedMean(Learned):
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario, temperature=0.0)
+
+
+class LearnedThree(Learned):
+    """The network with cameras to the front, the left and the right, which lets pass who comes from
+    a side.
+    """
+
+    files = (FOLDER / "learned-three.safetensors",)

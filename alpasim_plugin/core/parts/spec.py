@@ -300,6 +300,10 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "policies.learned:LearnedMean",
             "the same network, driven by its mean prediction: every seed drives alike",
         ),
+        "learned-three": (
+            "policies.learned:LearnedThree",
+            "a network that also sees cameras to the left and the right, and lets pass who comes from there",
+        ),
     },
     "controller": {
         "bicycle": (
