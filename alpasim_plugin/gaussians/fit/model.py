@@ -58,6 +58,7 @@ class SplatModel:
             wherever the scene lies.
         params: Name (`NAMES`) to a leaf tensor with N rows: means in the node's frame, logarithms
             of scales, quaternions, logits of opacity, constant and further colour coefficients.
+        device: Where its parameters are.
         node: ``(N,)`` the node of each Gaussian, ascending; on the host, which thus knows how many
             are in view.
     """
@@ -67,6 +68,7 @@ class SplatModel:
     ) -> None:
         self.actors, self.origin, self.node = actors, origin, node
         self.params = {name: params[name].detach().requires_grad_() for name in NAMES}
+        self.device = self.params["means"].device
 
     @classmethod
     def from_start(
@@ -110,9 +112,8 @@ class SplatModel:
                     _left_product(quat_from_matrix(T[i, :3, :3])),
                     _harmonics(T[i, :3, :3].tobytes(), size),
                 )
-        device = self.params["means"].device
         tensors = (
-            upload(a.astype(np.float32), device)
+            upload(a.astype(np.float32), self.device)
             for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
         )
         return Motion(torch.as_tensor(present), *tensors)
@@ -129,7 +130,6 @@ class SplatModel:
             that each is, ``(M,)``.
         """
         p = self.params
-        device = p["means"].device
         still = int(torch.searchsorted(self.node, 1))
         sh = (
             torch.cat([p["sh_dc"], p["sh_rest"][:, : sh_size - 1]], dim=1)
@@ -139,8 +139,10 @@ class SplatModel:
         moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
         if not len(moving):
             parts = [*(p[name][:still] for name in NAMES[:4]), sh[:still]]
-            return Splats(*parts), torch.arange(still, device=device)
-        node, moving = (rows.to(device, non_blocking=True) for rows in (self.node[moving], moving))
+            return Splats(*parts), torch.arange(still, device=self.device)
+        node, moving = (
+            rows.to(self.device, non_blocking=True) for rows in (self.node[moving], moving)
+        )
         means = (
             torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
             + motion.shift[node]
@@ -156,7 +158,7 @@ class SplatModel:
             torch.cat([p["logit_opacities"][:still], p["logit_opacities"][moving]]),
             torch.cat([sh[:still], turned]),
         )
-        return splats, torch.cat([torch.arange(still, device=device), moving])
+        return splats, torch.cat([torch.arange(still, device=self.device), moving])
 
     def clouds(self) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
         """Return the background in world coordinates and each actor in its box frame, as ordinary
@@ -370,7 +372,7 @@ def densify(
 
 def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
     model.node = model.node[rows]
-    rows = rows.to(model.params["means"].device)
+    rows = rows.to(model.device)
     model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
     adam.take(rows, old)
 
@@ -378,7 +380,7 @@ def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
 def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
     """Draw new centres from the Gaussians of a part, and shrink them."""
     p = model.params
-    draw = upload(rng.standard_normal(p["means"][part].shape, dtype=np.float32), p["means"].device)
+    draw = upload(rng.standard_normal(p["means"][part].shape, dtype=np.float32), model.device)
     w, x, y, z = torch.nn.functional.normalize(p["quaternions"][part], dim=1).unbind(1)
     along = draw * p["log_scales"][part].exp()
     # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.devices import require_device, upload
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -311,7 +311,7 @@ class UploadedClouds(TileCompositor):
         return _joined(spans, (3,)).astype(np.int32)
 
     def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
-        return torch.from_numpy(np.array(array, dtype)).to(self.device)
+        return upload(np.asarray(array, dtype), self.device)
 
 
 def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:

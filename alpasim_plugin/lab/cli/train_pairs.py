@@ -98,8 +98,12 @@ def pairs(
     made: Iterable[tuple[Path, bool]]  # folder of a sequence, and whether it is new
     if len(sources) == 1 and sources[0].is_dir():
         scenes = scenes_of(sources[0], split, count)
-        recipe = PairRecipe(source, max_offset_m=max_offset_m, offset_m=offset_m)
-        maker = _Maker(out, recipe, seed, require_device(device))
+        maker = _Maker(
+            out,
+            PairRecipe(source, max_offset_m=max_offset_m, offset_m=offset_m),
+            seed,
+            require_device(device),
+        )
         made = (result for _, result in map_jobs(maker, scenes, jobs))
     else:
         sizes = [parse_size(text) for text in size or ["256x144"]]

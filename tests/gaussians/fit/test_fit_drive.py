@@ -71,24 +71,6 @@ def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(
     assert found["front-000004"][1] == pytest.approx(between, abs=0.01)
 
 
-def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views, tmp_path):
-    recipe = replace(QUICK, steps=8, save_every=4, points=500, cap=600)
-
-    class CutOffError(Exception):
-        pass
-
-    def cut(stage, at, all, numbers):
-        if stage == "fitting" and at == 6:
-            raise CutOffError
-
-    whole = fit_drive(views, None, recipe=recipe, threads=1)
-    with pytest.raises(CutOffError):
-        fit_drive(views, None, recipe=recipe, threads=1, folder=tmp_path, report=cut)
-    again = fit_drive(views, None, recipe=recipe, threads=1, folder=tmp_path)
-    assert again.exposures == whole.exposures
-    assert again.model.background.means.tobytes() == whole.model.background.means.tobytes()
-
-
 def test_photographs_that_share_nothing_start_from_given_points(views):
     rng = np.random.default_rng(0)
     noise = [

@@ -75,13 +75,6 @@ def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed, tmp_path):
     assert bits(again) == bits(whole)
 
 
-def test_threads_do_not_change_the_result(posed):
-    recipe = replace(QUICK, steps=12)
-    assert bits(fit(posed.views, posed.start, recipe, threads=1)) == bits(
-        fit(posed.views, posed.start, recipe, threads=2)
-    )
-
-
 def test_a_folder_begun_with_another_recipe_is_refused(posed, tmp_path):
     recipe = replace(QUICK, steps=2)
     fit(posed.views, posed.start, recipe, folder=tmp_path)
