@@ -6,24 +6,22 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.drives import build
+from alpasim_plugin.gaussians.fit.drive import FittedDrive
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from tests.drives.street import write_kitti, write_transforms
 
 
-def at_once(views, kept, points, *rest):
-    """Stand in for `fitting.fitted`."""
-    cloud = cloud_from_points(points.xyz, points.rgb)
-    return Reconstruction(cloud, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))), {
-        views[0].name: (1.1, 1.0, 0.9)
-    }
+def at_once(views, start, **rest):
+    """Stand in for `fit_drive`."""
+    model = Reconstruction(start, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+    return FittedDrive(model, {views[0].name: (1.1, 1.0, 0.9)})
 
 
 @pytest.fixture
 def quick_fit(monkeypatch):
     """Leave the fit out."""
-    monkeypatch.setattr(build, "fitted", at_once)
+    monkeypatch.setattr(build, "fit_drive", at_once)
 
 
 @pytest.fixture(scope="session")
@@ -45,6 +43,6 @@ def imported(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("drive")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "fitted", at_once)
+        patch.setattr(build, "fit_drive", at_once)
         build.import_drive(write_kitti(folder / "street", spare_pictures=1), folder / "out")
     return folder / "out"

@@ -118,6 +118,7 @@ def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
         "1.5",
         "--json",
     ]
+    assert run_command([*command, "--device", "cuda:999"]) == 4
     assert run_command(command) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["scenario"] == str(tmp_path / "out/scenario.yaml")

@@ -18,8 +18,14 @@ from alpasim_plugin.core.types import (
     Environment,
     Latency,
 )
+from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.views import logged_views
-from alpasim_plugin.renderers import make_renderer, recorded
+from alpasim_plugin.renderers import (
+    make_renderer,
+    reconstruction,
+    reconstruction_build,
+    recorded,
+)
 from alpasim_plugin.renderers.gaussian import (
     CleanRenderer,
     clear_cache,
@@ -171,6 +177,21 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
     ensure(scenario, recipe_of(scenario), threads=2)
     assert "is damaged" in capfd.readouterr().err
     assert (folder / "background.ply").read_bytes() == data
+
+
+def test_a_model_is_fitted_where_its_renderer_draws_and_kept_apart(cache, monkeypatch):
+    del cache
+    scenario, places = street(replace(FITTED, share=0.01)), []
+
+    def fit_on(*views, device, **options):
+        places.append(device)
+        return fit(*views, **options)
+
+    monkeypatch.setattr(reconstruction_build, "fit", fit_on)
+    monkeypatch.setattr(reconstruction, "require_device", str)
+    for device in ("cpu", "cuda:1", "cuda:2"):
+        make_renderer("3dgs", scenario, device=device)
+    assert places == ["cpu", "cuda:1"]
 
 
 def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cache):
