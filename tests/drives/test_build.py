@@ -119,6 +119,7 @@ def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
         "--json",
     ]
     assert run_command([*command, "--device", "cuda:999"]) == 4
+    capsys.readouterr()
     assert run_command(command) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["scenario"] == str(tmp_path / "out/scenario.yaml")
