@@ -60,7 +60,7 @@ def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud():
     poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
     view = camera()
     fast = graph.render(view, poses)
-    slow = rasterize_reference(joined(graph._choose(view, poses)), view, SKY.image(view))
+    slow = rasterize_reference(joined(graph._choose(view, poses, 0)), view, SKY.image(view))
     assert np.abs(fast.rgb - slow.rgb).max() <= 1.5 / 255
     assert np.abs(fast.alpha - slow.alpha).max() < 5e-3
 

@@ -107,7 +107,8 @@ def logged_views(
         )
         for spec in scenario.cameras:
             camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, width)
-            view = seen_from(camera, scene, actors, f"{spec.name}-{t_us}", threads)
+            name = f"{spec.name}-{t_us}"
+            view = seen_from(camera, scene, actors, name, threads, float(spec.K[0, 0]))
             views.append(replace(view, t_us=t_us))
     return views
 
@@ -118,9 +119,10 @@ def seen_from(
     actors: Mapping[str, F64],
     name: str,
     threads: int | None = None,
+    px_per_rad: float | None = None,
 ) -> PosedView:
-    """Render one view with its sky and depth."""
-    out = scene.render(camera, actors, threads)
+    """Render one view with its sky and depth; see `SceneGraph.render`."""
+    out = scene.render(camera, actors, threads, px_per_rad=px_per_rad)
     return PosedView(
         camera,
         out.to_uint8(),

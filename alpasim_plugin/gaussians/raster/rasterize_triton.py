@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     EXTENT_MAX_SIGMA,
+    MIP_PX2,
     NEAR_M,
     POSE_ANTIALIAS,
     TILE,
@@ -230,6 +231,7 @@ class UploadedClouds(TileCompositor):
         camera: PinholeCamera,
         background: Background | Tensor = (0.0, 0.0, 0.0),
         near_m: float = NEAR_M,
+        antialiased: Sequence[bool] = (),
     ) -> DeviceOutput:
         """Render clouds at rigid poses in one image, which stays on the device.
 
@@ -240,6 +242,7 @@ class UploadedClouds(TileCompositor):
             background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything; a tensor is
                 the device's.
             near_m: Gaussians whose centre is nearer are left out.
+            antialiased: Which nodes are drawn with a filter that their clouds may lack.
 
         Raises:
             InputError: A transform is not rigid or the background does not fit.
@@ -250,6 +253,7 @@ class UploadedClouds(TileCompositor):
         spans = self._spans([cloud for cloud, _ in nodes])
         poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
         poses[:, POSE_ANTIALIAS] = [self.antialias_px2[cloud] for cloud, _ in nodes]
+        poses[np.flatnonzero(antialiased), POSE_ANTIALIAS] = MIP_PX2
         had_room = partial(self.had_room, self.capacity)
         image, pairs = self._image(spans, poses, camera, near_m)
         transmittance = image[..., 4]
@@ -258,7 +262,7 @@ class UploadedClouds(TileCompositor):
         depth = torch.where(alpha > 0, image[..., 3] / alpha, 0.0)
 
         def again() -> DeviceOutput:
-            return self.draw(nodes, camera, background, near_m)
+            return self.draw(nodes, camera, background, near_m, antialiased)
 
         return DeviceOutput(
             rgb=rgb, alpha=alpha, depth=depth, pairs=pairs, had_room=had_room, again=again

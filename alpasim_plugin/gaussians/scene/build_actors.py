@@ -97,7 +97,8 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
             [shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)]
         )
         levels.append(Level(float(cell_m), cloud))
-    return SceneNode(actor.actor_id, "actor", tuple(levels))
+    usual_cell_m = float(CELLS_M[0] * coarser)
+    return SceneNode(actor.actor_id, "actor", tuple(levels), usual_cell_m=usual_cell_m)
 
 
 def _check_size(actor: Actor, reach: F64) -> None:

@@ -295,6 +295,7 @@ FINE_M, COARSE_M = 0.125, 0.5
 TILE_M, FAR_TILE_M = 16.0, 32.0
 CORRIDOR_M = 9.0  # tiles that come this near to the path get the fine levels
 LIFT_M = 0.02
+STROKE_M = 0.125  # length of the finest cells of lane markings for usual cameras
 MAX_LEVEL = 5  # cells of one image grow up to 2**5 of its pixels
 PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 
@@ -431,10 +432,10 @@ def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
     length = np.linalg.norm(strokes.end - strokes.start, axis=1)
     direction = unit(strokes.end - strokes.start)
     levels = []
-    finer = [(0.125 / 2**n, 0.19 / 2**n, 0.10 / 2**n) for n in halvings(site.scenario)]
+    finer = [(STROKE_M / 2**n, 0.19 / 2**n, 0.10 / 2**n) for n in halvings(site.scenario)]
     for cell_m, link_m, across_m in (
         *finer,
-        (0.125, 0.19, 0.15),
+        (STROKE_M, 0.19, 0.15),
         (0.3, 0.75, 0.25),
         (0.8, 1.5, 0.5),
     ):
@@ -466,7 +467,7 @@ def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
                 tile[owner],
             )
         )
-    return nodes_by_tile("paint", levels, far_m=140.0)
+    return nodes_by_tile("paint", levels, far_m=140.0, usual_cell_m=STROKE_M)
 
 
 def _surroundings(site: Site) -> list[SceneNode]:

@@ -42,6 +42,7 @@ TREE_LINE_M = {False: 1.6, True: 7.0}
 RIM_RGB = (0.88, 0.88, 0.86)
 SIGN_RGB = ((0.75, 0.12, 0.10), (0.10, 0.28, 0.62), (0.88, 0.72, 0.12), (0.10, 0.42, 0.26))
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
+USUAL_CELL_M = {"kerb": 0.25, "sign": 0.12}  # sharp cameras see halves of them
 Item = tuple[float, GaussianCloud, F64]  # cell size, cloud, plan position of each Gaussian's owner
 
 
@@ -57,7 +58,7 @@ def build_street(site: Site, houses: Houses) -> list[SceneNode]:
             if owned.any():
                 tile = tile_numbers(at[owned] - site.low, TILE_M)
                 levels.append((cell_m, cloud.take(owned), tile))
-        nodes += nodes_by_tile(name, levels)
+        nodes += nodes_by_tile(name, levels, usual_cell_m=USUAL_CELL_M.get(name, 0.0))
     return nodes
 
 
@@ -75,8 +76,9 @@ def _spots(site: Site, beyond_m: float, step_m: float, shortest_m: float) -> Roa
 def _kerbs(site: Site) -> list[Item]:
     """Place a kerb along the road's edge: a face towards the road and a top."""
     items: list[Item] = []
-    finer = [(0.25 / 2**n, 0.5 / 2**n, 2**n + 1) for n in halvings(site.scenario)]
-    for cell_m, step, rows in (*finer, (0.25, 0.5, 1), (0.7, 1.0, 1), (1.6, 2.0, 1)):
+    usual_m = USUAL_CELL_M["kerb"]
+    finer = [(usual_m / 2**n, 0.5 / 2**n, 2**n + 1) for n in halvings(site.scenario)]
+    for cell_m, step, rows in (*finer, (usual_m, 0.5, 1), (0.7, 1.0, 1), (1.6, 2.0, 1)):
         spots = _spots(site, 0.0, step, 2 * step)
         if spots is None:
             return []
@@ -297,8 +299,9 @@ def _signs(site: Site) -> list[Item]:
             tops.append(T[:3, 3])
     plan = site.frame.to_ground(np.array(at))
     items: list[Item] = []
-    finer = [(0.12 / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
-    for cell_m, size in (*finer, (0.12, 0.15), (0.4, 0.5)):
+    usual_m = USUAL_CELL_M["sign"]
+    finer = [(usual_m / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
+    for cell_m, size in (*finer, (usual_m, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
         clouds, where = [plates], [plan[owner]]
         if feet:

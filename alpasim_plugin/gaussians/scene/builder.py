@@ -12,7 +12,6 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
-from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades
@@ -28,7 +27,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
 )
 from alpasim_plugin.gaussians.scene.site import HeightAt, make_site, path_of, section_of
 from alpasim_plugin.gaussians.scene.sky import Sky, make_sky
-from alpasim_plugin.gaussians.scene.surfels import halvings
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, SIGHT_M
 
@@ -94,6 +92,7 @@ class LongScene(SceneGraph):
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
         device: str = "cpu",
+        px_per_rad: float | None = None,
     ) -> RasterOutput:
         """Render one view; see `SceneGraph.render`."""
         with self._lock:
@@ -102,7 +101,7 @@ class LongScene(SceneGraph):
             if near != tuple(self._sections):
                 self._sections = {i: self._sections.get(i) or self._built(i) for i in near}
                 self.set_background([node for i in near for node in self._sections[i]])
-            return super().render(camera, actor_poses, threads, device)
+            return super().render(camera, actor_poses, threads, device, px_per_rad)
 
     def _built(self, section: int) -> list[SceneNode]:
         """Build a section; its nodes get names of their own."""
@@ -131,21 +130,13 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
 
 
 def finished(node: SceneNode, scenario: Scenario) -> SceneNode:
-    """Return a built node in the light of a scenario's sky. Where one of its cameras is sharp, the
-    node is antialiased, and its levels are drawn up to half the distance.
-
-    Without antialiasing all that is thinner than a pixel is drawn a pixel wide, and at 1900 pixels
-    across a line is as thin as that from 30 m on.
-    """
+    """Return a built node in the light of a scenario's sky."""
     light = np.array(LIGHT[scenario.environment.sky])
-    is_sharp = bool(halvings(scenario))
-    if np.all(light == 1.0) and not is_sharp:
-        return node
+    if np.all(light == 1.0):
+        return replace(node, is_built=True)
     levels = []
     for level in node.levels:
         sh = level.cloud.sh * light
         sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
-        filter_px2 = MIP_PX2 if is_sharp else 0.0
-        cloud = replace(level.cloud, sh=sh.astype(np.float32), antialias_px2=filter_px2)
-        levels.append(Level(level.cell_m * (2 if is_sharp else 1), cloud))
-    return replace(node, levels=tuple(levels))
+        levels.append(Level(level.cell_m, replace(level.cloud, sh=sh.astype(np.float32))))
+    return replace(node, levels=tuple(levels), is_built=True)

@@ -7,6 +7,12 @@ the view, and its level is the coarsest whose cells stay below `CELL_PX` pixels 
 nearest point. Order of drawing at equal depth is background nodes in the order given, then actors
 by id.
 
+What a camera sees does not depend on the other cameras of a scene. A built scene holds finer levels
+for its sharpest camera; a camera is drawn with those that its own pixels per radian ask for, and if
+these are more than usual, antialiased and with every level up to half the distance. Without
+antialiasing all that is thinner than a pixel is drawn a pixel wide, and at 1900 pixels across a line
+is as thin as that from 30 m on.
+
 The sky is no Gaussian: its image stands behind everything and is blended with what transparency is
 left. ``alpha`` is therefore the accumulated opacity of the scene *without* the sky (0 in the open
 sky), which is what the paper's opacity-mixed source needs.
@@ -26,10 +32,12 @@ from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
+from alpasim_plugin.gaussians.scene.surfels import halvings_of
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
@@ -53,12 +61,17 @@ class SceneNode:
             x length, y width, z height).
         levels: Finest first.
         far_m: Beyond this distance the node is not drawn.
+        usual_cell_m: Levels with smaller cells are for sharp cameras.
+        is_built: Whether it is antialiased for sharp cameras; a model from elsewhere is drawn as it
+            was trained.
     """
 
     name: str
     kind: str
     levels: tuple[Level, ...]
     far_m: float = 1.0e9
+    usual_cell_m: float = 0.0
+    is_built: bool = False
 
     @cached_property
     def sphere(self) -> tuple[F64, float]:
@@ -94,7 +107,10 @@ def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000
 
 
 def nodes_by_tile(
-    prefix: str, levels: list[tuple[float, GaussianCloud, I64]], far_m: float = 1.0e9
+    prefix: str,
+    levels: list[tuple[float, GaussianCloud, I64]],
+    far_m: float = 1.0e9,
+    usual_cell_m: float = 0.0,
 ) -> list[SceneNode]:
     """Group clouds of several levels into one node per tile.
 
@@ -102,14 +118,15 @@ def nodes_by_tile(
         prefix: Start of the nodes' names.
         levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack its finest
             levels, not its coarser ones.
-        far_m: See `SceneNode`.
+        far_m, usual_cell_m: See `SceneNode`.
     """
     by_tile: dict[int, list[Level]] = {}
     for cell_m, cloud, tile in levels:
         for i, part in split_by_tile(cloud, tile).items():
             by_tile.setdefault(i, []).append(Level(cell_m, part))
     return [
-        SceneNode(f"{prefix}/{i}", "background", tuple(by_tile[i]), far_m) for i in sorted(by_tile)
+        SceneNode(f"{prefix}/{i}", "background", tuple(by_tile[i]), far_m, usual_cell_m)
+        for i in sorted(by_tile)
     ]
 
 
@@ -155,6 +172,7 @@ class SceneGraph:
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
         device: str = "cpu",
+        px_per_rad: float | None = None,
     ) -> RasterOutput:
         """Render one view.
 
@@ -163,6 +181,8 @@ class SceneGraph:
             actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
             threads: Thread count on the CPU; None leaves it as it is.
             device: Where to draw. The first frame on a GPU uploads all nodes.
+            px_per_rad: Of the camera whose smaller image this is, which decides whether it is
+                sharp; None: the camera's own.
 
         Returns:
             Colour with sky, alpha, depth, and ``stats`` with ``visible`` (on the CPU), ``nodes``
@@ -172,11 +192,17 @@ class SceneGraph:
             RendererError: A pose for an actor that the scene does not hold.
         """
         rolling = camera.rolling
+        sharp = halvings_of(px_per_rad or camera.fx)
         chosen = self._choose(
-            camera if rolling is None else camera.widened(rolling.reach_px), actor_poses
+            camera if rolling is None else camera.widened(rolling.reach_px), actor_poses, sharp
         )
+        antialiased = [sharp > 0 and node.is_built for node, _, _ in chosen]
         if device == "cpu":
-            nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
+            prepared = [self._prepare(node, level) for node, level, _ in chosen]
+            nodes: list[Node] = [
+                (replace(one, antialias_px2=MIP_PX2) if filtered else one, T)
+                for one, filtered, (_, _, T) in zip(prepared, antialiased, chosen, strict=True)
+            ]
             starts = (
                 []
                 if rolling is None
@@ -187,7 +213,8 @@ class SceneGraph:
         else:
             clouds, place = self._upload(device)
             placed = [(place[node.name, i], T) for node, i, T in chosen]
-            out = clouds.draw(placed, camera, self.sky.on_device(camera, device))
+            behind = self.sky.on_device(camera, device)
+            out = clouds.draw(placed, camera, behind, antialiased=antialiased)
         stats = {
             **out.stats,
             "nodes": len(chosen),
@@ -196,7 +223,7 @@ class SceneGraph:
         return replace(out, stats=stats)
 
     def _choose(
-        self, camera: PinholeCamera, actor_poses: Mapping[str, F64]
+        self, camera: PinholeCamera, actor_poses: Mapping[str, F64], sharp: int
     ) -> list[tuple[SceneNode, int, F64 | None]]:
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
@@ -216,16 +243,19 @@ class SceneGraph:
         seen = in_view(camera, centres, radii)
         seen[: len(self._far)] &= distance[: len(self._far)] < self._far
         nodes, places = (*self.background, *present), [None] * len(self.background) + list(poses)
-        focal_px = max(camera.fx, camera.fy)
+        allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
         return [
-            (nodes[i], self._level(nodes[i], float(distance[i]), focal_px), places[i])
+            (nodes[i], self._level(nodes[i], float(allowed_m[i]), sharp), places[i])
             for i in np.flatnonzero(seen)
         ]
 
-    def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:
-        allowed_m = CELL_PX * max(distance_m, 0.0) / focal_px
-        fit = [i for i, level in enumerate(node.levels) if level.cell_m <= allowed_m]
-        return fit[-1] if fit else 0
+    def _level(self, node: SceneNode, allowed_m: float, sharp: int) -> int:
+        """Return the coarsest level whose cells are small enough for a camera, else its finest."""
+        least_m = node.usual_cell_m / 2**sharp
+        most_m = allowed_m / 2 if sharp and node.is_built else allowed_m
+        own = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
+        fit = [i for i in own if node.levels[i].cell_m <= most_m]
+        return fit[-1] if fit else own[0]
 
     def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
         key = (node.name, level)

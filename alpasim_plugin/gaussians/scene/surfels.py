@@ -27,15 +27,21 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)  # a quaternion along the axes
 USUAL_PX_PER_RAD, MOST_HALVINGS = 450.0, 2
 
 
-def halvings(scenario: Scenario) -> range:
-    """Return how many times the finest cells are halved for the sharpest camera of a scenario, from
-    the most to one; empty for usual cameras.
+def halvings_of(px_per_rad: float) -> int:
+    """Return how many times the finest cells are halved for a camera with so many pixels per radian;
+    0 for usual cameras.
 
-    Each doubling of its pixels per radian beyond `USUAL_PX_PER_RAD` halves them once.
+    Each doubling beyond `USUAL_PX_PER_RAD` halves them once.
+    """
+    return min(int(np.log2(max(px_per_rad / USUAL_PX_PER_RAD, 1.0))), MOST_HALVINGS)
+
+
+def halvings(scenario: Scenario) -> range:
+    """Return the halvings for the cameras of a scenario, from the most to one; empty for usual
+    cameras.
     """
     sharpest = max((camera.K[0, 0] for camera in scenario.cameras), default=1.0)
-    doublings = int(np.log2(max(sharpest / USUAL_PX_PER_RAD, 1.0)))
-    return range(min(doublings, MOST_HALVINGS), 0, -1)
+    return range(halvings_of(sharpest), 0, -1)
 
 
 def cloud_of(
