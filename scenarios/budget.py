@@ -4,7 +4,8 @@
 single quantities are in `alpasim_plugin.core.limits`.
 
 The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km
-(docs/runs.md): ground and kerbs by the drive's length, trees and walls by the surroundings.
+(docs/runs.md): ground and kerbs by the drive's length, trees and walls by the surroundings, and for
+sharp cameras lane markings, kerbs and road users once more for every halving of their cells.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import astuple
 import numpy as np
 
 from alpasim_plugin.core import limits as b
+from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, Environment, Scenario
@@ -80,15 +82,39 @@ def check_scenario(scenario: Scenario, where: str) -> None:
     b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, where, "length")
     if scenario.background is not None:
         return
+    GAUSSIANS.check(gaussians_of(scenario), where)
+
+
+def gaussians_of(scenario: Scenario) -> float:
+    """Estimate how many Gaussians a built scene takes at all levels of detail, within about half of
+    the true number.
+    """
     xyz = scenario.ego_log.xyz
+    driven_m = float(arc_lengths(xyz)[-1])
     # A longer drive is built in sections, of which no more than so much of its path is held.
-    held_m = min(float(arc_lengths(xyz)[-1]), BUILT_WHOLE_M)
+    held_m = min(driven_m, BUILT_WHOLE_M)
     sides_m = np.minimum(np.ptp(xyz[:, :2], axis=0), held_m) + 2 * REACH_M
-    GAUSSIANS.check(_gaussians(scenario.environment, held_m, float(np.prod(sides_m))), where)
+    usual = _gaussians(scenario.environment, held_m, float(np.prod(sides_m)))
+    halved = halvings(scenario)
+    if not halved:
+        return usual
+    low, high = xyz[:, :2].min(axis=0) - REACH_M, xyz[:, :2].max(axis=0) + REACH_M
+    lanes_m = 0.0
+    for lane in scenario.lane_map.lanes.values():
+        near = ((lane.centre[1:, :2] > low) & (lane.centre[1:, :2] < high)).all(axis=1)
+        lanes_m += float(np.diff(arc_lengths(lane.centre))[near].sum())
+    held_lanes_m = lanes_m * held_m / max(driven_m, 1.0)
+    finer = sum(4**n for n in halved) * (5.0 * held_lanes_m + 20.0 * (held_m + 40.0))
+    return usual + finer + 13_000.0 * len(scenario.actors)
+
+
+def memory_mb(scenario: Scenario, drawn_pixels: float) -> float:
+    """Estimate the most memory that a process takes to show a built scene."""
+    return 220.0 + 2e-4 * gaussians_of(scenario) + 3e-5 * drawn_pixels
 
 
 def _gaussians(environment: Environment, driven_m: float, area_m2: float) -> float:
-    """Estimate how many Gaussians a scene takes, within about half of the true number.
+    """Estimate how many Gaussians a scene takes for usual cameras.
 
     Args:
         environment: Surroundings.

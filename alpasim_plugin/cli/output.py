@@ -194,6 +194,7 @@ def size_lines(plan: RunPlan) -> list[str]:
     have a megapixel or more.
     """
     from alpasim_plugin.runs.lenses import drawn_pixels
+    from scenarios.budget import memory_mb
 
     def pixels_of(scenario: Scenario) -> int:
         return sum(camera.width * camera.height for camera in scenario.cameras)
@@ -206,7 +207,10 @@ def size_lines(plan: RunPlan) -> list[str]:
     cameras = plural(len(largest.cameras), "camera")
     size = f"{cameras} of {pixels / 1e6:.1f} megapixels"
     by = f"drawn as {drawn / 1e6:.1f} by {plural(pinholes, 'pinhole')}"
-    return [f"{largest.scene_id}: {size}, {by}, {drawn / PX_PER_S:.1f} CPU seconds behind clean"]
+    cost = f"{drawn / PX_PER_S:.1f} CPU seconds"
+    if largest.background is None and largest.model is None:
+        cost += f" and {memory_mb(largest, drawn) / 1e3:.1f} GB"
+    return [f"{largest.scene_id}: {size}, {by}, {cost} behind clean"]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.reading import file_sha256
@@ -21,7 +22,6 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.scene.log_views import SkyView
-from alpasim_plugin.gaussians.scene.surfels import halvings
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction

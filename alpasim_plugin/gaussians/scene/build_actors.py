@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Box, Scenario
@@ -27,7 +28,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
 from alpasim_plugin.gaussians.scene.surfels import (
     IDENTITY,
     cloud_of,
-    halvings,
     quad_surfels,
     rods,
     with_sheen,

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.markings import WHITE, YELLOW, Strokes
@@ -39,7 +40,6 @@ from alpasim_plugin.gaussians.scene.surfels import (
     cell_counts,
     cloud_of,
     grid_cells,
-    halvings,
     quats_along,
     upright_quats,
 )

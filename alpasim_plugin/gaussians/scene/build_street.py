@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -25,7 +26,6 @@ from alpasim_plugin.gaussians.scene.surfels import (
     SPREAD,
     cell_counts,
     cloud_of,
-    halvings,
     quad_surfels,
     quats_along,
     rods,

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.detail import halvings_of
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -37,7 +38,6 @@ from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
-from alpasim_plugin.gaussians.scene.surfels import halvings_of
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds

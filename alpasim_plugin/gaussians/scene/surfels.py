@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw
-from alpasim_plugin.core.types import F64, I64, Scenario
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, quat_multiply
 from alpasim_plugin.gaussians.sh import C1, dc_from_rgb
 
@@ -22,26 +22,6 @@ SPREAD = 0.64  # standard deviation per cell size
 THICKNESS = 0.08  # standard deviation across the surface, per cell size
 OPACITY = 0.985
 IDENTITY = (1.0, 0.0, 0.0, 0.0)  # a quaternion along the axes
-# Pixels per radian from which a camera sees that the usual cells are soft; 1.2 for 512 pixels across
-# 70 degrees, and 2.5 for 1900 across 120.
-USUAL_PX_PER_RAD, MOST_HALVINGS = 450.0, 2
-
-
-def halvings_of(px_per_rad: float) -> int:
-    """Return how many times the finest cells are halved for a camera with so many pixels per radian;
-    0 for usual cameras.
-
-    Each doubling beyond `USUAL_PX_PER_RAD` halves them once.
-    """
-    return min(int(np.log2(max(px_per_rad / USUAL_PX_PER_RAD, 1.0))), MOST_HALVINGS)
-
-
-def halvings(scenario: Scenario) -> range:
-    """Return the halvings for the cameras of a scenario, from the most to one; empty for usual
-    cameras.
-    """
-    sharpest = max((camera.K[0, 0] for camera in scenario.cameras), default=1.0)
-    return range(halvings_of(sharpest), 0, -1)
 
 
 def cloud_of(

@@ -11,7 +11,7 @@ from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core import limits as bounds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART
-from scenarios.budget import check_scenario
+from scenarios.budget import check_scenario, gaussians_of
 from scenarios.load import load_scenario
 from tests.core.reading import past_failures as seen
 
@@ -59,6 +59,12 @@ def drive_of(length_m, scenario):
     n = len(scenario.ego_log)
     xyz = np.column_stack([np.linspace(0, length_m, n), np.zeros((n, 2))])
     return replace(scenario, ego_log=replace(scenario.ego_log, xyz=xyz))
+
+
+@pytest.mark.parametrize(("cameras", "counted"), [("[{}]", 647_805), ("{rig: alpasim-4}", 912_395)])
+def test_the_gaussians_of_a_built_street_are_known_before_it_is_built(cameras, counted):
+    scenario = load_scenario("urban/one_way", overrides=[f"cameras={cameras}"])
+    assert counted / 1.5 < gaussians_of(scenario) < 1.5 * counted
 
 
 def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built():
