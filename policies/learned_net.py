@@ -146,7 +146,7 @@ class LearnedNet(nn.Module):
             speed * self.speed_scale,
             sigma,
             leader,
-            torch.cat(comes, dim=1).unflatten(1, (-1, 2)),
+            torch.cat(comes, dim=1).view(len(state), len(self.views) - 1, 2),
         )
 
 

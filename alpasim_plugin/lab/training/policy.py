@@ -230,7 +230,7 @@ def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
     with the plans of ``front``.
     """
     known = front.state_dict()
-    wide, narrow = net.plan[0].weight, known["plan.0.weight"]
+    wide, narrow = net.state_dict()["plan.0.weight"], known["plan.0.weight"]
     others = wide.shape[1] - narrow.shape[1]
     after = narrow.shape[1] - front.state[0].out_features - front.word.embedding_dim
     zeros = torch.zeros(len(wide), others)
