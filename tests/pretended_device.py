@@ -271,6 +271,7 @@ def pretended_device(patch):
         patch: pytest's ``monkeypatch``.
     """
     from alpasim_plugin.fixers import pixel_fixer
+    from alpasim_plugin.fixers.semantic_map import tile_kernel
     from alpasim_plugin.gaussians.raster import rasterize_triton, triton_kernels
 
     patch.setattr(torch.cuda, "is_available", lambda: True)
@@ -289,6 +290,7 @@ def pretended_device(patch):
     patch.setattr(torch.cuda, "stream", nullcontext)
     patch.setattr(torch.cuda, "device", nullcontext)
     patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
+    patch.setattr(tile_kernel, "draw_tiles", _Launches(tile_kernel.draw_tiles))
     # Subclasses of tensors do not work in inference mode; gradients are off in either.
     plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]
     patch.setattr(pixel_fixer, "fix_frame", plain)

@@ -78,8 +78,10 @@ class Lens:
 
     def frame(self, covering: Frame) -> Frame:
         """Return a covering frame as the lens shows it; where the pinhole does not show the lens it
-        is black and opaque.
+        is black and opaque; itself where the lens is the pinhole.
         """
+        if self.resample is None:
+            return covering
         alpha = None if covering.alpha is None else self.plane(covering.alpha, 1.0)
         references = tuple(self.image(image) for image in covering.references)
         return replace(

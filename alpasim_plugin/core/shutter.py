@@ -46,12 +46,20 @@ class Band:
     actors: Mapping[str, F64]
 
     def put(self, whole: Any, part: Any) -> None:
-        """Write the band's pixels of a window's image ``(h, w, ...)`` into the whole one."""
+        """Write the band's pixels of a window's image ``(h, w, ...)`` into the whole one; both are
+        arrays, or tensors of a device.
+        """
         window = whole[self.rows, self.columns]
         if self.exposed is None:
             window[...] = part
-        else:
+        elif isinstance(whole, np.ndarray):
             window[self.exposed] = part[self.exposed]
+        else:
+            import torch
+
+            exposed = torch.from_numpy(self.exposed.copy()).to(whole.device)
+            exposed = exposed.reshape(*exposed.shape, *[1] * (part.ndim - 2))
+            window[...] = torch.where(exposed, part, window)
 
 
 def rolling_exposure(

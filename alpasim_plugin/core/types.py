@@ -266,6 +266,11 @@ class Frame:
         """The planes of a device, if the frame's image is theirs."""
         return self.on_device if self.is_pending("rgb") else None
 
+    @property
+    def device(self) -> Any:
+        """The device that drew it, also if its image was changed on the host since; or None."""
+        return None if self.on_device is None else self.on_device.rgb.device
+
     def is_pending(self, plane: str) -> bool:
         """Return whether a plane is that of a device, downloaded or not."""
         return self.on_device is not None and self.__dict__[plane] is None

@@ -22,11 +22,10 @@ from alpasim_plugin.core.lazy import installed
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
-from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 ONE_BY_ONE = BlockRule(1, 1)
@@ -38,7 +37,7 @@ class ConditionedFrame:
 
     request: RenderRequest
     frame: Frame
-    map: U8 | None  # (H, W, 3); None where the fixer uses none
+    map: Any  # (H, W, 3) uint8, of the host or of a device; None where the fixer uses none
 
 
 @dataclass
@@ -52,7 +51,8 @@ class BlockRunner:
         references: Warps recorded frames into each view; None where the fixer reads none, or the
             renderer declares none.
         threads: Threads of the map rasteriser.
-        on_device: Whether the fixer takes the references of a frame that a device drew from there.
+        on_device: Whether the fixer takes the references and the map of a frame that a device drew
+            from there.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -73,15 +73,12 @@ class BlockRunner:
         frame = self.render_base(request)
         if self.references is not None:
             with self._timed("references"):
-                if self.on_device and frame.pending is not None:
-                    planes = self.references.on_device(request, frame.pending)
-                    frame = frame.changed(on_device=planes)
-                else:
-                    frame = frame.changed(references=self.references.of(request, frame))
+                frame = self.references.added(request, frame, self.on_device)
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
+        device = frame.device if self.on_device else None
         with self._timed("map"):
-            image = draw_exposed_map(self.scene_map, request, self.actors, self.threads)
+            image = draw_exposed_map(self.scene_map, request, self.actors, self.threads, device)
         return ConditionedFrame(request, frame, image)
 
     def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
@@ -231,10 +228,7 @@ def fixed_renderer(
         InputError: No installed package has the mode.
     """
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
-    references = None
-    if settings.references and recorded:
-        of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
-        references = ReferenceSession(*of, threads=thread_count(threads))
+    references = session_of(settings, scenario, recorded, threads)
     first = complete(make_fixer(), Fixer)
     on_device = first.reads_device
     runner = BlockRunner(render, scene_map, scenario.actors, threads, references, on_device)

@@ -14,7 +14,7 @@ own future is looked at.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -30,10 +30,13 @@ from alpasim_plugin.core.types import (
     Frame,
     RecordedFrame,
     RenderRequest,
+    Scenario,
     Trajectory,
 )
 from alpasim_plugin.fixers.ground import carry, window_px, with_users
+from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
+from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
 SECOND_M, TURN_M = (
@@ -143,29 +146,46 @@ class ReferenceSession:
         if frame.depth is None:
             return ()
         chosen, T_world_rig = self._choose(request)
-        recorded_images = [self._recorded_image(i) for i in chosen]
-        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in recorded_images)
+        images = [self._recorded_image(i) for i in chosen]
+        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in images)
+        self._put(
+            out,
+            request,
+            frame.depth,
+            lambda target: carry(images, target, T_world_rig, self.threads),
+        )
+        return out
+
+    def _put(
+        self, out: Any, request: RenderRequest, depth: Any, carried: Callable[[WarpTarget], Any]
+    ) -> None:
+        """Write recorded frames, carried into each band of a view ``(H, W)``, into ``out``."""
         around = window_px(
             request.camera.K
         )  # what `carry` decides of a pixel depends on those around it
         for band in bands(request):
-            top, end = (
-                max(band.rows.start - around, 0),
-                min(band.rows.stop + around, len(frame.depth)),
-            )
+            top = max(band.rows.start - around, 0)
             K = request.camera.K.copy()
             K[1, 2] -= top
-            target = WarpTarget(
-                K, band.T_world_camera, frame.depth[top:end], band.actors, self._boxes
-            )
+            near = depth[top : band.rows.stop + around]
+            target = WarpTarget(K, band.T_world_camera, near, band.actors, self._boxes)
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            for whole, part in zip(
-                out, carry(recorded_images, target, T_world_rig, self.threads), strict=True
-            ):
+            for whole, part in zip(out, carried(target), strict=True):
                 band.put(whole, part[own])
-        return out
 
-    def on_device(self, request: RenderRequest, planes: DevicePlanes) -> DevicePlanes:
+    def added(self, request: RenderRequest, frame: Frame, on_device: bool) -> Frame:
+        """Return a rendered frame with its references.
+
+        Args:
+            request: What was rendered.
+            frame: The render.
+            on_device: Whether those of a frame that a device drew may stay there.
+        """
+        if on_device and frame.pending is not None:
+            return frame.changed(on_device=self._on_device(request, frame.pending))
+        return frame.changed(references=self.of(request, frame))
+
+    def _on_device(self, request: RenderRequest, planes: DevicePlanes) -> DevicePlanes:
         """Return the planes of a rendered frame with its references, both on their device."""
         from alpasim_plugin.fixers import device_carry
 
@@ -180,9 +200,14 @@ class ReferenceSession:
         images = [self._uploaded[i] for i in chosen]
 
         def carried(drawn: DevicePlanes) -> Mapping[str, Any]:
-            K, T = request.camera.K, request.T_world_camera[1]
-            target = WarpTarget(K, T, drawn.depth, request.actors, self._boxes)
-            return {"references": device_carry.carry_on_device(images, target, T_world_rig)}
+            out = drawn.rgb.new_zeros((len(images), *drawn.size, 4))
+            self._put(
+                out,
+                request,
+                drawn.depth,
+                lambda target: device_carry.carry_on_device(images, target, T_world_rig),
+            )
+            return {"references": out}
 
         return planes.changed(carried)
 
@@ -206,3 +231,19 @@ class ReferenceSession:
                 self._uploaded.pop(dropped, None)
         self._recorded.move_to_end(i)
         return self._recorded[i]
+
+
+def session_of(
+    settings: FixerSettings,
+    scenario: Scenario,
+    recorded: Sequence[RecordedFrame],
+    threads: int | None = None,
+    hysteresis: bool = True,
+) -> ReferenceSession | None:
+    """Return the references of a scenario's rollout as a fixer's settings have them; None where
+    there are none. See `ReferenceSession`.
+    """
+    if not (settings.references and recorded):
+        return None
+    of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
+    return ReferenceSession(*of, hysteresis, thread_count(threads))

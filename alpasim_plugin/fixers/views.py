@@ -27,7 +27,7 @@ class Views:
     t_us: tuple[tuple[int, ...], ...]  # per camera
     rgb: Any  # (B, T, H, W, 3) uint8, of the host or of a device
     alpha: Any  # (B, T, H, W) float32 beside it, 0 to 1; None where every pixel is opaque
-    maps: U8 | None  # (B, T, H, W, 3)
+    maps: Any  # (B, T, H, W, 3) uint8, of the host or of a device; None: nothing is drawn
     references: Any = (
         # (B, T, K, H, W, 4) uint8 recorded frames, of the host or of a device, 0 where a frame has
         # fewer than others; None: no frame has any
@@ -154,7 +154,7 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
     if sdmap is not None:
         given.append(("the map", sdmap, shape))
     for name, image, due in given:
-        if image.shape != due or image.dtype != np.uint8:
+        if image.shape != due or str(image.dtype).rpartition(".")[2] != "uint8":
             raise InputError(
                 f"{what}: {name} is {image.dtype} {image.shape}",
                 f"give uint8 {due}, the size of the frame",
@@ -195,6 +195,11 @@ def _stack(
         rgb, alpha, references = stacked(drawn)
     else:
         rgb, alpha = np.stack([frame.rgb for frame in frames]), _opacity(frames)
+    joined: Any = np.stack
+    if maps and not isinstance(maps[0], np.ndarray):
+        import torch
+
+        joined = torch.stack
     given = [] if references is not None else [_references(frame) for frame in frames]
     count = max(map(len, given), default=0)
     if count:
@@ -210,7 +215,7 @@ def _stack(
         tuple(tuple(block[i].t_us for i in mine) for mine in order),
         rgb.reshape(*lead, *shape),
         None if alpha is None else alpha.reshape(*lead, *shape[:2]),
-        np.stack([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
+        joined([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
         references,
     )
 

@@ -216,7 +216,7 @@ class ImportedRenderer(Renderer):
         there.
         """
         return photograph_recording(
-            self.scenario, lambda camera, actors: self._drawn(camera, actors).depth
+            self.scenario, lambda camera, actors: self._drawn(camera, actors).on_host().depth
         )
 
     def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-
-import numpy as np
+from functools import partial
 
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.shutter import at_share, bands, motion_px
@@ -28,7 +27,8 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
     """Draw a request's frame; without an exposure at the shutter's end.
 
     Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
-    time of its pixel. Otherwise the frame is drawn in `bands`, which are joined on the host.
+    time of its pixel. Otherwise the frame is drawn in `bands`, which are joined where they were
+    drawn.
 
     Args:
         request: What to draw.
@@ -44,13 +44,14 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
         return draw(camera_at(request, request.T_world_camera[1]), request.actors)
     if device == "cpu" and 1 in request.exposure.share.shape:
         return draw(*_rolling(request))
-    shape = (spec.height, spec.width)
-    out = RasterOutput(
-        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
-    )
-    for band in bands(request):
-        camera = camera_at(request, band.T_world_camera)
-        part = draw(camera.window(band.rows, band.columns), band.actors).on_host()
+    exposed = bands(request)
+    parts = [
+        draw(camera_at(request, band.T_world_camera).window(band.rows, band.columns), band.actors)
+        for band in exposed
+    ]
+    again = partial(draw_request, request, draw, device)
+    out = parts[0].blank(spec.height, spec.width, parts, again)
+    for band, part in zip(exposed, parts, strict=True):
         for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
             band.put(whole, drawn)
     return out

@@ -1,4 +1,4 @@
-"""Compile the rasteriser's Triton kernels for a GPU that need not be here, and print what they use.
+"""Compile the Triton kernels for a GPU that need not be here, and print what they use.
 
 Usage: python docs/scripts/compile_gpu_kernels.py 80 90
 """
@@ -17,17 +17,19 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from alpasim_plugin.fixers.semantic_map.on_device import COLUMNS, tile_kernel
 from alpasim_plugin.gaussians.constants import TILE
 from alpasim_plugin.gaussians.raster import triton_kernels as kernels
 from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
 
-CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK}
+CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK, "COLUMNS": COLUMNS}
 TYPES = {
-    "*fp64": ("poses", "camera", "means"),
+    "*u8": ("levels",),
+    "*fp64": ("poses", "camera", "means", "primitives", "samples"),
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
     "*i64": ("order", "ends", "places"),
     "fp32": ("near_m",),
-    "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height"),
+    "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height", "rows", "top"),
     "constexpr": tuple(CONSTANTS),
 }
 
@@ -43,9 +45,8 @@ def resources(kernel: Any, capability: int) -> str:
     )
     compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))
     tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
-    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+    with tempfile.NamedTemporaryFile(suffix=".cubin", buffering=0) as file:
         file.write(compiled.asm["cubin"])
-        file.flush()
         command = [str(tool), "--dump-resource-usage", file.name]
         said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     (registers,), (stack,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK"))
@@ -54,5 +55,6 @@ def resources(kernel: Any, capability: int) -> str:
 
 if __name__ == "__main__":
     for wanted in map(int, sys.argv[1:]):
-        for name in ("project", "list_tiles", "composite", "composite_backward"):
-            print(f"{name} sm_{wanted} {resources(getattr(kernels, name), wanted)}")
+        for name in ("project", "list_tiles", "composite", "composite_backward", "draw_tiles"):
+            kernel = getattr(kernels, name, tile_kernel.draw_tiles)
+            print(f"{name} sm_{wanted} {resources(kernel, wanted)}")

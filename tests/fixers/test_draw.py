@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_map, primitives_of
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.fixers.semantic_map.style import COLOURS
 from tests.examples import first_of
@@ -274,6 +275,17 @@ def test_a_part_of_the_rows_is_that_part_of_the_picture(rows):
     scene, boxes = street()
     whole = draw_map(scene, PIN, at(), boxes)
     assert_array_equal(draw_map(scene, PIN, at(), boxes, rows=rows), whole[rows])
+
+
+def test_a_gpu_draws_the_same_pixels():
+    pytest.importorskip("triton", reason="Triton is not installed")
+    from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles
+
+    (scene, boxes), rows = street(), slice(3, 25)
+    view = replace(PIN, width=48, height=27, K=np.diag([0.1875, 0.1875, 1]) @ PIN.K)
+    seen = primitives_of(scene, view, at(x=1.0), boxes)
+    found = draw_tiles(*seen, (view.height, view.width), rows, torch.device("cpu"))
+    assert_array_equal(found, draw_map(scene, view, at(x=1.0), boxes, rows=rows))
 
 
 def test_concave_area_stays_concave():

@@ -2,15 +2,24 @@
 waits, launches and bytes.
 """
 
+import copy
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
+from alpasim_plugin.alpasim.server.caches import SceneEntry
 from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of
+from alpasim_plugin.core.shutter import rolling
 from alpasim_plugin.core.types import (
     OPACITY_MEAN,
     RECORDED_SHARE,
     CameraSpec,
+    Exposure,
     Frame,
     RecordedFrame,
     RenderRequest,
@@ -18,14 +27,21 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.loop import BlockRunner
+from alpasim_plugin.fixers.network.pixel_generator import TORCH
+from alpasim_plugin.fixers.pixel_fixer import GivenFrame, fix_frame, in_range
+from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.renderers.rolling import draw_request
 from tests.examples import first_of
+from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
 from tests.gaussians.test_scene_graph import SKY, blobs, camera, node, se2
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
+from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
 from tests.pretended_device import pretended_device, traffic
 
 HEIGHT, WIDTH = 64, 96
@@ -70,31 +86,27 @@ def test_a_scene_is_uploaded_once_and_a_frame_waits_when_it_is_read(monkeypatch)
     assert traffic.launches <= 40
 
 
-@pytest.mark.parametrize("capacity", first_of([10, 1 << 16]))
-def test_a_frame_stays_on_the_device_between_rasteriser_and_fixer(monkeypatch, capacity):
-    graph, poses = scene()
-    host = make_fixer("onefixer", scene_id="scene")
-    sdmap = np.zeros((*camera_size(), 3), np.uint8)
+def test_bands_of_a_rolling_shutter_are_joined_where_they_are_drawn(monkeypatch):
+    graph, _ = scene()
+    T = np.linalg.inv(camera().T_camera_world)
+    spec = CameraSpec("front", *camera_size()[::-1], camera().K, T)
+    exposure = Exposure(rolling(spec.width, spec.height, "rows", backwards=False), {})
+    request = RenderRequest(0, spec, np.stack([se2(0.3, 0, 0) @ T, T]), {}, exposure=exposure)
 
-    def drawn(t_us, device="cpu"):
-        return graph.render(camera(), poses, device=device).surface().frame(t_us, "front")
+    def drawn(device):
+        draw = partial(graph.render, device=device if "cuda" in device else "cpu")
+        return draw_request(request, draw, device).frame(0, "front")
 
-    wanted = [host.step([drawn(t)], [sdmap])[0] for t in range(3)]
+    wanted = drawn("bands")
     with pretended_device(monkeypatch) as traffic:
-        device = make_fixer("onefixer", scene_id="scene", device="cuda")
-        for t, due in enumerate(wanted):
-            graph._upload("cuda:0")[0].capacity = capacity
-            traffic.reset()
-            fixed = device.step([drawn(t, "cuda:0")], [sdmap])[0]
-            assert np.abs(fixed.rgb.astype(int) - due.rgb).max() <= 2  # of images that differ by 1
-            assert fixed.facts[OPACITY_MEAN] == pytest.approx(due.alpha.mean(), abs=1e-4)
-            assert sum(traffic.waits.values()) == (1 if capacity > 10 else 2)
-            if capacity > 10:
-                assert traffic.bytes_down < 3.1 * due.alpha.size + 200
-        assert np.abs(fixed.alpha - due.alpha).max() <= LSB
+        found = drawn("cuda:0")
+        assert not traffic.waits
+        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 1
+    assert sum(traffic.waits.values()) == 1
 
 
-def test_references_are_carried_on_the_device(monkeypatch):
+@pytest.mark.parametrize("capacity", first_of([10, 1 << 16]))
+def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capacity):
     graph, poses = scene()
     spec = camera()
     T = np.linalg.inv(spec.T_camera_world)
@@ -105,31 +117,65 @@ def test_references_are_carried_on_the_device(monkeypatch):
     ]
     path = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     view = CameraSpec("front", spec.width, spec.height, spec.K, T)
+    request = RenderRequest(100_000, view, np.stack([T, T]), {})
+
+    def rendered(asked, device="cuda:0"):
+        return graph.render(spec, poses, device=device).surface().frame(asked.t_us, "front")
 
     def fixed(device):
         references = ReferenceSession(recorded, (), path, 2)
         fixer = make_fixer("onefixer", scene_id="scene", device=device)
         runner = BlockRunner(
-            lambda r: graph.render(spec, poses, device=device).surface().frame(r.t_us, "front"),
-            None,
+            partial(rendered, device=device),
+            prepare_map(marked((line((2, 1, 0), (30, 1, 0)), "solid_white"))),
             (),
             references=references,
             on_device=fixer.reads_device,
         )
-        for t_us in (0, 100_000):
+        for t_us in (0, request.t_us):
             traffic.reset()
-            request = RenderRequest(t_us, view, np.stack([T, T]), {})
-            (frame,) = runner.fix(fixer, fixer.step, [runner.render(request)])
+            if device != "cpu":
+                graph._upload(device)[0].capacity = capacity
+            one = replace(request, t_us=t_us)
+            (frame,) = runner.fix(fixer, fixer.step, [runner.render(one)])
         return frame
 
     wanted = fixed("cpu")
     assert wanted.facts[RECORDED_SHARE] > 0.05
     with pretended_device(monkeypatch):
         found = fixed("cuda:0")
-        assert sum(traffic.waits.values()) == 1
-        assert traffic.bytes_down < 3.1 * rgb[..., 0].size + 200
-        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 2
+        assert sum(traffic.waits.values()) == (1 if capacity > 10 else 2)
+        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 2  # of images that differ by 1
         assert found.facts[RECORDED_SHARE] == pytest.approx(wanted.facts[RECORDED_SHARE], abs=1e-3)
+        assert found.facts[OPACITY_MEAN] == pytest.approx(wanted.alpha.mean(), abs=1e-4)
+        if capacity > 10:
+            assert traffic.bytes_up < 3_000  # poses, and what is in view of the map
+            assert traffic.bytes_down < 3.1 * rgb[..., 0].size + 200
+        renderer = SimpleNamespace(render_batch=lambda asked: [rendered(*asked)])
+        served = SceneEntry(None, None, renderer, ReferenceSession(recorded, (), path, 2), True)
+        traffic.reset()
+        assert len(served.render(request, True).pending.references) == 2
+        assert not traffic.waits
+    assert np.abs(found.alpha - wanted.alpha).max() <= LSB
+
+
+def test_what_a_frame_costs_at_least():
+    cloud = blobs((8, 3, 1), n=12)
+    cloud = replace(cloud, sh=np.zeros((12, 16, 3)))
+    drawn = UploadedClouds([cloud], "cpu")
+    parts = drawn.means, drawn.factors, drawn.opacities, drawn.extents, drawn.sh
+    assert sum(part.nbytes for part in parts) == 260 * 12
+    settings, size = fixer_settings("onefixer"), (1, 544, 960)
+    loaded = load_generator(settings)
+    net = copy.deepcopy(loaded.net).to("meta")
+    image = torch.empty((*size, 3), dtype=torch.uint8, device="meta")
+    references = torch.empty((1, 2, *size[1:], 4), dtype=torch.uint8, device="meta")
+    scale = settings.scale_of(*size[1:])
+    state = net.start(in_range(image, scale), scale)
+    given = GivenFrame(image, image, image, *state, None, image, references)
+    with FlopCounterMode(display=False) as counted:
+        fix_frame(replace(loaded, net=net, operations=TORCH), settings, given)
+    assert counted.get_total_flops() == pytest.approx(2.06e9, rel=0.01)
 
 
 @pytest.mark.parametrize("holes", ["render", "noise"])

@@ -9,7 +9,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,10 +20,9 @@ from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_ren
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.fixers.references import ReferenceSession
+from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.log.schema import wire_camera
 from alpasim_plugin.log.wire import FRONT_WIDE, sensorsim_pb2
 from alpasim_plugin.renderers.weather import in_weather
@@ -115,16 +114,17 @@ class SceneEntry:
     scene_map: PreparedMap | None
     renderer: Renderer | None
     references: ReferenceSession | None = None
+    reads_device: bool = False  # whether its fixer takes frames from a device
 
-    def render(self, request: RenderRequest) -> Frame:
-        """Render a frame with its references, which depend on the request alone."""
+    def render(self, request: RenderRequest, on_device: bool = False) -> Frame:
+        """Render a frame with its references, which depend on the request alone; what a device
+        drew may stay there.
+        """
         assert self.renderer is not None, "scenes without a renderer are for maps only"
-        frame = checked_frames(self.renderer, [request])[0]
-        return (
-            frame
-            if self.references is None
-            else replace(frame, references=self.references.of(request, frame))
-        )
+        frame = checked_frames(self.renderer, [request], on_device)[0]
+        if self.references is None:
+            return frame
+        return self.references.added(request, frame, on_device)
 
 
 class SceneCache:
@@ -216,31 +216,21 @@ class SceneCache:
 
     def _load(self, source: str | Path) -> SceneEntry:
         scenario = load_scenario(source)
-        renderer, references = None, None
+        renderer, references, reads_device = None, None, False
         if self._spec is not None:
             built = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
             renderer = in_weather(built, scenario, self._session["seed"])
             settings = self._spec.fixer and self._spec.fixer.settings
-            recorded = (
-                renderer.recorded()
-                if isinstance(settings, FixerSettings) and settings.references
-                else ()
-            )
-            if recorded:
-                assert isinstance(settings, FixerSettings)
-                of = (
-                    recorded,
-                    scenario.actors,
-                    scenario.ego_log,
-                    settings.references,
-                    settings.recording,
-                )
-                references = ReferenceSession(*of, hysteresis=False, threads=thread_count(None))
+            reads_device = isinstance(settings, PixelFixerSettings)
+            if isinstance(settings, FixerSettings):
+                recorded = renderer.recorded() if settings.references else ()
+                references = session_of(settings, scenario, recorded, hysteresis=False)
         return SceneEntry(
             scenario,
             prepare_map(scenario.lane_map) if self._needs_map else None,
             renderer,
             references,
+            reads_device,
         )
 
 

@@ -118,9 +118,9 @@ class FrameServer:
             if known is not None:  # another call has made it meanwhile
                 return known
             parent = self.tree.parent_of(view)
-            if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
+            if parent is not None and parent.state.image.shape[:2] != item.frame.size:
                 raise UpstreamFault(
-                    f"scene {view.scene_id!r}, camera {view.camera!r}: an image of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)",
+                    f"scene {view.scene_id!r}, camera {view.camera!r}: an image of {item.frame.size} after {parent.state.image.shape[:2]} (height, width)",
                     "see the upstream's log",
                 )
             past = None if parent is None else parent.state.past

@@ -92,7 +92,7 @@ class Rendered:
     """A frame before it is fixed, with its semantic map where the fixer takes one."""
 
     frame: Frame
-    sdmap: U8 | None
+    sdmap: Any  # (H, W, 3) uint8, of the host or of a device
 
 
 class FrameSource(Protocol):
@@ -143,11 +143,14 @@ def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec
     return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
 
 
-def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens) -> U8 | None:
-    """Return the semantic map as the lens sees it; None where the fixer takes none."""
+def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens, device: Any = None) -> Any:
+    """Return the semantic map as the lens sees it, of the device that drew its frame; None where
+    the fixer takes none.
+    """
     if entry.scene_map is None:
         return None
-    return lens.image(draw_exposed_map(entry.scene_map, asked, entry.scenario.actors))
+    actors = entry.scenario.actors
+    return lens.image(draw_exposed_map(entry.scene_map, asked, actors, device=device))
 
 
 def gated(
@@ -193,7 +196,7 @@ def gated(
         found.there,
         found_at,
     )
-    return Rendered(replace(rendered.frame, events=(*rendered.frame.events, MAP_OFF)), None)
+    return Rendered(rendered.frame.changed(events=(*rendered.frame.events, MAP_OFF)), None)
 
 
 class LocalSource:
@@ -229,10 +232,11 @@ class LocalSource:
         entry = self._scenes.get(view.scene_id, left)
         camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
         asked = asked_of(entry, request, view, camera)
+        stays = entry.reads_device and lens.resample is None  # the CPU looks through a lens
         with left.holding(self._busy):
-            frame = entry.render(asked)
+            frame = entry.render(asked, stays)
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
-            sdmap = drawn_map(entry, asked, lens)
+            sdmap = drawn_map(entry, asked, lens, frame.device if stays else None)
         rendered = Rendered(lens.frame(frame), sdmap)
         return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view)
 

@@ -11,6 +11,7 @@ rows i to i + 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -64,10 +65,7 @@ def draw_map(
         rows: The part of the image to draw and to return; None: all.
     """
     rows = slice(0, camera.height) if rows is None else rows
-    view, pose = view_of(scene, camera, T_world_camera)
-    faces, edges = actor_geometry(actors, scene, pose)
-    lines, box_edges = (strokes_of(part, pose, view) for part in (scene.segments, edges))
-    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
+    lines, shapes, box_edges = primitives_of(scene, camera, T_world_camera, actors)
     image: U8 = np.empty((rows.stop, camera.width, 3), np.uint8)
     band = np.full(1, rows.start // BAND, np.int64)
     stretch = camera.width / camera.height
@@ -77,9 +75,23 @@ def draw_map(
     return image[rows]
 
 
+def primitives_of(
+    scene: PreparedMap, camera: CameraSpec, T_world_camera: F64, actors: Sequence[ActorBox]
+) -> tuple[F64, F64, F64]:
+    """Return the strokes of lines, the shapes, and the strokes of boxes' edges that are seen."""
+    view, pose = view_of(scene, camera, T_world_camera)
+    faces, edges = actor_geometry(actors, scene, pose)
+    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
+    return strokes_of(scene.segments, pose, view), shapes, strokes_of(edges, pose, view)
+
+
 def draw_exposed_map(
-    scene: PreparedMap, request: RenderRequest, actors: Sequence[Actor], threads: int | None = None
-) -> U8:
+    scene: PreparedMap,
+    request: RenderRequest,
+    actors: Sequence[Actor],
+    threads: int | None = None,
+    device: Any = None,
+) -> Any:
     """Draw the map of a requested frame ``(H, W, 3)``: each band of a rolling shutter at its
     instant; see `draw_map`.
 
@@ -88,13 +100,23 @@ def draw_exposed_map(
         request: Camera, poses, road users and when rows are exposed.
         actors: The scenario's, for the sizes of their boxes.
         threads: As many CPU threads; None leaves numba's number.
+        device: A card, which draws the map and keeps it as a tensor; None: the CPU.
     """
-    out: U8 = np.zeros((request.camera.height, request.camera.width, 3), np.uint8)
+    camera = request.camera
+    size = camera.height, camera.width
+    out: Any = np.zeros((*size, 3), np.uint8)
+    if device is not None:
+        import torch
+
+        from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles
+
+        out = torch.zeros((*size, 3), dtype=torch.uint8, device=device)
     for band in bands(request):
-        boxes = actor_boxes(band.actors, actors)
-        part = draw_map(
-            scene, request.camera, band.T_world_camera, boxes, threads=threads, rows=band.rows
-        )
+        seen = scene, camera, band.T_world_camera, actor_boxes(band.actors, actors)
+        if device is None:
+            part: Any = draw_map(*seen, threads=threads, rows=band.rows)
+        else:
+            part = draw_tiles(*primitives_of(*seen), size, band.rows, device)
         band.put(out, part[:, band.columns])
     return out
 

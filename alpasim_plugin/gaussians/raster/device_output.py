@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -56,6 +56,19 @@ class DeviceOutput(RasterOutput):
     def on_host(self) -> RasterOutput:
         """Return the view with arrays."""
         return RasterOutput(**self.arrays, stats=self.stats)
+
+    def blank(
+        self, height: int, width: int, parts: Sequence[Any], again: Callable[[], Any]
+    ) -> DeviceOutput:
+        """See `RasterOutput.blank`; there is room for all parts if there is for the largest."""
+        return replace(
+            self,
+            rgb=self.rgb.new_zeros((height, width, 3)),
+            alpha=self.alpha.new_ones((height, width)),
+            depth=self.depth.new_zeros((height, width)),
+            pairs=torch.stack([part.pairs for part in parts]).amax(),
+            again=again,
+        )
 
     def surface(self) -> DeviceOutput:
         """See `RasterOutput.surface`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -40,6 +40,23 @@ class RasterOutput:
     def on_host(self) -> RasterOutput:
         """Return the view with arrays: itself, unless a device drew it."""
         return self
+
+    def blank(
+        self,
+        height: int,
+        width: int,
+        parts: Sequence[RasterOutput],
+        again: Callable[[], RasterOutput],
+    ) -> RasterOutput:
+        """Return a black and opaque image without depth, into which parts are to be written.
+
+        Args:
+            height, width: Pixels.
+            parts: Drawn where this one was.
+            again: Draws the image with all parts once more, where a device lacked room for one.
+        """
+        rgb, alpha = np.zeros((height, width, 3), np.float32), np.ones((height, width), np.float32)
+        return RasterOutput(rgb, alpha, np.zeros_like(alpha))
 
     def surface(self) -> RasterOutput:
         """Return the view with depth only where the splats are at least half opaque; 0 where the
