@@ -156,7 +156,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         traffic.reset()
         assert len(served.render(request, True).pending.references) == 2
         assert not traffic.waits
-    assert np.abs(found.alpha - wanted.alpha).max() <= LSB
+        assert np.abs(found.alpha - wanted.alpha).max() <= LSB
 
 
 def test_what_a_frame_costs_at_least():
