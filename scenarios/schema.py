@@ -82,6 +82,9 @@ class EnvironmentSpec(Part):
     )
     rain: float = number(0, 200, "Rain, mm/h; 0: dry.", 0.0)
     snow: float = number(0, 10, "Snowfall, mm/h of water; 0: none falls and none lies.", 0.0)
+    friction: float | None = Field(
+        default=None, gt=0, le=1.5, description="Coefficient of tyres on the road; none: no slip."
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -346,7 +349,7 @@ class ScenarioSpec(Part):
     scene_id: str | None = Field(
         default=None,
         max_length=100,
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*(@@[-+.0-9e]+)?$",
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*(@@[-+.0-9e]+){0,2}$",
         description="None: the file's folder and name.",
     )
     description: str = field("One sentence.", "")

@@ -45,7 +45,7 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
-from alpasim_plugin.runs.vary import BoundarySearch, Sweep
+from alpasim_plugin.runs.vary import BoundarySearch, parse_sweeps
 from evaluators import preset as find_preset
 from evaluators.numbers import plural
 from evaluators.opening import read_run
@@ -154,9 +154,12 @@ def run(
         ),
     ] = (),
     vary: Annotated[
-        str | None,
-        Flag("Find where each variant starts to fail along a key.", metavar="KEY=LOW..HIGH"),
-    ] = None,
+        tuple[str, ...],
+        Flag(
+            "Find where each variant starts to fail along a key, or two. Repeatable.",
+            metavar="KEY=LOW..HIGH",
+        ),
+    ] = (),
     repeat: Annotated[
         bool,
         Flag("Drive a rollout of each policy twice and compare.", "--repeat"),
@@ -193,10 +196,10 @@ def run(
         seeds=parse_seeds(seeds),
         options=replace(options, fixer=of_fixer),
     )
-    sweep = None if vary is None else Sweep.parse(vary)
-    if sweep is not None and (len(refs) != 1 or until_decided or repeat or resume):
+    sweeps = parse_sweeps(vary)
+    if sweeps and (len(refs) != 1 or until_decided or repeat or resume):
         raise InputError(
-            f"--vary {vary}: takes one scene, and no --until-decided, --repeat or --resume",
+            f"--vary {vary[0]}: takes one scene, and no --until-decided, --repeat or --resume",
             "Name one scene and leave these options out.",
         )
     plan = replace(planned(refs), asked=scenarios)
@@ -209,8 +212,8 @@ def run(
         search = SequentialTest(plan_of_two(plan, question), question)
     elif metric:
         raise InputError("--metric: without --until-decided", "Add --until-decided.")
-    if sweep is not None:
-        search = BoundarySearch(plan, sweep, planned)
+    if sweeps:
+        search = BoundarySearch(plan, sweeps, planned)
     if search is not None:
         plan = search.ceiling
     root = out or default_folder(plan)

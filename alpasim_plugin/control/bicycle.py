@@ -7,8 +7,10 @@ has no side slip (Rajamani, Vehicle Dynamics and Control, 2nd ed., section 2.2):
     x' = v cos(yaw)    y' = v sin(yaw)    yaw' = v tan(steer) / wheelbase    v' = accel    steer' = rate
 
 The equations hold at standstill and in reverse without a special case: nothing is divided by the
-speed. Tyre slip is left out; the tracker keeps its commands where that is fair
-(`tracker.MAX_LATERAL_MPS2`).
+speed. On a road with a coefficient of friction the acceleration, of speed and of direction together,
+stays within the friction circle: beyond it both are less by the same factor, so the vehicle brakes
+longer and follows a wider curve, but does not spin. Otherwise tyre slip is left out; the tracker
+keeps its commands where that is fair (`tracker.MAX_LATERAL_MPS2`).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
 
 MAX_SUBSTEP_S = 0.01
+G_MPS2 = 9.81
 
 
 @dataclass(frozen=True)
@@ -96,23 +99,38 @@ def step(
     ):
         n = math.ceil(span_s / max_substep_s - 1e-9)
         for _ in range(n):
-            state = _substep(state, rate, drive, brake, span_s / n, vehicle.wheelbase_m)
+            state = _substep(state, rate, drive, brake, span_s / n, vehicle)
         if slew_s < dt_s:
             state = replace(state, steer_rad=target)
     return state
 
 
 def _substep(
-    state: BicycleState, steer_rate: float, drive: float, brake: float, h: float, wheelbase: float
+    state: BicycleState, steer_rate: float, drive: float, brake: float, h: float, vehicle: Vehicle
 ) -> BicycleState:
     """Integrate one sub-step, cut at the instant of standstill where the brake brings one."""
     accel = _accel(state.speed_mps, drive, brake)
+    share = grip_share(accel, state.speed_mps, state.steer_rad + 0.5 * h * steer_rate, vehicle)
+    accel *= share
+    wheelbase = vehicle.wheelbase_m / share  # a longer vehicle turns less
     if state.speed_mps * accel < 0:
         stop_s = -state.speed_mps / accel
         if stop_s < h:
             at_stop = replace(_rk4(state, steer_rate, accel, stop_s, wheelbase), speed_mps=0.0)
-            return _rk4(at_stop, steer_rate, _accel(0.0, drive, brake), h - stop_s, wheelbase)
+            accel = _accel(0.0, drive, brake) * share
+            return _rk4(at_stop, steer_rate, accel, h - stop_s, wheelbase)
     return _rk4(state, steer_rate, accel, h, wheelbase)
+
+
+def grip_share(accel_mps2: float, speed_mps: float, steer_rad: float, vehicle: Vehicle) -> float:
+    """Return the share of an acceleration along the body, and of the one across it that speed and
+    steering ask for, that the friction circle leaves: 1 within it.
+    """
+    if vehicle.friction is None:
+        return 1.0
+    lateral = speed_mps**2 * math.tan(steer_rad) / vehicle.wheelbase_m
+    asked = math.hypot(accel_mps2, lateral)
+    return min(1.0, vehicle.friction * G_MPS2 / asked) if asked > 0 else 1.0
 
 
 def _accel(speed: float, drive: float, brake: float) -> float:

@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from alpasim_plugin.control.bicycle import BicycleState, Command, step
+from alpasim_plugin.control.bicycle import BicycleState, Command, grip_share, step
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_from_quat, yaw_of
 from alpasim_plugin.core.interfaces import Controller
@@ -74,6 +74,7 @@ def spatial(
     """Return the ego state of a planar state: level, at height ``z_m``."""
     pose = se2(now.x_m, now.y_m, now.yaw_rad, z_m)
     yaw_rate = now.speed_mps * float(np.tan(now.steer_rad)) / vehicle.wheelbase_m
+    yaw_rate *= grip_share(accel_mps2, now.speed_mps, now.steer_rad, vehicle)
     return EgoState(t_us, pose, now.speed_mps, accel_mps2, yaw_rate, now.steer_rad)
 
 
@@ -89,9 +90,17 @@ def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
 class PerfectController(Controller):
     """Put the ego on the plan's interpolated pose at the given time; before the first and after the
     last pose, hold that pose.
+
+    Raises:
+        InputError: The road has a coefficient of friction, which this would ignore.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
+        if vehicle.friction is not None:
+            raise InputError(
+                f"controller perfect: it ignores environment.friction = {vehicle.friction:g}",
+                "Add --controller bicycle, or leave out environment.friction.",
+            )
         self.vehicle = vehicle
 
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:

@@ -65,6 +65,7 @@ class Vehicle:
     max_steer_rate_radps: float = 0.8
     max_accel_mps2: float = 3.5
     max_brake_mps2: float = 8.0
+    friction: float | None = None  # coefficient between tyres and road; None: they do not slip
 
 
 @dataclass(frozen=True)

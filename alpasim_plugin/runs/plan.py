@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
@@ -217,6 +218,8 @@ def make_plan(
             sources[scenario.source_part] = code_digest_of(scenario)
         for renderer, policy, seed in product(rendering, driving, seeds):
             controller = moving[policy.name]
+            if controller.name == "perfect":
+                make_controller(controller.name, scenario.vehicle)  # refuses friction
             content = {
                 f"renderer {renderer.name}": renderer.digest,
                 f"policy {policy.name}": policy.digest,

@@ -1,21 +1,23 @@
-"""Sequential search along one parameter of a scene: drive the points of a grid that enclose where
-each variant starts to fail.
+"""Sequential search along one or two parameters of a scene: drive the points of a grid that enclose
+where each variant starts to fail.
 
-Everything but the parameter stays as it is: the scene is the same, and so is the noise, since every
-point bears the scene's name with its value behind it (`core.seeding.POINT`). What is driven next
+Everything but the parameters stays as it is: the scene is the same, and so is the noise, since every
+point bears the scene's name with its values behind it (`core.seeding.POINT`). What is driven next
 follows from the outcomes alone, so the same command continues after any interruption.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
 from alpasim_plugin.runs.plan import Cell, RunPlan
@@ -26,17 +28,21 @@ from evaluators.statistics.boundary import (
     MOST_POINTS,
     STEPS,
     Bracket,
+    Interval,
     boundary_of,
     bracket_of,
     difference_of,
     next_points,
 )
+from evaluators.statistics.boundary_area import AREA_STEPS, MOST_AREA_POINTS, Area, area_of
 from evaluators.statistics.variants import Variant, usual_base, variants_of
 from scenarios.suite import ScenarioRef
 
 UNITS = {"mps": "m/s", "mps2": "m/s\u00b2", "m": "m", "s": "s", "us": "\u00b5s", "rad": "rad"}
 RANGE = re.compile(r"([A-Za-z_][\w.\-]*)=([^=]+?)\.\.([^=]+)")
+EXAMPLE = "Write for example --vary actors.cutter.s_m=4..14."
 MakePlan = Callable[[Sequence[ScenarioRef]], RunPlan]
+Point = tuple[int, ...]  # of the grid, a step of each parameter
 
 
 @dataclass(frozen=True)
@@ -46,46 +52,76 @@ class Sweep:
     Attributes:
         key: Dotted key of the scenario file.
         low, high: Ends of the range.
+        steps: Of the grid between them.
     """
 
     key: str
     low: float
     high: float
+    steps: int = STEPS
 
     @classmethod
-    def parse(cls, text: str) -> Sweep:
+    def parse(cls, text: str, steps: int = STEPS) -> Sweep:
         """Read ``KEY=LOW..HIGH``.
 
         Raises:
             InputError: Another form, no numbers, or ``LOW`` is not below ``HIGH``.
         """
-        example = "Write for example --vary actors.cutter.s_m=4..14."
         match = RANGE.fullmatch(text.strip())
         if match is None:
-            raise InputError(f"--vary {text}: not KEY=LOW..HIGH", example)
+            raise InputError(f"--vary {text}: not KEY=LOW..HIGH", EXAMPLE)
         try:
             low, high = float(match[2]), float(match[3])
         except ValueError:
-            raise InputError(f"--vary {text}: an end is not a number", example) from None
+            raise InputError(f"--vary {text}: an end is not a number", EXAMPLE) from None
         if not -1e12 < low < high < 1e12:
-            raise InputError(f"--vary {text}: LOW is not below HIGH", example)
-        sweep = cls(match[1], low, high)
-        if len({sweep.value(point) for point in range(STEPS + 1)}) <= STEPS:
+            raise InputError(f"--vary {text}: LOW is not below HIGH", EXAMPLE)
+        if match[1] == "seed":
             raise InputError(
-                f"--vary {text}: its {STEPS + 1} points round to fewer values",
+                f"--vary {text}: every seed is another scene", "Use --seeds, or name a parameter."
+            )
+        sweep = cls(match[1], low, high, steps)
+        if len(set(sweep.values)) <= steps:
+            raise InputError(
+                f"--vary {text}: its {steps + 1} points round to fewer values",
                 "Give a wider range.",
             )
         return sweep
 
-    def value(self, point: int) -> float:
-        """Return the value at a point of the grid; times in microseconds are whole numbers."""
-        value = self.low + (self.high - self.low) * point / STEPS
-        return float(round(value, 0 if self.key.endswith("_us") else 9))
+    @property
+    def values(self) -> list[float]:
+        """Give the values of the grid; times in microseconds are whole numbers."""
+        digits = 0 if self.key.endswith("_us") else 9
+        span = self.high - self.low
+        return [
+            float(round(self.low + span * point / self.steps, digits))
+            for point in range(self.steps + 1)
+        ]
 
     @property
     def unit(self) -> str:
         """Give the unit that the key ends with; empty where it names none."""
         return UNITS.get(self.key.rpartition("_")[2], "")
+
+
+def parse_sweeps(texts: Sequence[str]) -> tuple[Sweep, ...]:
+    """Read every ``--vary``; their order does not matter.
+
+    Raises:
+        InputError: More than two, a key named twice, or no optuna for two.
+    """
+    if len(texts) == 2:
+        require_library(
+            "optuna", "--vary of two parameters", 'Run pip install "alpasim-onefixer[vary]".'
+        )
+    elif len(texts) > 2:
+        raise InputError(
+            f"--vary: {len(texts)} parameters", "Name at most two, and fix others by --set."
+        )
+    sweeps = [Sweep.parse(text, AREA_STEPS if len(texts) == 2 else STEPS) for text in texts]
+    if len({sweep.key for sweep in sweeps}) < len(sweeps):
+        raise InputError(f"--vary: {sweeps[0].key} is named twice", "Name two parameters.")
+    return tuple(sorted(sweeps, key=lambda sweep: sweep.key))
 
 
 @dataclass
@@ -95,70 +131,99 @@ class BoundarySearch:
 
     Attributes:
         plan: The scene as written, with the keys of the whole run.
+        sweeps: One or two parameters and their ranges.
+        reached: The parts of the ranges in which the scene can be built.
         cells: The cells driven so far.
-        scenes: Point -> plan of the scene with the parameter at that value.
-        unreachable: Point -> why the scene cannot be built there.
+        scenes: Values of the parameters -> plan of the scene with them.
+        unreachable: Values of the parameters -> why the scene cannot be built with them.
     """
 
     kind: ClassVar[str] = "vary"
     plan: RunPlan
-    sweep: Sweep
+    sweeps: tuple[Sweep, ...]
     make: MakePlan
     driven: dict[str, JsonObject] = field(default_factory=dict)
     cells: list[Cell] = field(default_factory=list)
-    scenes: dict[int, RunPlan] = field(default_factory=dict)
-    unreachable: dict[int, InputError] = field(default_factory=dict)
-    failed: dict[tuple[Variant, int], dict[int, bool]] = field(default_factory=dict)
+    scenes: dict[tuple[float, ...], RunPlan] = field(default_factory=dict)
+    unreachable: dict[tuple[float, ...], InputError] = field(default_factory=dict)
+    failed: dict[tuple[Variant, int], dict[Point, bool]] = field(default_factory=dict)
     stopped: str = ""
 
     def __post_init__(self) -> None:
-        ref, sweep = self.plan.cells[0].ref, self.sweep
-        varied = digest([sweep.key, sweep.low, sweep.high, STEPS])
+        ref = self.plan.cells[0].ref
+        varied = digest([[one.key, one.low, one.high, one.steps] for one in self.sweeps])
         self.plan = replace(self.plan, question=varied)
-        self.ceiling = replace(self.plan, cells=self.plan.cells * MOST_POINTS, whole=self.plan)
+        self.is_area = len(self.sweeps) == 2
+        most = MOST_AREA_POINTS if self.is_area else MOST_POINTS
+        self.ceiling = replace(self.plan, cells=self.plan.cells * most, whole=self.plan)
         self.own_id = self.plan.cells[0].scene.removesuffix(f"-seed{ref.seed}")
         self.ref = ref
         names = [(cell.renderer.name, cell.policy.name) for cell in self.plan.cells]
         self.variants = variants_of(names)
         self.failed = {(one, seed): {} for one in self.variants for seed in self.plan.seeds}
-        self.at_once = len(self.failed) * 4  # points beside a change
-        self.ends = self._reachable_ends()
+        self.at_once = len(self.failed) * 4
+        self.points: dict[str, Point] = {}  # by scene
+        self.skipped: set[Point] = set()
+        self.reached = tuple(self._reachable_part(axis) for axis in range(len(self.sweeps)))
 
-    def _reachable_ends(self) -> tuple[int, int]:
-        """Return the first and the last point at which the scene can be built."""
-        if self._is_reachable(0) and self._is_reachable(STEPS):
-            return 0, STEPS
-        bad, good = (0, STEPS) if 0 in self.unreachable else (STEPS, 0)
-        if not self._is_reachable(good):
-            raise self.unreachable[bad]
-        reached = good
+    def _reachable_part(self, axis: int) -> Sweep:
+        """Return the part of a range in which the scene can be built, with the other parameter in
+        the middle of its own.
+        """
+        sweep = self.sweeps[axis]
+        middle = [one.values[one.steps // 2] for one in self.sweeps]
+
+        def values(point: int) -> tuple[float, ...]:
+            return (*middle[:axis], sweep.values[point], *middle[axis + 1 :])
+
+        ends = [end for end in (0, sweep.steps) if self._is_reachable(values(end))]
+        good = ends[0] if ends else 0
+        bad = sweep.steps - good
+        inside = 1 if good == 0 else sweep.steps - 1  # of a whole number the ends alone are whole
+        for point in (good, inside):
+            if not self._is_reachable(values(point)):
+                raise self.unreachable[values(point)]
+        if len(ends) == 2:
+            return sweep
+        reached = inside
         while abs(reached - bad) > 1:
-            middle = (reached + bad) // 2
-            if self._is_reachable(middle):
-                reached = middle
+            tried = (reached + bad) // 2
+            if self._is_reachable(values(tried)):
+                reached = tried
             else:
-                bad = middle
-        if reached == good:
-            raise self.unreachable[bad]
-        return min(reached, good), max(reached, good)
+                bad = tried
+        low, high = sorted((sweep.values[good], sweep.values[reached]))
+        part = replace(sweep, low=low, high=high)
+        if len(set(part.values)) <= part.steps:
+            raise self.unreachable[values(bad)]
+        return part
 
-    def _is_reachable(self, point: int) -> bool:
-        try:
-            self._load(point)
-        except InputError as error:
-            self.unreachable[point] = error
-        return point not in self.unreachable
+    def _values(self, point: Point) -> tuple[float, ...]:
+        """Return the values of the parameters at a point."""
+        return tuple(one.values[step] for one, step in zip(self.reached, point, strict=True))
 
-    def _load(self, point: int) -> RunPlan:
-        """Plan the rollouts of a point."""
-        if point not in self.scenes:
-            value = self.sweep.value(point)
-            written = f"{int(value)}" if value.is_integer() else f"{value!r}"
-            name = f"{self.own_id}{POINT}{written}"
-            more = (f"{self.sweep.key}={written}", f"scene_id={name}")
-            ref = replace(self.ref, overrides=(*self.ref.overrides, *more))
-            self.scenes[point] = self.make([ref])
-        return self.scenes[point]
+    def _is_reachable(self, values: tuple[float, ...]) -> bool:
+        """Plan the rollouts of the scene with some values, unless it cannot be built."""
+        if values not in self.scenes and values not in self.unreachable:
+            texts = [f"{int(one)}" if one.is_integer() else f"{one!r}" for one in values]
+            name = self.own_id + "".join(POINT + text for text in texts)
+            keys = [sweep.key for sweep in self.sweeps]
+            more = [f"{key}={text}" for key, text in zip(keys, texts, strict=True)]
+            overrides = (*self.ref.overrides, *more, f"scene_id={name}")
+            try:
+                self.scenes[values] = self.make([replace(self.ref, overrides=overrides)])
+            except InputError as error:
+                self.unreachable[values] = error
+        return values in self.scenes
+
+    def _asked(self, failed: Mapping[Point, bool]) -> list[Point]:
+        """Return the points that a variant and seed drives next."""
+        if self.is_area:
+            from alpasim_plugin.runs.vary_study import next_points as next_area_points
+
+            return next_area_points(failed, self.skipped)
+        skipped = {step for (step,) in self.skipped}
+        return [(step,) for step in next_points(_steps(failed), skipped)]
 
     def next_plan(self) -> RunPlan | None:
         """Return the rollouts of the next round; None where the search has ended."""
@@ -166,16 +231,16 @@ class BoundarySearch:
             return None
         cells: list[Cell] = []
         for (variant, seed), failed in self.failed.items():
-            points: list[int] = []
-            while not points:
-                asked = next_points(failed, self.ends, set(self.unreachable))
-                points = [point for point in asked if self._is_reachable(point)]
-                if not asked:
-                    break
+            points: list[Point] = []
+            while not points and (asked := self._asked(failed)):
+                points = [point for point in asked if self._is_reachable(self._values(point))]
+                self.skipped |= set(asked) - set(points)
             for point in points:
+                plan = self.scenes[self._values(point)]
+                self.points[plan.cells[0].scene] = point
                 cells += [
                     cell
-                    for cell in self.scenes[point].cells
+                    for cell in plan.cells
                     if (cell.renderer.name, cell.policy.name, cell.seed)
                     == (variant.renderer, variant.policy, seed)
                 ]
@@ -201,7 +266,6 @@ class BoundarySearch:
 
     def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
         """Take in the outcomes of a round."""
-        points = {one.cells[0].scene: point for point, one in self.scenes.items()}
         for cell, manifest in zip(plan.cells, manifests, strict=True):
             self.cells.append(cell)
             self.driven[cell.folder.as_posix()] = manifest
@@ -210,12 +274,11 @@ class BoundarySearch:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"
                 continue
             variant = Variant(cell.renderer.name, cell.policy.name)
-            self.failed[variant, cell.seed][points[cell.scene]] = failed
+            self.failed[variant, cell.seed][self.points[cell.scene]] = failed
 
     def record(self) -> JsonObject:
         """Return what ``summary.json`` holds of the search, as its member ``boundary``."""
-        values = {point: self.sweep.value(point) for point in range(STEPS + 1)}
-        found = {one: self._of_variant(one, values) for one in self.variants}
+        found = {one: self._of_variant(one) for one in self.variants}
         base = usual_base(self.variants, self.plan.options.baseline)
         differences = {}
         for variant, other in base.pairs(self.variants):
@@ -223,36 +286,47 @@ class BoundarySearch:
             if brackets and others:
                 estimate = difference_of(brackets, others)
                 differences[variant.name] = {"baseline": other.name} | vars(estimate)
-        least, most = (values[point] for point in self.ends)
+        grid_points = math.prod(one.steps + 1 for one in self.sweeps)
         record: JsonObject = {
-            "parameter": self.sweep.key,
-            "unit": self.sweep.unit,
-            "range": [self.sweep.low, self.sweep.high],
-            "reachable": [least, most],
+            "parameter": self._shown([one.key for one in self.sweeps]),
+            "unit": self._shown([one.unit for one in self.sweeps]),
+            "range": self._shown([[one.low, one.high] for one in self.sweeps]),
+            "reachable": self._shown([[one.low, one.high] for one in self.reached]),
             "unreachable": {
-                f"{values[k]:g}": error.message for k, error in self.unreachable.items()
+                ", ".join(f"{one:g}" for one in values): error.message
+                for values, error in self.unreachable.items()
             },
             "stopped": self.stopped,
             "rollouts": len(self.driven),
-            "grid_rollouts": (STEPS + 1) * len(self.failed),
+            "grid_rollouts": grid_points * len(self.failed),
             "variants": {one.name: facts for one, (facts, _) in found.items()},
             "differences": differences,
         }
         return record | {"sentence": sentence_of(record)}
 
-    def _of_variant(
-        self, variant: Variant, values: Mapping[int, float]
-    ) -> tuple[JsonObject, list[Bracket]]:
-        """Return the facts of a variant, and the brackets of its seeds if all have one."""
+    def _shown(self, items: Sequence[Any]) -> Any:
+        """Return facts of both parameters, or the one of a single one."""
+        return list(items) if self.is_area else items[0]
+
+    def _of_variant(self, variant: Variant) -> tuple[JsonObject, Sequence[Interval]]:
+        """Return the facts of a variant, and the brackets or areas of its seeds if all have one."""
         seeds = {seed: self.failed[variant, seed] for seed in self.plan.seeds}
-        ended = {seed: bracket_of(failed, values) for seed, failed in seeds.items()}
-        outcomes = {
-            seed: [[values[point], failed[point]] for point in sorted(failed)]
+        values = self.reached[-1].values
+        ended = {
+            seed: area_of(failed, values)
+            if self.is_area
+            else bracket_of(_steps(failed), dict(enumerate(values)))
             for seed, failed in seeds.items()
         }
-        facts: JsonObject = {"outcomes": {str(seed): one for seed, one in outcomes.items()}}
-        brackets = [one for one in ended.values() if isinstance(one, Bracket)]
+        facts: JsonObject = {
+            "outcomes": {
+                str(seed): [[*self._values(point), failed[point]] for point in sorted(failed)]
+                for seed, failed in seeds.items()
+            }
+        }
         reasons = [one for one in ended.values() if isinstance(one, str)]
+        areas = {seed: one for seed, one in ended.items() if isinstance(one, Area)}
+        brackets = [one for one in ended.values() if isinstance(one, Bracket)]
         sides = {one.fails_below for one in brackets}
         if self.stopped:
             reasons.append("not finished")
@@ -261,9 +335,18 @@ class BoundarySearch:
         if reasons:
             counted = [f"{why} in {reasons.count(why)} of {len(ended)} seeds" for why in reasons]
             return facts | {"reason": "; ".join(dict.fromkeys(counted))}, []
+        if self.is_area:
+            facts["contradictions"] = sum(one.contradictions for one in areas.values())
+            facts["areas"] = {str(seed): vars(one) for seed, one in areas.items()}
+            return facts | vars(boundary_of(list(areas.values()))), list(areas.values())
         side = "below" if sides.pop() else "above"
         changes = max(one.changes for one in brackets)
         return facts | {"fails": side, "changes": changes} | vars(boundary_of(brackets)), brackets
+
+
+def _steps(failed: Mapping[Point, bool]) -> dict[int, bool]:
+    """Return outcomes along one parameter by step."""
+    return {step: has_failed for (step,), has_failed in failed.items()}
 
 
 def _has_failed(manifest: JsonView) -> bool | None:

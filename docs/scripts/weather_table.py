@@ -2,10 +2,8 @@
 without an event; or measure what weather leaves of contrast at 50 to 70 m, before and after the
 fixer.
 
-Usage: python docs/scripts/weather_table.py FOLDER | contrast
-
-The same command continues after an interruption. Policies without a camera drive alike in any
-weather and are left out.
+Usage: python docs/scripts/weather_table.py FOLDER | contrast; it continues when it is interrupted.
+Policies without a camera drive alike in any weather and are left out.
 """
 
 from __future__ import annotations

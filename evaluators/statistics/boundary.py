@@ -17,26 +17,18 @@ import numpy as np
 import scipy.stats
 
 STEPS = 64  # of the grid between both ends of the range
-FIRST_POINTS = 5  # driven before the bisection, both ends among them; they show a second change
+FIRST = range(0, STEPS + 1, STEPS // 4)  # driven before the bisection; they show a second change
 BESIDE = (2, 4)  # steps from the outermost changes that are driven too
 MOST_POINTS = 24  # that a seed drives: after 20 no more are asked for
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Bracket:
-    """The change of outcome of one seed.
-
-    Attributes:
-        low, high: Values of the parameter between which the outcome changes.
-        fails_below: The drive fails at ``low`` and not at ``high``.
-        changes: How often the outcome changes between them.
-    """
+class Interval:
+    """Values between which what is sought of one seed lies."""
 
     low: float
     high: float
-    fails_below: bool
-    changes: int = 1
 
     @property
     def middle(self) -> float:
@@ -50,6 +42,20 @@ class Bracket:
 
 
 @dataclass(frozen=True)
+class Bracket(Interval):
+    """The change of outcome of one seed.
+
+    Attributes:
+        low, high: Values of the parameter between which the outcome changes.
+        fails_below: The drive fails at ``low`` and not at ``high``.
+        changes: How often the outcome changes between them.
+    """
+
+    fails_below: bool
+    changes: int = 1
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A boundary, or a difference of two, with its interval of 95 %."""
 
@@ -58,15 +64,14 @@ class Estimate:
     high: float
 
 
-def next_points(failed: Mapping[int, bool], ends: tuple[int, int], skipped: set[int]) -> list[int]:
+def next_points(failed: Mapping[int, bool], skipped: set[int]) -> list[int]:
     """Return the points of the grid that a seed drives next; none where its search has ended.
 
     Args:
         failed: Point -> whether the drive failed there.
-        ends: The first and the last point.
         skipped: Points at which the scene cannot be built.
     """
-    asked = [point for point in _first(ends) if point not in skipped]
+    asked = [point for point in FIRST if point not in skipped]
     if missing := [point for point in asked if point not in failed]:
         return missing
     if len(changes_of({point: failed[point] for point in asked})) != 1:
@@ -82,13 +87,7 @@ def next_points(failed: Mapping[int, bool], ends: tuple[int, int], skipped: set[
         return sorted(middles)
     low, high = changes[0][0], changes[-1][1]
     beside = [point for step in BESIDE for point in (low - step, high + step)]
-    return [p for p in beside if ends[0] < p < ends[1] and p not in {*failed, *skipped}]
-
-
-def _first(ends: tuple[int, int]) -> list[int]:
-    """Return the points that are driven before the bisection."""
-    points = np.linspace(*ends, FIRST_POINTS).round().astype(int)
-    return list(dict.fromkeys(points.tolist()))
+    return [p for p in beside if 0 < p < STEPS and p not in {*failed, *skipped}]
 
 
 def changes_of(failed: Mapping[int, bool]) -> list[tuple[int, int]]:
@@ -104,8 +103,7 @@ def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Brack
         failed: Point -> whether the drive failed there.
         values: Point -> value of the parameter.
     """
-    first = _first((min(failed), max(failed)))
-    if len(changes_of({point: failed[point] for point in first if point in failed})) > 1:
+    if len(changes_of({point: failed[point] for point in FIRST if point in failed})) > 1:
         return "not monotone"
     changes = changes_of(failed)
     if not changes:
@@ -114,7 +112,7 @@ def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Brack
     return Bracket(values[low], values[high], failed[low], len(changes))
 
 
-def boundary_of(brackets: Sequence[Bracket]) -> Estimate:
+def boundary_of(brackets: Sequence[Interval]) -> Estimate:
     """Return the mean boundary of several seeds with its interval; of one seed its bracket.
 
     Args:
@@ -126,7 +124,7 @@ def boundary_of(brackets: Sequence[Bracket]) -> Estimate:
     )
 
 
-def difference_of(brackets: Sequence[Bracket], base: Sequence[Bracket]) -> Estimate:
+def difference_of(brackets: Sequence[Interval], base: Sequence[Interval]) -> Estimate:
     """Return the mean difference of the boundaries of two variants, paired by seed.
 
     Args:

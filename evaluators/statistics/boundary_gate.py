@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable
@@ -20,7 +22,8 @@ def boundary_verdict(
     stored: JsonView | None = None,
     stored_name: str = "",
 ) -> GateVerdict:
-    """Check the boundaries that a search along a parameter found against a margin.
+    """Check the boundaries, or the failing shares of a rectangle, that a search found against a
+    margin.
 
     Args:
         table: The run's rollouts.
@@ -72,7 +75,8 @@ def boundary_verdict(
     failures = failures_of(table)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks]
     outcomes.append(outcome_of_failures(failures, spec.max_failed))
-    about = f"about {record['parameter']} of this scene and these seeds"
+    parameters = np.atleast_1d(record["parameter"])
+    about = f"about {' and '.join(parameters)} of this scene and these seeds"
     return GateVerdict(worst(outcomes), tuple(checks), failures, stored_name or "the run", about)
 
 
@@ -86,7 +90,7 @@ def _checked(
     bounds = more_that_fails(now, was, record["reachable"])
     difference = record["differences"].get(name)
     if record is earlier and difference and difference["baseline"] == other and bounds:
-        bounds = _signed(now["fails"], difference["low"], difference["high"])
+        bounds = _signed(now.get("fails", "below"), difference["low"], difference["high"])
     if now["outcomes"] == was["outcomes"]:
         bounds = 0.0, 0.0
     if bounds is None:
@@ -99,7 +103,8 @@ def _checked(
     elif high <= spec.boundary_margin:
         cause = "pass"
     between = f"{fixed(low, 2, sign=True)} to {fixed(high, 2, sign=True)}"
-    unit = f" {record['unit']}".rstrip()
+    is_area = isinstance(record["unit"], list)
+    unit = " of the rectangle" if is_area else f" {record['unit']}".rstrip()
     return cause, f"fails over {between}{unit} more, margin {spec.boundary_margin:g}{unit}", bounds
 
 
@@ -117,8 +122,10 @@ def more_that_fails(
         return None
     extents = []
     for facts in (now, was):
-        outcomes = {failed for points in facts["outcomes"].values() for _, failed in points}
-        if "fails" in facts:
+        outcomes = {failed for points in facts["outcomes"].values() for *_, failed in points}
+        if "areas" in facts:
+            extents.append((facts["low"], facts["high"]))
+        elif "fails" in facts:
             low, high = _signed(facts["fails"], facts["low"], facts["high"])
             end = reachable[0] if facts["fails"] == "below" else -reachable[1]
             extents.append((low - end, high - end))

@@ -2,6 +2,7 @@
 broken.
 """
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,12 +38,13 @@ def drive(
     start,
     seconds,
     step_us=100_000,
+    tracker=TRACKER,
 ):
     states = [start]
     for _ in range(round(seconds * 1e6 / step_us)):
         now = states[-1]
         states.append(
-            TRACKER.advance(now, plan(now) if callable(plan) else plan, now.t_us + step_us)
+            tracker.advance(now, plan(now) if callable(plan) else plan, now.t_us + step_us)
         )
     return states
 
@@ -240,3 +242,22 @@ def test_standing_start_reaches_the_planned_acceleration_and_place():
     states = drive(plan_of(t, t * t, 0, 0), at(), 5.0)
     assert states[-1].speed_mps == pytest.approx(10.0, abs=0.05)
     assert states[-1].T_world_rig[0, 3] == pytest.approx(25.0, abs=0.1)
+
+
+def test_on_a_slippery_road_braking_is_longer_and_curves_are_wider():
+    speed, limit = 15.0, 0.2 * 9.81
+    tracker = make_controller("bicycle", replace(VEHICLE, friction=0.2))
+    t = np.arange(0, 40, 0.1)
+    stopped = drive(plan_of(t, 0, 0, 0), at(speed=speed), 12, tracker=tracker)
+    assert stopped[-1].speed_mps == 0
+    assert xy(stopped)[-1, 0] == pytest.approx(speed**2 / (2 * limit), rel=0.05)
+    turn = speed * t / 60  # a curve of 60 m asks for 3.75 m/s2
+    curve = plan_of(t, 60 * np.sin(turn), 60 * (1 - np.cos(turn)), turn)
+    states = drive(curve, at(speed=speed), 3, tracker=tracker)
+    for before, after in pairwise(states):
+        turned = yaw_of(after.T_world_rig) - yaw_of(before.T_world_rig)
+        assert np.hypot(turned / 0.1 * after.speed_mps, after.accel_mps2) < 1.03 * limit
+    assert abs(states[-1].yaw_rate_radps) * states[-1].speed_mps == pytest.approx(limit, rel=0.1)
+    assert np.hypot(*(xy(states)[-1] - [0, 60])) > 65
+    with pytest.raises(InputError):
+        make_controller("perfect", tracker.vehicle)

@@ -21,6 +21,11 @@ def without(*outcomes):
     return {"reason": "", "outcomes": {"0": [[4.0 + k, one] for k, one in enumerate(outcomes)]}}
 
 
+def area(low, high):
+    points = [[4.0, 1.0, True], [14.0, low, False]]
+    return {"areas": {}, "low": low, "high": high, "outcomes": {"0": points}}
+
+
 def record(base, variant, difference=None, **more):
     between = {"baseline": "clean/p"} | dict(zip(("low", "high"), difference or (), strict=False))
     made = {
@@ -48,6 +53,8 @@ def record(base, variant, difference=None, **more):
         (without(False, False), found(6.0, 6.2), None, 1),
         (found(6.0, 6.2), without(True, True), None, 1),
         (found(6.0, 6.2), without(True, False, True), None, 3),
+        (area(0.1, 0.2), area(0.3, 0.4), (0.6, 0.7), 1),
+        (area(0.1, 0.2), area(0.3, 0.4) | {"areas": {}}, None, 0),
     ],
 )
 def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, difference, code):

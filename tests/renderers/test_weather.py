@@ -335,6 +335,8 @@ def test_a_renderer_without_depth_cannot_be_put_into_weather():
         "snow=-1",
         "snow=11",
         "snow=nan",
+        "friction=0",
+        "friction=1.6",
     ],
 )
 def test_weather_that_is_none_is_refused(given):

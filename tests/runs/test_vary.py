@@ -72,10 +72,17 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
         ("actors.cutter.at_us=0..3", "0..3"),  # four values
         ("version=1..2", "version"),  # built at one of them
         ("actors.cutter.s_m", "actors.cutter.s_m"),
+        ("seed=0..64", "seed"),
+        ("ego.lane=0..1", "lane"),  # a whole number
+        ("actors.cutter.s_m=4..14 actors.cutter.s_m=4..15", "actors.cutter.s_m"),
+        ("actors.cutter.s_m=4..14 ego.speed_mps=4..4", "4..4"),
+        ("actors.cutter.s_m=4..14 ego.sped_mps=4..9", "speed_mps"),
+        ("actors.cutter.s_m=4..14 ego.speed_mps=4..9 ego.cruise_mps=4..9", "3"),
     ],
 )
 def test_a_parameter_or_range_that_is_none_is_refused_before_driving(vary, named, tmp_path, capsys):
-    words = [*DRIVE, "--vary", vary, "--dry-run", "hard/cut_in", "--out", str(tmp_path / "run")]
+    words = [*DRIVE, *(word for one in vary.split() for word in ("--vary", one)), "--dry-run"]
+    words += ["hard/cut_in", "--out", str(tmp_path / "run")]
     assert run_command(words) == 2
     assert named in capsys.readouterr().err
 
@@ -86,15 +93,23 @@ def test_a_search_takes_one_scene_and_no_other_question(more, tmp_path):
     assert run_command(words) == 2
 
 
+def test_a_vehicle_that_follows_exactly_is_refused_on_a_slippery_road(tmp_path, capsys):
+    words = ["--set", "environment.friction=0.3", "--dry-run", "hard/cut_in"]
+    words += ["--out", str(tmp_path / "run"), "--renderer", "clean", "--policy"]
+    assert run_command([*words, "log-replay"]) == 2
+    assert "friction = 0.3" in capsys.readouterr().err
+    assert run_command([*words, "log-replay", "--controller", "bicycle"]) == 0
+
+
 def test_a_point_keeps_the_noise_of_its_scene():
     assert (
         derive_seed("a-b@@4.5", 1, "x") == derive_seed("a-b", 1, "x") != derive_seed("a@@b", 1, "x")
     )
-    assert derive_seed("a-b@@4.5-seed3", 1, "x") == derive_seed("a-b-seed3", 1, "x")
+    assert derive_seed("a-b@@4.5@@2-seed3", 1, "x") == derive_seed("a-b-seed3", 1, "x")
 
 
 def test_times_stay_whole():
     sweep = Sweep.parse("actors.cutter.at_us=100..200")
-    assert all(sweep.value(point).is_integer() for point in range(65))
+    assert all(value.is_integer() for value in sweep.values)
     with pytest.raises(InputError):
-        Sweep.parse("seed=nan..3")
+        Sweep.parse("ego.speed_mps=nan..3")

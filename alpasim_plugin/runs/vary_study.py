@@ -1,0 +1,33 @@
+"""The study of a search over two parameters: what was driven, as trials, and the points that the rule
+of `evaluators.statistics.boundary_area` asks for next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import optuna
+from optuna.distributions import BaseDistribution, IntDistribution
+from optuna.trial import TrialState
+
+from evaluators.statistics.boundary_area import AREA_STEPS, Point, next_area_points
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)  # of each study it says that it was made
+SPACE: dict[str, BaseDistribution] = {name: IntDistribution(0, AREA_STEPS) for name in "xy"}
+
+
+def next_points(failed: Mapping[Point, bool], skipped: set[Point]) -> list[Point]:
+    """Return the points that a seed drives in the next round; none where its search has ended.
+
+    Args:
+        failed: Point -> whether the drive failed there.
+        skipped: Points at which the scene cannot be built.
+    """
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))  # draws nothing
+    for point, has_failed in sorted(failed.items()):
+        params = dict(zip(SPACE, point, strict=True))
+        study.add_trial(optuna.create_trial(params=params, distributions=SPACE, value=has_failed))
+    for point in next_area_points(failed, skipped):
+        study.enqueue_trial(dict(zip(SPACE, point, strict=True)))
+    waiting = study.get_trials(states=[TrialState.WAITING])
+    return [tuple(study.ask(SPACE).params.values()) for _ in waiting]
