@@ -108,6 +108,7 @@ def area_charts(record: JsonView) -> list[Chart]:
     for row, (name, facts) in enumerate(record["variants"].items()):
         colour = VARIANT[row % len(VARIANT)]
         axes = new_axes(*labels)
+        axes.use_sticky_edges = False  # points on an edge are not cut
         for outcomes in facts["outcomes"].values():
             for x, y, has_failed in outcomes:
                 _draw_point(axes, x, y, has_failed, colour)
