@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
-from alpasim_plugin.block_fixers.sampling import context_level, finalise, sample_block
+from alpasim_plugin.block_fixers.sampling import context_level
 from alpasim_plugin.fixers.network.schedule import from_names
 from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import furthest, stream
@@ -118,22 +118,6 @@ def test_two_forwards_a_block_through_a_rolling_window(net, io, window, sink):
     assert furthest(torch.cat(context, 2), io[f"{name}.out_context"]) < TOLERANCE
     if sink:
         assert furthest(history(cache, 0)[0], io[f"{name}.final_block0_k_cache"]) < TOLERANCE
-
-
-def test_two_step_sampler_over_five_blocks(net, golden):
-    io, case = golden["dit_rollout.io"], "rollout_nocond_bigcache"
-    noise = io[f"in.{case}.noise_BTCHW"].transpose(1, 2)
-    fresh = io[f"in.{case}.fresh_noise_in_call_order"]
-    cache = net.new_cache(1, 8, 12, window=4)
-    out = []
-    for block in range(5):
-        cut = slice(2 * block, 2 * block + 2)
-        draws = [fresh[2 * block + i].transpose(0, 1)[None] for i in range(2)]
-        sources, hdmap = [noise[:, :, cut], draws[0]], io[f"in.{case}.hdmap"][:, :, cut]
-        text, schedule = io[f"in.{case}.text"], from_names([1000, 450])
-        out.append(sample_block(net, sources, text, hdmap, cache, schedule))
-        finalise(net, out[-1], draws[1], text, hdmap, cache)
-    assert furthest(torch.cat(out, 2), io[f"out.{case}.result_BCTHW"]) < TOLERANCE
 
 
 def test_noise_levels_are_the_recorded_ones():

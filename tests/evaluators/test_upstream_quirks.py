@@ -22,7 +22,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
-from evaluators import PRESETS, aggregate, reduce_rollout, resolve_evaluators, rollout_values, score
+from evaluators import PRESETS, reduce_rollout, resolve_evaluators, rollout_values, score
 from evaluators.alpasim import (
     EvalSettings,
     ScoredRollout,
@@ -358,47 +358,6 @@ def test_d18_an_evaluator_that_fails_is_never_swallowed():
 
 
 # --- tables over rollouts
-
-
-def test_d23_alpasims_spread_depends_on_how_rollouts_are_named():
-    def run(names):
-        drives = [(scene_id, end) for scene_id in ("s1", "s2") for end in (4, 8)]
-        out = []
-        for name, (scene_id, end) in zip(names, drives, strict=True):
-            log = rollout(
-                track(np.linspace(0.0, end, 5), 0.0),
-                log=track(np.arange(5) * 2.0, 0.0),
-                images=[image(400_000, 99)],
-            )
-            out.append(
-                ScoredRollout(scene_id, name, tuple(score(log, scene(TWO_LANES, log), "alpasim")))
-            )
-        return out
-
-    one, two = (
-        over_sweeps(reduce_run(run(names), ALPASIM))
-        for names in (("a", "b", "a", "b"), ("a", "b", "b", "a"))
-    )
-    assert one["progress"] == pytest.approx(two["progress"])
-    assert one["progress_std"] == pytest.approx(0.5 / np.sqrt(2))
-    assert two["progress_std"] == pytest.approx(0.0, abs=1e-6)
-    # Intervals over scenes and seeds know no names.
-    rows = [
-        {
-            "renderer": "r",
-            "policy": "p",
-            "scene": s,
-            "seed": k,
-            "status": "ok",
-            "progress": v,
-            "progress_valid": True,
-        }
-        for s in ("s1", "s2")
-        for k, v in enumerate((0.5, 1.0))
-    ]
-    swapped = [dict(row, seed=1 - row["seed"]) if row["scene"] == "s2" else row for row in rows]
-    clustered = [aggregate(some)["r"]["progress"]["ci95_clustered"] for some in (rows, swapped)]
-    assert clustered[0] == pytest.approx(clustered[1])
 
 
 def test_d27_times_of_written_tables_are_64_bit_integers():

@@ -82,10 +82,6 @@ def decided_run(tmp_path_factory, two_scenes_per_look):
     return root, *decide(root, SAME, plan_of())
 
 
-def told(root):
-    return {key: value for key, value in (read_decision(root) or {}).items()}
-
-
 def test_a_question_is_decided_before_all_scenes_are_driven(decided_run):
     root, decided, announced = decided_run
     assert (decided.outcome.exit_code, decided.record()["verdict"]) == (0, "non-inferior")
@@ -105,7 +101,7 @@ def test_the_order_depends_on_the_names_alone():
 
 
 def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp_path):
-    before = told(decided_run[0])
+    before = read_decision(decided_run[0])
     root = tmp_path / "again"
     shutil.copytree(decided_run[0], root)
     (root / SUMMARY).unlink()
@@ -115,7 +111,7 @@ def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp
             break
     decided, announced = decide(root, SAME, plan_of())
     assert sorted(announced.results) == [("ok", False)] * 2 + [("ok", True)] * 6
-    assert told(root) == before
+    assert read_decision(root) == before
     assert decided.record() == before
 
 
@@ -193,7 +189,7 @@ def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_pa
 @pytest.mark.slow
 def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path):
     decide(tmp_path / "two", SAME, plan_of(), workers=2)
-    assert told(tmp_path / "two") == told(decided_run[0])
+    assert read_decision(tmp_path / "two") == read_decision(decided_run[0])
 
 
 @pytest.mark.parametrize(

@@ -104,40 +104,6 @@ def test_an_arm_trains_resumes_and_drives(data, tmp_path, recipe):
     assert deployed(whole, steps=4).label.startswith(f"{recipe.fixer}@4")
 
 
-@pytest.mark.slow
-def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(
-    data, student, tmp_path
-):
-    recipe = recipe_of("self-forcing")
-    run = run_of(data, recipe, student=student, teacher=student)
-    assert [stage.name for stage in run.stages()] == ["dmd"]
-    first = load_weights(train_fixer(run, tmp_path / "run", stop_at=1).with_name(STATE_FILE))
-    path = train_fixer(run, tmp_path / "run")
-    assert not (tmp_path / "run" / "student").exists()
-    second = load_weights(path.with_name(STATE_FILE))
-    moved = {
-        key.split(".")[1]
-        for key in first
-        if key.startswith("weight.") and not torch.equal(first[key], second[key])
-    }
-    assert moved == {"fake"}, "the second update trains the critic alone"
-    assert all(
-        torch.equal(first[key], second[key]) for key in first if key.startswith("average.dit")
-    )
-    facts = json.loads(path.with_suffix(".card.json").read_text())["training"]
-    assert facts["start"]["dit"] == facts["start"]["real"]
-    assert len(facts["start"]["dit"]) == 32
-    rows = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert "normaliser_min" in rows[0], "the student is trained in the first update"
-    assert "normaliser_min" not in rows[1], "and then in every fifth"
-    assert all("critic" in row for row in rows)
-    with pytest.raises(InputError):
-        run_of(data, recipe, pupil=student)
-    less = train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path / "less", stop_at=1)
-    with pytest.raises(InputError):
-        train_fixer(run_of(data, recipe, student=student, teacher=less), tmp_path / "run")
-
-
 def test_a_head_that_no_longer_teaches_stops_its_run(data, student, tmp_path):
     recipe = recipe_of("one-forcing")
     strict = replace(

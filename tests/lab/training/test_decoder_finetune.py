@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, Rollouts
+from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe
 from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.lab.training.vae import load_tiny_vae
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 from tests.lab.training.test_generator import FORM, brightness, clips_of, data, run_of  # noqa: F401 - data is a fixture
@@ -26,36 +24,6 @@ RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
 def bundle(data, tmp_path_factory):
     return train_fixer(
         run_of(data, "V9"), tmp_path_factory.mktemp("run") / "v9", ("brightness", brightness)
-    )
-
-
-def vae_of(bundle):
-    return load_tiny_vae(bundle)
-
-
-def net_of(bundle):
-    tensors = {key: value.float() for key, value in load_weights(bundle).items()}
-    return CosmosCausalDiT.from_state_dict(
-        {key[4:]: value for key, value in tensors.items() if key.startswith("dit.")}
-    )
-
-
-def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data, bundle, tmp_path):
-    clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    rollouts = Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
-    assert len(rollouts) == len(clips)
-    clip, z = rollouts[2]
-    assert z.shape == clip.z_0.shape
-    assert torch.isfinite(z).all()
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")}
-    Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")} == files
-    other = net_of(bundle)
-    with torch.no_grad():
-        other.final_layer.linear.weight.add_(0.1)
-    assert (
-        Rollouts(clips, vae_of(bundle), other, 2, 4, "drawn", tmp_path / "r").digest
-        != rollouts.digest
     )
 
 

@@ -18,9 +18,6 @@ from alpasim_plugin.lab.training.dmd import (
     generator_loss,
     noised,
 )
-from alpasim_plugin.lab.training.flow_matching import FlowMatching, bell_weight, noise_levels
-from alpasim_plugin.lab.training.recipes.recipe import Attention
-from alpasim_plugin.lab.training.shared_rollout import Sample
 
 N = 4
 TEXT = torch.zeros(1, 1, 8)
@@ -142,23 +139,3 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
     assert net.blocks[0].self_attn.q_proj.weight.grad is not None
     net.zero_grad(set_to_none=True)
     assert head(score.features).shape == (2,)
-
-
-def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one():
-    t = torch.from_numpy(stream("dmd", 0, "t").random((3, 8))).float()
-    z = torch.zeros(3, 16, 8, 2, 2)
-    sample = Sample(z, z, z, z[:, :1], z, z, t, t, 0)
-    drawn = {
-        times: noise_levels(FlowMatching(times), sample, Attention(2), 0, 0)[0]
-        for times in ("latent", "block", "clip")
-    }
-    assert torch.equal(drawn["latent"], t)
-    assert torch.equal(drawn["block"], t[:, [0, 0, 2, 2, 4, 4, 6, 6]])
-    assert torch.equal(drawn["clip"], t[:, :1].expand(3, 8))
-    shifted = noise_levels(FlowMatching("clip", shift=5.0), sample, Attention(2), 0, 0)[0]
-    assert_close(shifted, 5 * drawn["clip"] / (1 + 4 * drawn["clip"]))
-    u = 1 - torch.arange(1000, dtype=torch.float64) / 1000
-    weights = bell_weight(5 * u / (1 + 4 * u))
-    assert float(weights.mean()) == pytest.approx(1.0, abs=1e-6)
-    assert float(weights.min()) == pytest.approx(0.0, abs=1e-6)
-    assert weights.argmax() == (5 * u / (1 + 4 * u) - 0.5).abs().argmin()

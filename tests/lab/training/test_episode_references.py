@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Actor, Box, RecordedFrame, Trajectory
-from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.lab.training.episode_references import (
     SLOTS,
     ReferenceDraw,
     pair_references,
     road_users,
-)
-from alpasim_plugin.lab.training.map_errors import (
-    MapError,
-    is_paint,
-    with_error,
 )
 from alpasim_plugin.lab.training.pair_store import PairSequence, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
@@ -98,19 +92,3 @@ def test_as_many_references_as_drawn_and_none_without_a_recording(sequence, tmp_
         there = shown(sequence, replace(EXACT, count=count)).any(axis=(0, 2, 3, 4))
         assert there.tolist() == [True] * count + [False] * (SLOTS - count)
     assert not shown(make(tmp_path), EXACT).any()
-
-
-def test_errors_of_the_map_do_what_their_names_say():
-    sdmap = np.zeros((1, 20, 30, 3), np.uint8)
-    sdmap[:, 10, :] = COLOURS["line_white"]
-    sdmap[:, 12, :] = (np.array(COLOURS["line_yellow"]) * 0.3).astype(np.uint8)  # far away
-    sdmap[:, 14, :] = COLOURS["road_boundary"]
-    sdmap[:, 16, :] = BOX_COLOURS["car"][0]
-    error = MapError("true", (3.0, 2.0), 0.0, 1.0)
-    assert np.array_equal(with_error(sdmap, error), sdmap)
-    assert not with_error(sdmap, replace(error, kind="missing")).any()
-    unpainted = with_error(sdmap, replace(error, kind="unpainted"))
-    assert unpainted.any(axis=(0, 2, 3)).tolist() == [row in (14, 16) for row in range(20)]
-    assert is_paint(sdmap).any(axis=(0, 2)).tolist() == [row in (10, 12) for row in range(20)]
-    shifted = with_error(sdmap, replace(error, kind="shifted", shift_px=(0.0, 2 * 256 / 30)))
-    assert shifted.any(axis=(0, 2, 3)).tolist() == [row in (12, 14, 16, 18) for row in range(20)]

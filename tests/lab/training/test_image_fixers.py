@@ -62,22 +62,6 @@ def test_windows_cover_every_frame_and_their_weights_sum_to_one(frames):
     assert {(198): 12, 900: 53}.get(frames, len(parts)) == len(parts)
 
 
-@pytest.mark.parametrize("name", ["harmonizer-temporal", "gsfix3d"])
-def test_cameras_are_alike_alone_together_and_at_different_rates(session, name):
-    left, right = (moving_picture(6, (16, 32), key=key, camera=key) for key in ("left", "right"))
-    small = moving_picture(6, (16, 16), key="small", camera="small")
-    alone = {clip[0].camera: pixels(run(session(name), clip)) for clip in (left, small)} | {
-        "right": pixels(run(session(name), right[::2]))
-    }
-    fixer, out = session(name), {"left": [], "right": [], "small": []}
-    for i in range(6):
-        for frame in fixer.step([small[i], left[i], *([right[i]] if i % 2 == 0 else [])], ()):
-            out[frame.camera].append(frame)
-    assert {
-        camera: levels(pixels(frames), alone[camera]) for camera, frames in out.items()
-    } == pytest.approx(dict.fromkeys(out, 0), abs=1)
-
-
 def test_the_temporal_model_looks_at_four_outputs_and_no_further(
     session,
 ):
