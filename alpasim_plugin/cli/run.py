@@ -28,6 +28,7 @@ from alpasim_plugin.cli.output import (
     fixer_labels,
     report_lines,
     show,
+    size_lines,
     varied_lines,
     warn,
 )
@@ -334,6 +335,7 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
         "seeds": list(plan.seeds),
         "varied": {name: s.varied for name, s in plan.scenarios.items() if s.varied},
         "never_reused": list(plan.undigested),
+        "large_cameras": size_lines(plan),
         "camera_frames": sum(asked) * len(plan.renderers) * len(plan.seeds),
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,

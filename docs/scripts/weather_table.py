@@ -1,6 +1,5 @@
-"""Drive the shipped policies of cameras in every weather on 20 drawn streets, and count the rollouts
-without an event; or measure what weather leaves of contrast at 50 to 70 m, before and after the
-fixer.
+"""Drive policies with cameras in every weather on 20 drawn streets, and count the rollouts without
+an event; or measure what weather leaves of contrast at 50 to 70 m, before and after the fixer.
 
 Usage: python docs/scripts/weather_table.py FOLDER | contrast; it continues when it is interrupted.
 Policies without a camera drive alike in any weather and are left out.

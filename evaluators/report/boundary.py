@@ -36,7 +36,7 @@ def sentence_of(record: JsonView) -> str:
             if facts.get("changes", 1) > 1:
                 text += f", where its outcome changes {facts['changes']} times"
         outcomes = {has_failed for one in facts["outcomes"].values() for *_, has_failed in one}
-        if is_area and len(outcomes) == 1:
+        if "areas" in facts and len(outcomes) == 1:
             text = f"{name} {'fails everywhere' if outcomes.pop() else 'fails nowhere'}"
         texts.append(text)
     for name, facts in record["differences"].items():
@@ -53,6 +53,8 @@ def sentence_of(record: JsonView) -> str:
             zip(*members, strict=True) if is_area else [members]
         )
     ]
+    if record["unreachable"]:
+        texts.append(f"{plural(len(record['unreachable']), 'point')} cannot be built")
     share = 100 * record["rollouts"] / record["grid_rollouts"]
     stopped = f", stopped: {record['stopped']}" if record["stopped"] else ""
     return (

@@ -6,7 +6,7 @@ both failing directions fails, and whatever lies beyond a passing point in the o
 holds. The boundary therefore runs between two staircases. The nine first points and the edges show
 the directions; then the point is driven that decides most of the rectangle whatever its outcome.
 Points behind the staircases test the rule. Where outcomes contradict each other, every claim begins
-so many steps beyond its point that none are left.
+so many steps beyond its point that it contradicts no claim and no outcome.
 """
 
 from __future__ import annotations
@@ -215,6 +215,15 @@ def _highest(score: npt.NDArray[np.int_]) -> Point | None:
     return (row, column) if score[row, column] > 0 else None
 
 
+def _agree(failed: Mapping[Point, bool], claims: Claims, steps: int) -> bool:
+    """Tell whether claims that begin some steps beyond a point contradict neither each other nor an
+    outcome.
+    """
+    fails, holds = claims.beyond(steps)
+    failing = _marked(claims, {point for point, has_failed in failed.items() if has_failed})
+    return not (fails & holds | holds & failing | fails & claims.driven & ~failing).any()
+
+
 def area_of(failed: Mapping[Point, bool], values: Sequence[float]) -> Area | str:
     """Return the failing share of a seed whose search has ended, or why there is none.
 
@@ -225,8 +234,8 @@ def area_of(failed: Mapping[Point, bool], values: Sequence[float]) -> Area | str
     if not is_monotone(failed):
         return "not monotone"
     claims = claims_of(failed)[0]
-    squares = (claims.squares(steps) for steps in range(AREA_STEPS))
-    fails, holds = next(pair for pair in squares if not (pair[0] & pair[1]).any())
+    steps = next(number for number in range(AREA_STEPS) if _agree(failed, claims, number))
+    fails, holds = claims.squares(steps)
     below, above = claims.turned(fails), claims.turned(holds)
     if claims.order[1] < 0:
         below, above = above, below

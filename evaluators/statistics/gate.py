@@ -128,7 +128,7 @@ class GateSpec(_Strict):
     boundary_margin: float | None = Field(
         default=None,
         ge=0.0,
-        description="How much more of the range of --vary may fail, in the parameter's unit; in place of metrics.",
+        description="How much more of the range of --vary may fail, in the parameter's unit, of two parameters as a share; in place of metrics.",
     )
 
     @model_validator(mode="after")

@@ -129,6 +129,8 @@ def test_a_dry_run_counts_without_running(tmp_path, capsys):
         "3",
         "--dry-run",
         "--json",
+        "--set",
+        "cameras=[{name: front, width: 1900, height: 1080, hfov_deg: 120}]",
         "--out",
         str(tmp_path / "out"),
         "suites/smoke",
@@ -137,6 +139,7 @@ def test_a_dry_run_counts_without_running(tmp_path, capsys):
     plan = json.loads(capsys.readouterr().out)
     assert plan["rollouts"] == 2 * 3 * len(plan["scenes"])
     assert plan["camera_frames"] > 0
+    assert " GB" in plan["large_cameras"][0]
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").touch()
     for name in ("n" * 300, "file"):

@@ -2,8 +2,10 @@
 ranges without a boundary.
 """
 
+import numpy as np
 import pytest
 
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.runs.vary_study import next_points as next_area_points
 from evaluators.statistics.boundary import (
     MOST_POINTS,
@@ -117,3 +119,14 @@ def test_rectangles_without_a_boundary_and_points_that_cannot_be_built():
     found, failed = searched_area(lambda x, y: x + y < 20.5, gone)
     assert not gone & set(failed)
     assert found.low <= 20.5**2 / 2 / 1024 <= found.high
+
+
+def test_no_claim_contradicts_an_outcome():
+    for seed in range(12):
+        noise = 3 * stream("area", seed, "noise").standard_normal((AREA_STEPS + 1, AREA_STEPS + 1))
+        found, failed = searched_area(lambda x, y, noise=noise: x + y + noise[x, y] < 24)
+        lower, upper = np.array(found.lower), np.array(found.upper)
+        inside = {(x, y): one for (x, y), one in failed.items() if 0 < x < AREA_STEPS}
+        for (x, y), has_failed in inside.items():
+            assert has_failed or y >= lower[x - 1 : x + 1].min()
+            assert not has_failed or y <= upper[x - 1 : x + 1].max()

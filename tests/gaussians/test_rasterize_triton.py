@@ -150,7 +150,7 @@ def test_kernels_compile_without_spilling(capability):
         check=True,
     )
     lines = done.stdout.splitlines()
-    names = "project list_tiles composite composite_backward"
+    names = "project list_tiles composite composite_backward draw_tiles"
     assert [line.split()[0] for line in lines] == names.split()
     assert all("stack 0 " in line for line in lines), lines
 

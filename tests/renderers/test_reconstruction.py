@@ -181,7 +181,7 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
 
 def test_a_model_is_fitted_where_its_renderer_draws_and_kept_apart(cache, monkeypatch):
     del cache
-    scenario, places = street(replace(FITTED, share=0.01)), []
+    scenario, places = street(replace(FITTED, share=0.06)), []
 
     def fit_on(*views, device, **options):
         places.append(device)

@@ -55,6 +55,7 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
     assert "no failure" in found["variants"]["clean/pure-pursuit"]["reason"]
     assert found["reachable"][1] < 2000
     assert found["unreachable"]
+    assert "cannot be built" in found["sentence"]
     gate = tmp_path / "gate.yaml"
     gate.write_text("version: 1\nboundary_margin: 0.5\n")
     command = ["gate", str(tmp_path / "run"), "--gate", str(gate)]
