@@ -10,19 +10,21 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import shapely
+from scipy.ndimage import gaussian_filter1d
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
-from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.path import Path, smooth_path, thinned
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.ego_path import grid
 from scenarios.expert import drive
 from scenarios.map_lines import bordered, ground_of
-from scenarios.map_route import LaneGraph, Spot, Way
+from scenarios.map_route import STATION_M, LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
 from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
@@ -38,6 +40,7 @@ REAR_M = 2.0  # room behind the rear axle where the map begins
 AHEAD_M = 120.0  # the route goes on so far behind the end of the drive
 AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
 LONGEST_S = 300.0  # of a drive
+MOST_INSIDE_M, EASED_M = 0.6, 1.5  # in bends: from the middle of the lane, over this length
 YELLOW_AHEAD_S = 4.0  # before the ego, on a free road, would pass the first light of its route
 
 
@@ -79,7 +82,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
             one for one in street.give_way if any(key in lane_map.lanes for key in one.lanes)
         ),
     )
-    driven = _until(line, goal_m + front_m + 1.0)
+    driven = _inside_bends(_until(line, goal_m + front_m + 1.0), front_m)
     duration_us = spec.timing.duration_us
     end_us = round(LONGEST_S * 1e6)
     if duration_us is not None:
@@ -217,6 +220,16 @@ def _around(street: StreetMap, line: Path) -> LaneMap:
 def _until(line: Path, length_m: float) -> Path:
     keep = line.s <= length_m
     return Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep])
+
+
+def _inside_bends(line: Path, front_m: float) -> Path:
+    """Return the line of the rear axle, moved to the inside of bends by half of what the front of
+    the car swings out there.
+    """
+    swing_m = front_m**2 * line.curvature / 2
+    inside_m = np.clip(swing_m / 2, -MOST_INSIDE_M, MOST_INSIDE_M)
+    smooth_m = gaussian_filter1d(inside_m, EASED_M / line.s[1], mode="nearest")
+    return smooth_path(thinned(line.at(line.s, smooth_m)[0], STATION_M))
 
 
 def _timed(

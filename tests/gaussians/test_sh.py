@@ -23,19 +23,6 @@ def directions(n=200, seed=0):
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def test_basis_is_orthonormal_over_the_sphere():
-    # Gauss-Legendre in z and a uniform rule in azimuth integrate polynomials of this degree
-    # exactly.
-    z, w = np.polynomial.legendre.leggauss(8)
-    phi = np.arange(16) * 2 * np.pi / 16
-    zz, pp = np.meshgrid(z, phi, indexing="ij")
-    r = np.sqrt(1 - zz**2)
-    basis = sh_basis(np.stack([r * np.cos(pp), r * np.sin(pp), zz], axis=-1))
-    weights = (w[:, None] * np.full(16, 2 * np.pi / 16))[..., None, None]
-    gram = (weights * basis[..., :, None] * basis[..., None, :]).sum(axis=(0, 1))
-    assert np.abs(gram - np.eye(16)).max() < 1e-12
-
-
 def test_basis_equals_real_harmonics_of_scipy_with_the_3dgs_signs():
     d = directions()
     theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])

@@ -7,9 +7,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import shapely
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.lane_areas import lane_polygon
 from scenarios.load import load_scenario
 from scenarios.opendrive import read_lanes
 from scenarios.opendrive_road import parse_map
@@ -255,6 +258,22 @@ def test_a_lane_that_closes_is_not_driven(tmp_path):
     made = road("1", section(0, lane(-1), closing), length=100)
     for seed in range(2):
         assert scenario(tmp_path, (made,), seed=seed).route.lane_ids == ("1.0.-1",)
+
+
+def test_the_front_of_the_car_stays_on_the_road_in_a_tight_bend(tmp_path):
+    view = (
+        '<geometry s="0" x="0" y="0" hdg="0" length="60"><line/></geometry>'
+        '<geometry s="60" x="60" y="0" hdg="0" length="7"><arc curvature="-0.16"/></geometry>'
+        '<geometry s="67" x="65.6257" y="-3.5269" hdg="-1.12" length="60"><line/></geometry>'
+    )
+    bend = road("1", section(0, lane(-1)), length=127, view=view)
+    made = scenario(tmp_path, (bend,), *named("1:5", "1:110"))
+    surface = shapely.union_all([lane_polygon(lane) for lane in made.lane_map.lanes.values()])
+    T_world_rig = interpolate(made.ego_log, made.ego_log.t_us)
+    front_m = made.vehicle.rear_axle_to_centre_m + made.vehicle.box.length_m / 2
+    for left_m in (-made.vehicle.box.width_m / 2, made.vehicle.box.width_m / 2):
+        corners = T_world_rig @ [front_m, left_m, 0.0, 1.0]
+        assert shapely.distance(surface, shapely.points(corners[:, :2])).max() < 0.01
 
 
 def test_people_cross_where_the_route_passes_and_the_expert_lets_them(tmp_path):
