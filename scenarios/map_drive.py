@@ -18,7 +18,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
-from alpasim_plugin.world.path import Path, smooth_path, thinned
+from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.ego_path import grid
@@ -229,7 +229,8 @@ def _inside_bends(line: Path, front_m: float) -> Path:
     swing_m = front_m**2 * line.curvature / 2
     inside_m = np.clip(swing_m / 2, -MOST_INSIDE_M, MOST_INSIDE_M)
     smooth_m = gaussian_filter1d(inside_m, EASED_M / line.s[1], mode="nearest")
-    return smooth_path(thinned(line.at(line.s, smooth_m)[0], STATION_M))
+    stations = np.linspace(0.0, line.length_m, int(line.length_m / STATION_M) + 2)
+    return smooth_path(line.at(stations, np.interp(stations, line.s, smooth_m))[0])
 
 
 def _timed(

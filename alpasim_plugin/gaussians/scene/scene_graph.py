@@ -213,8 +213,8 @@ class SceneGraph:
         else:
             clouds, place = self._upload(device)
             placed = [(place[node.name, i], T) for node, i, T in chosen]
-            behind = self.sky.on_device(camera, device)
-            out = clouds.draw(placed, camera, behind, antialiased=antialiased)
+            sky = self.sky.on_device(camera, device)
+            out = clouds.draw(placed, camera, sky, antialiased=antialiased)
         stats = {
             **out.stats,
             "nodes": len(chosen),
