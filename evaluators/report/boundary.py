@@ -115,7 +115,8 @@ def area_charts(record: JsonView) -> list[Chart]:
             for x, y, has_failed in outcomes:
                 _draw_point(axes, x, y, has_failed, colour)
         for area in facts.get("areas", {}).values():
-            edges = np.linspace(*record["reachable"][0], len(area["lower"]) + 1)
+            low, high = record["reachable"][0]
+            edges = np.linspace(low, high, len(area["lower"]) + 1)
             lower, upper = area["lower"], area["upper"]
             axes.stairs(upper, edges, baseline=lower, fill=True, color=colour, alpha=0.16)
             for one in (lower, upper):

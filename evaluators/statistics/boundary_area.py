@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +29,9 @@ MOST_AREA_POINTS = 100  # that a seed drives, tests of the rule among them
 APART = 2  # steps from driven points within which the rule is not tested
 AT_ONCE = 4  # points of a round
 ENDS = (0, AREA_STEPS // 2, AREA_STEPS)
-FIRST = list(product(ENDS, ENDS))
 
 Point = tuple[int, ...]  # two steps
+FIRST: list[Point] = list(product(ENDS, ENDS))
 Grid = npt.NDArray[np.bool_]  # (AREA_STEPS + 1, AREA_STEPS + 1)
 
 
@@ -46,7 +47,7 @@ class Area(Interval):
         contradictions: Driven points that contradict others.
     """
 
-    fails: tuple[str, str]
+    fails: tuple[str, ...]
     lower: list[float]
     upper: list[float]
     contradictions: int
@@ -73,7 +74,7 @@ class Claims:
         """Count the driven points that are claimed to do both."""
         return int((self.driven & self.fails & self.holds).sum())
 
-    def turned(self, grid: Grid) -> Grid:
+    def turned(self, grid: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return a grid with index 0 at the low end of both parameters, or back."""
         return grid[:: self.order[0], :: self.order[1]]
 
