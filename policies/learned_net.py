@@ -43,7 +43,7 @@ _SPEED_SCALE = [1.5 * t for t in TIMES_S]  # metres per second
 _PARTS = [len(KNOTS_M), len(TIMES_S), 2, 2]
 _MIN_SIGMA = 0.02
 PROXIMITY_M = 20.0
-ASIDE = 32  # features of a view to a side
+SIDE_FEATURES = 32  # features of a view to a side
 VIEWS = "views"  # entry in the header of the weights
 MOST_PIXELS = 512
 
@@ -61,7 +61,7 @@ class Prediction:
     leader: Tensor
     # (B, V - 1, 2) who comes, in each view to a side: proximity of the nearest that moves, and
     # whether it is let pass, before the sigmoid; auxiliary
-    comes: Tensor
+    crossing: Tensor
 
 
 def _convolutions() -> list[nn.Module]:
@@ -104,9 +104,11 @@ class LearnedNet(nn.Module):
         seen = 24 * (self.views[0].height // 16) * (self.views[0].width // 16)
         for view in self.views[1:2]:
             beside = 24 * (view.height // 16) * (view.width // 16)
-            self.aside = nn.Sequential(*_convolutions(), nn.Linear(beside, ASIDE), nn.ReLU())
-            self.comes = nn.Linear(ASIDE + 32, 2)
-        features = seen + ASIDE * len(self.views[1:])
+            self.side_encoder = nn.Sequential(
+                *_convolutions(), nn.Linear(beside, SIDE_FEATURES), nn.ReLU()
+            )
+            self.crossing_head = nn.Linear(SIDE_FEATURES + 32, 2)
+        features = seen + SIDE_FEATURES * len(self.views[1:])
         self.plan = nn.Sequential(
             nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
         )
@@ -133,10 +135,10 @@ class LearnedNet(nn.Module):
         """
         seen = [self.see(images[0])]
         known = self.state(state)
-        comes = [state.new_zeros(len(state), 0)]
+        crossing = [state.new_zeros(len(state), 0)]
         for view, image in zip(self.views[1:], images[1:], strict=True):
-            seen.append(self.aside(image if view.yaw_deg > 0 else image.flip(-1)))
-            comes.append(self.comes(torch.cat([seen[-1], known], dim=1)))
+            seen.append(self.side_encoder(image if view.yaw_deg > 0 else image.flip(-1)))
+            crossing.append(self.crossing_head(torch.cat([seen[-1], known], dim=1)))
         features = torch.cat([*seen, known, self.word(command)], dim=1)
         heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
@@ -146,7 +148,7 @@ class LearnedNet(nn.Module):
             speed * self.speed_scale,
             sigma,
             leader,
-            torch.cat(comes, dim=1).view(len(state), len(self.views) - 1, 2),
+            torch.cat(crossing, dim=1).view(len(state), len(self.views) - 1, 2),
         )
 
 

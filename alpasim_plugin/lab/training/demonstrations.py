@@ -90,7 +90,7 @@ _FORMS: dict[str, tuple[int, str]] = {
     "leader": (1, "float32"),  # (N,) its speed, metres per second
     # (N, V - 1, 2) who comes, in each view to a side: proximity of the nearest, exp(-distance / 20
     # m), and 1 if the expert lets it pass
-    "comes": (3, "float32"),
+    "crossing": (3, "float32"),
 }
 
 
@@ -214,11 +214,11 @@ def _target_speeds(
     lets_pass = (expert_speeds(*alone) - speeds).max() > LETS_PASS_MPS
     gap_m = min(leader.gap_m, SIGHT_M)
     sides = [view for view in SIDES if view.name in views]
-    comes = who_comes(state, sides, lets_pass)
-    return {"speeds": speeds, "gap": gap_m, "leader": leader.speed_mps, "comes": comes}
+    comes = crossing_traffic(state, sides, lets_pass)
+    return {"speeds": speeds, "gap": gap_m, "leader": leader.speed_mps, "crossing": comes}
 
 
-def who_comes(state: RolloutState, sides: Sequence[View], lets_pass: bool) -> F64:
+def crossing_traffic(state: RolloutState, sides: Sequence[View], lets_pass: bool) -> F64:
     """Return for each view to a side ``(V, 2)`` the proximity of the nearest road user that it shows
     on the way to the car's line, and 1 if that one is the nearest of all and is let pass.
     """

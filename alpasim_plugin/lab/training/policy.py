@@ -66,7 +66,7 @@ class PolicyBatch:
     speed: Tensor  # (B,) metres per second
     speeds: Tensor  # (B, 8) changes of speed, metres per second
     leader: Tensor  # (B, 2) proximity of the leader and its speed, as in `Prediction`
-    comes: Tensor  # (B, V - 1, 2) who comes from a side, as in `Prediction`, after the sigmoid
+    crossing: Tensor  # (B, V - 1, 2) who comes from a side, as in `Prediction`, after the sigmoid
 
 
 def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,7 +154,9 @@ class PolicyTask:
             "sigma": 0.05 * sigma,
         }
         if self.net.views[1:]:
-            parts["comes"] = F.binary_cross_entropy_with_logits(prediction.comes, batch.comes)
+            parts["crossing"] = F.binary_cross_entropy_with_logits(
+                prediction.crossing, batch.crossing
+            )
         numbers = {name: value.detach() for name, value in parts.items()}
         numbers["lateral_m"] = lateral[:, SIGMA_KNOT].detach().abs().mean()
         numbers["speed_mps"] = speed_error.detach().abs().mean()
@@ -218,7 +220,7 @@ class PolicyTask:
             a["speed"][row],
             a["speeds"][row],
             leader,
-            a["comes"][row],
+            a["crossing"][row],
         )
 
 
@@ -235,7 +237,7 @@ def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
     after = narrow.shape[1] - front.state[0].out_features - front.word.embedding_dim
     zeros = torch.zeros(len(wide), others)
     known["plan.0.weight"] = torch.cat([narrow[:, :after], zeros, narrow[:, after:]], dim=1)
-    known |= {f"aside.{name}": value for name, value in front.see.state_dict().items()}
+    known |= {f"side_encoder.{name}": value for name, value in front.see.state_dict().items()}
     net.load_state_dict(known, strict=False)
     net.see.requires_grad_(False)
 
