@@ -226,7 +226,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
     ]
     if not facts.centerline_is_driving_direction:
-        sides = [(edge[::-1], paint) for edge, paint in sides[::-1]]
+        sides = [(edge[::-1], mark_type) for edge, mark_type in sides[::-1]]
         ahead, beside = behind, beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):
         sides = sides[::-1]

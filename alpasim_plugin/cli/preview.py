@@ -121,7 +121,7 @@ def _draw_map(
     world = turn + axes.transData
     for kind, colour in (("lanes", ROAD), ("crosswalks", CROSSWALK)):
         axes.add_collection(PolyCollection(lines[kind], facecolor=colour, transform=world))
-    for kind, colour in (("paint", MARKING), ("edges", EDGE)):
+    for kind, colour in (("markings", MARKING), ("edges", EDGE)):
         axes.add_collection(LineCollection(lines[kind], colors=colour, transform=world))
     for number, actor in enumerate(actors):
         colour = OTHERS[number % len(OTHERS)]

@@ -21,8 +21,8 @@ def chord_angle(log: F64) -> float:
 
 
 def drawn_map(content: JsonView) -> dict[str, list[F64]]:
-    """Return what every view from above draws of a map: ``lanes``, ``paint`` (edges of lanes that
-    carry markings), ``edges`` and ``crosswalks``.
+    """Return what every view from above draws of a map: ``lanes``, ``markings`` (edges of lanes
+    that carry some), ``edges`` and ``crosswalks``.
 
     Args:
         content: ``scenes/SCENE.json``.
@@ -30,13 +30,13 @@ def drawn_map(content: JsonView) -> dict[str, list[F64]]:
     Returns:
         Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
     """
-    rings, painted = [], []
+    rings, marked = [], []
     for lane in content.get("lanes") or []:
         left, right = lane.get("left"), lane.get("right")
         if left and right:
             rings.append([*left, *reversed(right)])
-        paint = lane.get("paint") or ("unknown", "unknown")
-        painted += [edge for edge, kind in zip((left, right), paint, strict=True) if kind != "none"]
+        edges = zip((left, right), lane["markings"], strict=True)
+        marked += [edge for edge, kind in edges if kind != "none"]
 
     def arrays(lines: Sequence[Any], least: int) -> list[F64]:
         """Return the lines of at least so many points."""
@@ -48,7 +48,7 @@ def drawn_map(content: JsonView) -> dict[str, list[F64]]:
 
     return {
         "lanes": arrays(rings, 3),
-        "paint": arrays(painted, 2),
+        "markings": arrays(marked, 2),
         "edges": arrays(content.get("road_edges") or [], 2),
         "crosswalks": arrays(content.get("crosswalks") or [], 3),
     }

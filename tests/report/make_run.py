@@ -174,7 +174,7 @@ def _scene(scene, index, plan):
                 "centre": np.round(mid, 2).tolist(),
                 "left": np.round(mid + normal * 1.8, 2).tolist(),
                 "right": np.round(mid - normal * 1.8, 2).tolist() if lane or index != 2 else None,
-                "paint": ["dashed_white", "solid_white"],
+                "markings": ["dashed_white", "solid_white"],
             }
         )
     mid = np.array(lanes[0]["centre"])

@@ -67,9 +67,9 @@ def test_an_event_during_warm_up_does_not_give_the_time():
 
 
 def test_a_lane_without_an_edge_gives_its_line_and_no_area():
-    lane = {"left": [[0, 2], [50, 2]], "right": None}
+    lane = {"left": [[0, 2], [50, 2]], "right": None, "markings": ["solid_white", "none"]}
     found = drawn(Rollout("a", "p", "s", 0, "ok"), scene(X, 0 * X, lanes=[lane]), None)["map"]
-    assert (found["lanes"], len(found["paint"])) == ([], 1)
+    assert (found["lanes"], len(found["markings"])) == ([], 1)
 
 
 def test_a_road_user_is_where_it_is_at_the_first_event_and_leaves_its_way():

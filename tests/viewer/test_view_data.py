@@ -185,20 +185,25 @@ def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_pat
         assert drive["cameras"][0]["t"] == [100 * k for k in range(SMALL.steps)]
 
 
-def test_a_missing_log_is_told_in_its_place(small_run, tmp_path):
+def test_a_missing_or_damaged_log_is_told_in_its_place_and_the_others_are_shown(
+    small_run, tmp_path
+):
     root = Path(shutil.copytree(small_run, tmp_path / "run"))
-    (root / read_run(root).rollouts[0].path / "rollout.asl").unlink()
-    bare, whole = only_cell(root)["drives"]
-    assert "is missing" in bare["failed"]
-    assert "ego" in whole
-
-
-def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(small_run, tmp_path):
-    root = Path(shutil.copytree(small_run, tmp_path / "run"))
-    (root / read_run(root).rollouts[0].path / "rollout.asl").write_bytes(b"no log")
+    log = root / read_run(root).rollouts[0].path / "rollout.asl"
+    log.write_bytes(b"no log")
     damaged, whole = only_cell(root)["drives"]
     assert damaged["failed"].startswith("its log cannot be read: ")
     assert len(whole["cameras"][0]["t"]) == SMALL.steps
+    log.unlink()
+    assert "is missing" in only_cell(root)["drives"][0]["failed"]
+
+
+def test_a_scene_file_whose_lanes_lack_their_markings_is_refused(small_run, tmp_path):
+    root = Path(shutil.copytree(small_run, tmp_path / "run"))
+    (path,) = (root / "scenes").iterdir()
+    path.write_text(path.read_text().replace("markings", "marks"))
+    with pytest.raises(InputError):
+        only_cell(root)
 
 
 def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run):

@@ -111,13 +111,19 @@ class Summary(TypedDict, total=False):
     plans: dict[str, Facts]
 
 
+class MapLane(TypedDict):
+    """A lane of ``scenes/SCENE.json``: types of its left and right marking, and its lines."""
+
+    markings: list[str]
+
+
 class SceneFile(TypedDict, total=False):
     """``scenes/SCENE.json``: the map, the recorded drive and the road users that reports draw."""
 
     scene_id: str
     source: str
     start_us: int
-    lanes: list[Facts]
+    lanes: list[MapLane]
     road_edges: list[Line]
     crosswalks: list[Line]
     ego_log: dict[str, list[Coordinate] | list[int]]

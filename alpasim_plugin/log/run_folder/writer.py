@@ -243,7 +243,7 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> JsonObject:
             "centre": _xy(lane.centre),
             "left": _xy(lane.left) if lane.left is not None else None,
             "right": _xy(lane.right) if lane.right is not None else None,
-            "paint": [lane.left_mark_type, lane.right_mark_type],
+            "markings": [lane.left_mark_type, lane.right_mark_type],
         }
         for lane in scene.lane_map.lanes.values()
     ]

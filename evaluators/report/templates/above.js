@@ -53,7 +53,7 @@
       context.fillStyle = colour(name);
       for (const ring of map[kind]) { trace(ring, true); context.fill(); }
     }
-    for (const [kind, name, width] of [["paint", "lane-line", 1.1], ["edges", "edge", 1.4]]) for (const line of map[kind]) { trace(line); stroke(colour(name), width); }
+    for (const [kind, name, width] of [["markings", "lane-line", 1.1], ["edges", "edge", 1.4]]) for (const line of map[kind]) { trace(line); stroke(colour(name), width); }
     for (const user of scene.users) {
       if (user.way) { trace(user.way); stroke(colour("muted"), 1, 0.55); }
       box(user);

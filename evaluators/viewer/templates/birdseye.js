@@ -37,7 +37,7 @@ class Birdseye {
     const all = (lines, close) => lines.reduce((path, one) => line(path, one, close), new Path2D());
     this.paths = {
       lanes: map.lanes.map((one) => line(new Path2D(), one, true)), // one by one: overlapping rings must not cut holes
-      crosswalks: all(map.crosswalks, true), paint: all(map.paint), edges: all(map.edges), log: line(new Path2D(), map.log),
+      crosswalks: all(map.crosswalks, true), markings: all(map.markings), edges: all(map.edges), log: line(new Path2D(), map.log),
     };
     this.turn = [Math.cos(map.turn), Math.sin(map.turn)];
     this.drives = cell.drives.map((drive, i) => ({ ...drive, i, colour: this.variants[this.index.renderers.indexOf(drive.renderer)] }))
@@ -114,7 +114,7 @@ class Birdseye {
     for (const lane of this.paths.lanes) context.fill(lane);
     context.fillStyle = this.colours.crosswalk;
     context.fill(this.paths.crosswalks);
-    for (const [path, colour, width] of [["paint", "lane-line", 1.2], ["edges", "edge", 1.5]]) {
+    for (const [path, colour, width] of [["markings", "lane-line", 1.2], ["edges", "edge", 1.5]]) {
       context.strokeStyle = this.colours[colour];
       context.lineWidth = width * px;
       context.stroke(this.paths[path]);

@@ -88,7 +88,7 @@ class Overlay {
   // What a map and road users give: `wanted` names the layers.
   scene(cell, users, t, wanted) {
     if (wanted.has("lanes")) {
-      this.lines(cell.map.paint, { colour: "#ffe14d", width: 1.2, alpha: 0.9 });
+      this.lines(cell.map.markings, { colour: "#ffe14d", width: 1.2, alpha: 0.9 });
       this.lines(cell.map.edges, { colour: "#ff7ad9", width: 1.4, alpha: 0.9 });
     }
     if (wanted.has("recorded")) this.lines([cell.map.log], { colour: "#fff", width: 2, dash: [7, 6] });
