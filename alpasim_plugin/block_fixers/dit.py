@@ -28,7 +28,7 @@ from alpasim_plugin.block_fixers.attention import (
     RopeTable,
     block_causal_attention,
 )
-from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues, TimeSignal
+from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues
 from alpasim_plugin.block_fixers.clips import check_video
 from alpasim_plugin.block_fixers.kv_cache import BlockCache, RollingCache
 from alpasim_plugin.block_fixers.layers import (
@@ -247,7 +247,9 @@ class CosmosCausalDiT(nn.Module):
         table: RopeTable,
         attention: Callable[[int], Attend],
     ) -> Tensor:
-        time = self._time(t)
+        steps = t if isinstance(t, Tensor) else torch.full((1, 1), float(t), device=self.device)
+        s = sinusoid(steps, self.sizes.width)
+        time = self.t_embedding_norm(s), self.t_embedder[1](s)
         text = self.encode_text(text) if isinstance(text, Tensor) else text
         masks = torch.zeros_like(x[:, :MASK_CHANNELS])  # that of padding is zero
         if condition_mask is not None:
@@ -261,12 +263,6 @@ class CosmosCausalDiT(nn.Module):
         for layer, block in enumerate(self.blocks):
             tokens = block(tokens, time, text[layer], table, attention(layer), opacity)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
-
-    def _time(self, t: Tensor | float) -> TimeSignal:
-        """Return emb ``(b, T, width)`` and lora ``(b, T, 3 * width)``."""
-        steps = t if isinstance(t, Tensor) else torch.full((1, 1), float(t), device=self.device)
-        s = sinusoid(steps, self.sizes.width)
-        return self.t_embedding_norm(s), self.t_embedder[1](s)
 
     def _check(self, x: Tensor, hdmap: Tensor) -> None:
         check_video("x", x, self.sizes.latent_channels, PATCH)

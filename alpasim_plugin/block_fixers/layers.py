@@ -59,22 +59,6 @@ def layer_norm(x: Tensor) -> Tensor:
     return F.layer_norm(x, (x.shape[-1],), eps=NORM_EPS)
 
 
-def patchify(video: Tensor) -> Tensor:
-    """Split into 2x2 patches, channel slowest: the order of the input embeddings.
-
-    Args:
-        video: ``(B, C, T, H, W)``, H and W even.
-
-    Returns:
-        ``(B, T, H/2 * W/2, C * 4)`` with the last axis ordered (channel, row, column).
-    """
-    b, c, t, h, w = video.shape
-    grid = video.reshape(b, c, t, h // PATCH, PATCH, w // PATCH, PATCH)
-    return grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(
-        b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH
-    )
-
-
 def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
     """Join 2x2 patches, channel fastest: the order of the output layer, which differs from the
     input's.
@@ -101,7 +85,13 @@ class PatchLinear(nn.Linear):
 
     def embed(self, video: Tensor) -> Tensor:
         """Map ``(B, channels, T, H, W)`` to ``(B, T, N, width)``."""
-        return self(patchify(video))
+        b, c, t, h, w = video.shape
+        grid = video.reshape(b, c, t, h // PATCH, PATCH, w // PATCH, PATCH)
+        return self(
+            grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(
+                b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH
+            )
+        )
 
 
 def sinusoid(t: Tensor, width: int) -> Tensor:

@@ -143,7 +143,19 @@ class OneFixer(Fixer):
                 `views.group_views`).
             RendererError: An opacity that is not a number or outside [0, 1].
         """
-        views = self._views(block, maps)
+        views = group_views(
+            block, maps if self.settings.uses_map else (), self.blocks.frames(self._done)
+        )
+        given, known = (
+            [(part.cameras, part.shape) for part in parts] for parts in (views, self._history)
+        )
+        if given != known and not self._done:
+            self._history, self._pending = tuple(self._open(view) for view in views), ()
+        elif given != known:
+            raise InputError(
+                f"block {self._done}: cameras and sizes {given} after {known}",
+                "give the same cameras at the same sizes in every block, or reset",
+            )
         pending = [block.views for block in self._pending]
         if not (
             len(pending) == len(views)
@@ -163,25 +175,6 @@ class OneFixer(Fixer):
         self._pending = ()
         self._done += 1
         return fixed
-
-    def _views(self, block: Sequence[Frame], maps: Sequence[U8]) -> tuple[Views, ...]:
-        """Group a block and check that it continues the rollout; a rollout's first block starts its
-        history.
-        """
-        views = group_views(
-            block, maps if self.settings.uses_map else (), self.blocks.frames(self._done)
-        )
-        given, known = (
-            [(part.cameras, part.shape) for part in parts] for parts in (views, self._history)
-        )
-        if given != known and not self._done:
-            self._history, self._pending = tuple(self._open(view) for view in views), ()
-        elif given != known:
-            raise InputError(
-                f"block {self._done}: cameras and sizes {given} after {known}",
-                "give the same cameras at the same sizes in every block, or reset",
-            )
-        return views
 
     def _open(self, view: Views) -> ViewsHistory:
         height, width = (side + -side % TOKEN_PX for side in view.shape)

@@ -151,7 +151,12 @@ class SpeculativeRenderer(FixedRenderer):
         is_hit = bool(predicted) and all(error.within(*limits) for error in forecasts)
         shown = [EXACT] * len(ordered)
         if place + 1 == self.fixer.blocks.frames(self.stats.blocks):
-            frames = self._complete()
+            # The block of true poses joins the history; its last frames are shown.
+            fixed = self._fix(self.fixer.step, self.true)
+            self.stats.blocks += 1
+            self.true = []
+            self.draft = []
+            frames = fixed[-1]
         elif is_hit:
             frames = [frame for _, frame in predicted]
             shown = forecasts
@@ -167,14 +172,6 @@ class SpeculativeRenderer(FixedRenderer):
             for i, frame in enumerate(frames)
         }
         return [made[request.camera.name] for request in requests]
-
-    def _complete(self) -> list[Frame]:
-        """Add the block of true poses to the history and return its last frames."""
-        fixed = self._fix(self.fixer.step, self.true)
-        self.stats.blocks += 1
-        self.true = []
-        self.draft = []
-        return fixed[-1]
 
     def _make_draft(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Fix the true frames so far with the predicted rest of the block and return the newest

@@ -37,7 +37,7 @@ from alpasim_plugin.block_fixers.streaming import (
     channels_to_frames,
     run_layers,
 )
-from alpasim_plugin.fixers.network.checkpoints import StateDict, clean, load_checked, unwrap
+from alpasim_plugin.fixers.network.checkpoints import clean, load_checked, unwrap
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3
@@ -83,21 +83,6 @@ class MemBlock(nn.Module):
         return out.add_(x).relu_()
 
 
-def decoder_layers(latent: int, widths: Sequence[int]) -> nn.ModuleList:
-    """Return the decoder's layers under their checkpoint positions 0 to 22."""
-    layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU(inplace=True)]
-    for inputs, outputs, growth in zip(widths[:-1], widths[1:], GROWTH, strict=True):
-        layers += [MemBlock(inputs) for _ in range(3)]
-        # The original repeats pixels at the first of these positions. Temporal upsampling is
-        # pointwise, so repeating after it is equal at a quarter of the cost.
-        layers += [
-            nn.Identity(),
-            TemporalUpsample(inputs, growth),
-            UpsampleConv(inputs, outputs, bias=False),
-        ]
-    return nn.ModuleList([*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)])
-
-
 class TinyDecoder(StreamingDecoder):
     """Decode normalised Wan latents with a small network; weights are frozen, gradients with
     respect to the input flow.
@@ -116,7 +101,19 @@ class TinyDecoder(StreamingDecoder):
     def __init__(self, latent: int, widths: Sequence[int], scaled: bool = False) -> None:
         super().__init__()
         self.latent = latent
-        self.decoder = decoder_layers(latent, widths)
+        layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU(inplace=True)]
+        for inputs, outputs, growth in zip(widths[:-1], widths[1:], GROWTH, strict=True):
+            layers += [MemBlock(inputs) for _ in range(3)]
+            # The original repeats pixels at the first of these positions. Temporal upsampling is
+            # pointwise, so repeating after it is equal at a quarter of the cost.
+            layers += [
+                nn.Identity(),
+                TemporalUpsample(inputs, growth),
+                UpsampleConv(inputs, outputs, bias=False),
+            ]
+        self.decoder = nn.ModuleList(
+            [*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)]
+        )
         self.stats = LatentStats() if scaled else None
         self.eval().requires_grad_(False)
 
@@ -145,10 +142,18 @@ class TinyDecoder(StreamingDecoder):
             for key, value in clean(unwrap(sd, source)).items()
             if not key.startswith("encoder.")
         }
-        latent, widths = _read_widths(tensors, source)
+        first_convs = [
+            f"decoder.{FIRST + STAGE * stage}.conv.0.bias" for stage in range(len(GROWTH))
+        ]
+        stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) - 1}.weight"
+        *widths, _ = first_axes(tensors, [*first_convs, last, stem], source, DO)
         with torch.device("meta"):
-            net = cls(latent, widths, scaled)
-        load_checked(net, _last_rows(tensors, widths), source, DO)
+            net = cls(tensors[stem].shape[1], widths, scaled)
+        for stage, growth in enumerate(GROWTH):
+            key = f"decoder.{FIRST + STAGE * stage + 4}.conv.weight"
+            if key in tensors and tensors[key].ndim == 4:
+                tensors[key] = tensors[key][-growth * widths[stage] :]
+        load_checked(net, tensors, source, DO)
         return net
 
     @classmethod
@@ -192,20 +197,3 @@ class TinyDecoder(StreamingDecoder):
         return channels_first(frames[:, DROPPED if streaming.first else 0 :]), streaming.state
 
     forward = StreamingDecoder.decode
-
-
-def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple[int, ...]]:
-    """Read the latent's channels and the four widths off the kernels' inputs."""
-    first_convs = [f"decoder.{FIRST + STAGE * stage}.conv.0.bias" for stage in range(len(GROWTH))]
-    stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) - 1}.weight"
-    *widths, _ = first_axes(tensors, [*first_convs, last, stem], source, DO)
-    return tensors[stem].shape[1], tuple(widths)
-
-
-def _last_rows(tensors: Mapping[str, Tensor], widths: Sequence[int]) -> StateDict:
-    out = dict(tensors)
-    for stage, growth in enumerate(GROWTH):
-        key = f"decoder.{FIRST + STAGE * stage + 4}.conv.weight"
-        if key in out and out[key].ndim == 4:
-            out[key] = out[key][-growth * widths[stage] :]
-    return out

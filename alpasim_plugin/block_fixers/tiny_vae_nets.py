@@ -101,8 +101,20 @@ class CosineTransform(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
+        colour = _cosines(COLOURS)
+        time = _cosines(GROUP)
+        space = _cosines(SIDE)
+        rows = []
+        for (c, t, y, x), _ in COMPONENTS:
+            block = torch.einsum(
+                "t,y,x,c->tyxc", time[t], space[y], space[x], colour[c]
+            )  # (4, 8, 8, 3)
+            cells = block.reshape(GROUP, 2, QUARTER, 2, QUARTER, COLOURS).permute(0, 2, 4, 5, 1, 3)
+            rows.append(cells.reshape(GROUP * CELL * COLOURS, 2, 2))
         self.register_buffer(
-            "kernel", _kernel().contiguous(memory_format=torch.channels_last), persistent=False
+            "kernel",
+            torch.stack(rows).float().contiguous(memory_format=torch.channels_last),
+            persistent=False,
         )
         mean = [BLACK_OFFSET] + [0.0] * (LATENT - 1)
         std = [std for _, std in COMPONENTS]
@@ -128,23 +140,6 @@ class CosineTransform(nn.Module):
 
     def _sum(self, coefficients: Tensor) -> Tensor:
         return spread(F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)))
-
-
-def _kernel() -> Tensor:
-    """Return ``(16, 192, 2, 2)``: components by grid channels (frame, row, column, colour) and 2x2
-    cells.
-    """
-    colour = _cosines(COLOURS)
-    time = _cosines(GROUP)
-    space = _cosines(SIDE)
-    rows = []
-    for (c, t, y, x), _ in COMPONENTS:
-        block = torch.einsum(
-            "t,y,x,c->tyxc", time[t], space[y], space[x], colour[c]
-        )  # (4, 8, 8, 3)
-        cells = block.reshape(GROUP, 2, QUARTER, 2, QUARTER, COLOURS).permute(0, 2, 4, 5, 1, 3)
-        rows.append(cells.reshape(GROUP * CELL * COLOURS, 2, 2))
-    return torch.stack(rows).float()
 
 
 def _cosines(n: int) -> Tensor:
