@@ -148,7 +148,14 @@ class Exchange:
         self._drain(t_us)
         for sent in self.codec.map.send:
             if t_us % sent.period_us == 0:
-                self._send(self.codec.encode(sent, quantities))
+                try:
+                    self.bus.send(self.codec.encode(sent, quantities))
+                except can.CanError as error:
+                    raise PolicyError(
+                        f"{self.bus.channel_info}: {error}",
+                        "check that the bus is up",
+                    ) from error
+                self.counts["sent"] += 1
         began = self.clock()
         waiting = {id(self._steer), id(self._accel)}
         while waiting and (left := began + self.timeout_s - self.clock()) > 0:
@@ -157,7 +164,21 @@ class Exchange:
                 waiting -= {id(one) for one in self._take(frame, t_us)}
         if not waiting:
             self.latencies_s.append(self.clock() - began)
-        return self._commands(t_us, not waiting)
+        self._began_us = t_us if self._began_us is None else self._began_us
+        wheel, accel = self._steer.value, self._accel.value
+        since_us = min(self._steer.t_us, self._accel.t_us)
+        mark: Mark = "held" if waiting else "fresh"
+        if wheel is None or accel is None:  # nothing to hold: the ramp begins at once
+            since_us = self._began_us - HOLD_US
+            mark = "ramped"
+        over_us = t_us - since_us - HOLD_US
+        if waiting and over_us > 0:
+            mark = "ramped"
+        self.counts[mark] += 1
+        if mark == "ramped":
+            ramp = min(accel or 0.0, 0.0) - RAMP_MPS3 * max(over_us, 0) * 1e-6
+            accel = max(ramp, STOP_MPS2)
+        return Commands(wheel or 0.0, accel or 0.0, mark)
 
     def facts(self) -> dict[str, Any]:
         """Return counts and latency, for the rollout's manifest."""
@@ -175,16 +196,6 @@ class Exchange:
         """
         while (frame := self.bus.recv(0)) is not None:
             self.counts["late"] += bool(self._take(frame, t_us))
-
-    def _send(self, frame: can.Message) -> None:
-        try:
-            self.bus.send(frame)
-        except can.CanError as error:
-            raise PolicyError(
-                f"{self.bus.channel_info}: {error}",
-                "check that the bus is up",
-            ) from error
-        self.counts["sent"] += 1
 
     def _take(self, frame: can.Message, t_us: int) -> list[_Command]:
         """Take in a frame; return the commands that it renews, none where it is refused or
@@ -215,21 +226,3 @@ class Exchange:
             self.counts["lost"] += ahead - 1
         one.counter, one.value, one.t_us = counter, value, t_us
         return True
-
-    def _commands(self, t_us: int, is_fresh: bool) -> Commands:
-        """Return the newest commands, or what replaces them."""
-        self._began_us = t_us if self._began_us is None else self._began_us
-        wheel, accel = self._steer.value, self._accel.value
-        since_us = min(self._steer.t_us, self._accel.t_us)
-        mark: Mark = "fresh" if is_fresh else "held"
-        if wheel is None or accel is None:  # nothing to hold: the ramp begins at once
-            since_us = self._began_us - HOLD_US
-            mark = "ramped"
-        over_us = t_us - since_us - HOLD_US
-        if not is_fresh and over_us > 0:
-            mark = "ramped"
-        self.counts[mark] += 1
-        if mark == "ramped":
-            ramp = min(accel or 0.0, 0.0) - RAMP_MPS3 * max(over_us, 0) * 1e-6
-            accel = max(ramp, STOP_MPS2)
-        return Commands(wheel or 0.0, accel or 0.0, mark)

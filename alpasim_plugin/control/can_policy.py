@@ -102,7 +102,18 @@ class CanPolicy(Policy):
             self._steer_rate = (state.steer_rad - before.steer_rad) / (self._step_us * 1e-6)
             self._accel = (state.speed_mps - before.speed_mps) / (self._step_us * 1e-6)
             states.append(state)
-        self._predicted = now + self._period_us, _in_world(state, observation.ego.T_world_rig)
+        T_world_rig = observation.ego.T_world_rig
+        x, y, _ = transform_points(T_world_rig, np.array([[state.x_m, state.y_m, 0.0]]))[0]
+        self._predicted = (
+            now + self._period_us,
+            BicycleState(
+                float(x),
+                float(y),
+                state.yaw_rad + yaw_of(T_world_rig),
+                state.speed_mps,
+                state.steer_rad,
+            ),
+        )
         times = [now + self._step_us * i for i in range(len(states))]
         while times[-1] < now + PLAN_US:
             state = step(state, self._command(commands), PLAN_STEP_US * 1e-6, self._vehicle)
@@ -217,10 +228,3 @@ def _steer_of(ego: EgoState, vehicle: Vehicle) -> float:
     if abs(ego.speed_mps) < 0.5:
         return ego.steer_rad
     return float(np.arctan(vehicle.wheelbase_m * ego.yaw_rate_radps / ego.speed_mps))
-
-
-def _in_world(state: BicycleState, T_world_rig: F64) -> BicycleState:
-    x, y, _ = transform_points(T_world_rig, np.array([[state.x_m, state.y_m, 0.0]]))[0]
-    return BicycleState(
-        float(x), float(y), state.yaw_rad + yaw_of(T_world_rig), state.speed_mps, state.steer_rad
-    )

@@ -293,41 +293,21 @@ class PlanTracker(Controller):
         change = np.zeros(NODES)
         start = now.steer_rad
         for _ in range(GAUSS_NEWTON_STEPS):
-            error, jacobian = _lateral_errors(
-                now, start, change, ds, wheelbase, target, normal, self.vehicle.max_steer_rad
-            )
+            max_steer = self.vehicle.max_steer_rad
+            middle = np.minimum(np.maximum(start + _MIDDLE @ change, -max_steer), max_steer)
+            turn = ds * np.tan(middle) / wheelbase
+            yaw_middle = now.yaw_rad + _MIDDLE @ turn
+            along = np.stack([np.cos(yaw_middle), np.sin(yaw_middle)], axis=1)
+            position = np.array([now.x_m, now.y_m]) + ds * np.cumsum(along, axis=0)
+            error = np.sum(normal * (position - target), axis=1)
+            d_turn = (ds / wheelbase / np.cos(middle) ** 2)[:, None] * _MIDDLE
+            d_yaw = _MIDDLE @ d_turn
+            left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
+            lever = np.where(_UP_TO, ds * (normal @ left.T), 0.0)
+            jacobian = lever @ d_yaw
             hessian = jacobian.T @ jacobian
             hessian.reshape(-1)[:: NODES + 1] += weight**2
             change = change - np.linalg.solve(hessian, jacobian.T @ error + weight**2 * change)
         # The move is per node of path; in time it takes NODE_S at the preview's speed.
         return min(max(start + float(change[0]) * CONTROL_S / NODE_S, -limit), limit)
-
-
-def _lateral_errors(
-    now: BicycleState,
-    start: float,
-    change: F64,
-    ds: float,
-    wheelbase: float,
-    target: F64,
-    normal: F64,
-    max_steer: float,
-) -> tuple[F64, F64]:
-    """Return the lateral errors (NODES,) of the bicycle under a steering sequence, and their
-    derivative (NODES, NODES).
-
-    Each node is one midpoint step of length ``ds``: turn by ``ds tan(steer) / L`` and move along
-    the mean heading.
-    """
-    middle = np.minimum(np.maximum(start + _MIDDLE @ change, -max_steer), max_steer)
-    turn = ds * np.tan(middle) / wheelbase
-    yaw_middle = now.yaw_rad + _MIDDLE @ turn
-    along = np.stack([np.cos(yaw_middle), np.sin(yaw_middle)], axis=1)
-    position = np.array([now.x_m, now.y_m]) + ds * np.cumsum(along, axis=0)
-    error = np.sum(normal * (position - target), axis=1)
-    d_turn = (ds / wheelbase / np.cos(middle) ** 2)[:, None] * _MIDDLE
-    d_yaw = _MIDDLE @ d_turn
-    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
-    lever = np.where(_UP_TO, ds * (normal @ left.T), 0.0)
-    return error, lever @ d_yaw
