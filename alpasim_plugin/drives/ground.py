@@ -65,7 +65,21 @@ class PathFrame:
     """
 
     def __init__(self, path: F64, unit: float) -> None:
-        line = _extended(path, AHEAD * unit, unit)
+        moved = np.concatenate(
+            [[True], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) > 1e-9]
+        )
+        line = path[moved]
+        s = arc_lengths(line[:, :2])
+        ends = []
+        for at, away in ((s[0], min(s[-1], s[0] + 3 * unit)), (s[-1], max(s[0], s[-1] - 3 * unit))):
+            here, there = (
+                np.array([np.interp(x, s, line[:, axis]) for axis in range(3)]) for x in (at, away)
+            )
+            direction = here - there
+            ends.append(
+                here + direction * (AHEAD * unit) / max(float(np.linalg.norm(direction[:2])), 1e-9)
+            )
+        line = np.concatenate([[ends[0]], line, [ends[1]]])
         s = arc_lengths(line[:, :2])
         at = np.linspace(0.0, s[-1], max(2, int(s[-1] / (STEP * unit)) + 1))
         self.line = np.stack([np.interp(at, s, line[:, axis]) for axis in range(3)], axis=1)
@@ -283,20 +297,3 @@ def _hats(s: F64, knots: F64) -> scipy.sparse.csr_matrix:
         (values, (np.concatenate([rows, rows]), np.concatenate([low, low + 1]))),
         shape=(len(s), len(knots)),
     )
-
-
-def _extended(path: F64, by: float, unit: float) -> F64:
-    """Return a path with a straight piece before and beyond it, level with its mean slope near the
-    ends.
-    """
-    moved = np.concatenate([[True], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) > 1e-9])
-    line = path[moved]
-    s = arc_lengths(line[:, :2])
-    ends = []
-    for at, away in ((s[0], min(s[-1], s[0] + 3 * unit)), (s[-1], max(s[0], s[-1] - 3 * unit))):
-        here, there = (
-            np.array([np.interp(x, s, line[:, axis]) for axis in range(3)]) for x in (at, away)
-        )
-        direction = here - there
-        ends.append(here + direction * by / max(float(np.linalg.norm(direction[:2])), 1e-9))
-    return np.concatenate([[ends[0]], line, [ends[1]]])

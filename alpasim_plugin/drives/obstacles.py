@@ -91,7 +91,12 @@ def standing_obstacles(
     sizes[0] = 0
     kept = np.argwhere((sizes >= FEWEST)[label] & occupied)
     at = low + (kept - 0.5) * CELL_M  # the cells' middles: the grid has a border of one cell
-    tops = _tops(places, above, low, grid.shape)[kept[:, 0], kept[:, 1]]
+    tops = np.zeros(grid.shape)
+    cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
+    np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
+    tops = np.where(tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2)))[
+        kept[:, 0], kept[:, 1]
+    ]
     return Standing(tuple(_boxes(at, kept, tops, frame, ground, points)), cleared)
 
 
@@ -130,15 +135,6 @@ def _driven(grid: Bool, low: F64, ego: Trajectory, vehicle: Vehicle) -> Bool:
     begins, ends = -1.0, frame.s[-1] + frame.s[0] + vehicle.box.length_m
     inside = (np.abs(left) < vehicle.box.width_m / 2 + SPARE_M) & (s > begins) & (s < ends)
     return inside.reshape(grid.shape)
-
-
-def _tops(places: F64, above: F64, low: F64, shape: tuple[int, ...]) -> F64:
-    tops = np.zeros(shape)
-    cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
-    np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
-    return np.where(
-        tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2))
-    )  # of cells in gaps: their neighbours'
 
 
 def _boxes(

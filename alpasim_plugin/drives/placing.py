@@ -165,7 +165,14 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
         strip = fit_ground(points.moved(T), front[:, :3, 3] @ T[:3, :3].T + T[:3, 3])
         if strip is None:
             break
-        T = _upright(_normal(strip) @ T[:3, :3], front)
+        own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
+        line, along = strip.frame.line[own], strip.frame.along[own]
+        left = np.column_stack([-along[:, 1], along[:, 0]])
+        xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
+        A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+        slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
+        normal = np.array([-slope[0], -slope[1], 1.0])
+        T = _upright((normal / np.linalg.norm(normal)) @ T[:3, :3], front)
     if strip is None:
         return T, None, "up from the camera, which is taken to stand upright on the mean"
     return T, strip, "up from the ground: the road's mean plane is taken as level"
@@ -184,18 +191,6 @@ def _upright(up: F64, front: F64) -> F64:
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z])
     return T
-
-
-def _normal(strip: GroundStrip) -> F64:
-    """Return the unit normal of the plane nearest to a strip under the path itself."""
-    own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
-    line, along = strip.frame.line[own], strip.frame.along[own]
-    left = np.column_stack([-along[:, 1], along[:, 0]])
-    xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
-    A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
-    slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
-    normal = np.array([-slope[0], -slope[1], 1.0])
-    return normal / np.linalg.norm(normal)
 
 
 def _scale(
@@ -244,27 +239,6 @@ def _rig(
 ) -> tuple[Trajectory, dict[str, F64]]:
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
     front, photographs = poses[drive.front], drive.of(drive.front)
-    mount = _front_mount(front, field)
-    if drive.front_xy_m is not None:
-        mount[:2, 3] = drive.front_xy_m
-    ego = trajectory_from_poses(
-        np.array([int(one.t_us or 0) for one in photographs]),
-        np.array([pose @ inverse(mount) for pose in front]),
-    )
-    mounts = {drive.front: mount}
-    for name in drive.cameras[1:]:
-        times = [int(one.t_us or 0) for one in drive.of(name)]
-        common = [i for i, t in enumerate(times) if ego.t_us[0] <= t <= ego.t_us[-1]]
-        if common:
-            i = common[len(common) // 2]
-            mounts[name] = inverse(interpolate(ego, times[i])) @ poses[name][i]
-    return ego, mounts
-
-
-def _front_mount(front: F64, field: HeightField) -> F64:
-    """Return the front camera's pose on the rig: its mean direction against the road and the way it
-    moves, its median height.
-    """
     centres = front[:, :3, 3]
     step = np.gradient(centres, axis=0)
     moving = np.linalg.norm(step[:, :2], axis=1) > 0.3 * np.median(
@@ -292,7 +266,20 @@ def _front_mount(front: F64, field: HeightField) -> F64:
     mount = np.eye(4)
     mount[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     mount[:3, 3] = AHEAD_OF_AXLE_M, 0.0, float(np.median(centres[:, 2] - height_at(field, centres)))
-    return mount
+    if drive.front_xy_m is not None:
+        mount[:2, 3] = drive.front_xy_m
+    ego = trajectory_from_poses(
+        np.array([int(one.t_us or 0) for one in photographs]),
+        np.array([pose @ inverse(mount) for pose in front]),
+    )
+    mounts = {drive.front: mount}
+    for name in drive.cameras[1:]:
+        times = [int(one.t_us or 0) for one in drive.of(name)]
+        common = [i for i, t in enumerate(times) if ego.t_us[0] <= t <= ego.t_us[-1]]
+        if common:
+            i = common[len(common) // 2]
+            mounts[name] = inverse(interpolate(ego, times[i])) @ poses[name][i]
+    return ego, mounts
 
 
 def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:

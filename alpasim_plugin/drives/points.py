@@ -97,22 +97,21 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     colours = np.array([_colour(views[tracks.view[i]], tracks.at[i]) for i in begins]).reshape(
         -1, 3
     )
-    return Points(found.xyz, colours, _covariance(found.xyz, tracks, cameras)).chosen(good)
+    R, t, K = pose_arrays(cameras)
+    _, slope, _ = residuals(found.xyz, tracks, R, t, K)
+    J = slope @ R[tracks.view]
+    H = np.zeros((tracks.count, 3, 3))
+    np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
+    return Points(
+        found.xyz,
+        colours,
+        np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64),
+    ).chosen(good)
 
 
 def _colour(view: PosedView, at: F64) -> F64:
     row, column = min(int(at[1]), view.camera.height - 1), min(int(at[0]), view.camera.width - 1)
     return view.rgb[row, column] / 255.0
-
-
-def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F64:
-    """Return the covariance ``(P, 3, 3)`` of each point for a usual error in its photographs."""
-    R, t, K = pose_arrays(cameras)
-    _, slope, _ = residuals(xyz, tracks, R, t, K)
-    J = slope @ R[tracks.view]
-    H = np.zeros((tracks.count, 3, 3))
-    np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
-    return np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64)
 
 
 def _matched(views: Sequence[PosedView]) -> Tracks:
@@ -234,7 +233,10 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
     ).astype(np.float32)
     if not len(at):
         return np.zeros((0, 4))
-    normal, away = _plane(pieces[0], camera.T_camera_world)
+    local = transform_points(camera.T_camera_world, pieces[0])
+    middle = local.mean(axis=0)
+    normal = np.linalg.svd(local - middle)[2][2]
+    away = float(normal @ middle)
     rows = [_rows(np.arange(len(at)), i, at.astype(np.float64))]
     for j in (i + k for k in NEXT if i + k < len(shots)):
         other, shown = shots[j]
@@ -288,16 +290,6 @@ def _piece_ahead(strip: GroundStrip, centre: F64, lateral: float) -> F64:
         out += [strip.frame.line[k, :2] + left, strip.frame.line[k, :2] - left]
     xy = np.array(out)
     return np.column_stack([xy, strip.z(xy)])
-
-
-def _plane(piece: F64, T: F64) -> tuple[F64, float]:
-    """Return the plane of a piece of road in a camera's axes: unit normal and distance, ``normal .
-    x = distance``.
-    """
-    local = transform_points(T, piece)
-    middle = local.mean(axis=0)
-    normal = np.linalg.svd(local - middle)[2][2]
-    return normal, float(normal @ middle)
 
 
 def _mask(camera: PinholeCamera, piece: F64) -> U8:
