@@ -115,7 +115,7 @@ def _warp(
         rays: Of the view.
         target: The view.
         depth: By which the frame is carried; road users move with their boxes by the view's own.
-        free_share: See `warp.Lookup`.
+        free_share: See `warp.warp`.
     """
     recorded, placed = image.recorded, target.placed
     project = recorded.K @ inverse(recorded.T_world_camera)[:3]

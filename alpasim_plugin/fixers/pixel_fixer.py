@@ -117,7 +117,8 @@ def fix_frame(
             after = after._replace(output=video.clamp(-1, 1))
     visible = slice(None), slice(height), slice(width)
     output = after.output[visible]
-    levels = _grey_levels(output)
+    levels = (output * HALF).add_(HALF).round_().clamp_(0, 255)
+    levels = levels.nan_to_num_(0.0).to(torch.uint8)
     measured = guard.measures(
         video[visible], levels, given.rgb, given.fixed_before, given.rgb_before
     )
@@ -345,12 +346,6 @@ class PixelFixer(Fixer):
             return fix_frame(self.generator, self.settings, given)
         tensors = {name: part for name, part in given._asdict().items() if part is not None}
         return FixedFrame(*_captured(self.generator, self.settings, sizes_of(tensors))(tensors))
-
-
-def _grey_levels(images: Tensor) -> Tensor:
-    """Convert images in [-1, 1] to bytes, rounded to nearest; what is no number becomes black."""
-    levels = (images * HALF).add_(HALF).round_().clamp_(0, 255)
-    return levels.nan_to_num_(0.0).to(torch.uint8)
 
 
 def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[Frame]]:

@@ -54,23 +54,18 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
         trained = bundle.trained
         note = bundle.note
     else:
-        net = _untrained(settings)
+        if settings.untrained == "refuse":
+            raise InputError(
+                f"{settings.name}, weights.bundle: no weights, and settings.untrained is 'refuse'",
+                weights_to_give("bundle"),
+            )
+        sizes = PixelSizes(**settings.generator.model_dump())
+        net = PixelGenerator.random(sizes, derive_seed("fixer", 0, settings.name))
+        if settings.untrained == "identity":
+            torch.nn.init.zeros_(net.write.weight)
         trained = False
         note = f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[settings.precision])
     operations = CPU if device == "cpu" else TORCH
     captured = operations is TORCH
     return LoadedGenerator(net, operations, trained, note, torch.device(device), captured)
-
-
-def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
-    if settings.untrained == "refuse":
-        raise InputError(
-            f"{settings.name}, weights.bundle: no weights, and settings.untrained is 'refuse'",
-            weights_to_give("bundle"),
-        )
-    sizes = PixelSizes(**settings.generator.model_dump())
-    net = PixelGenerator.random(sizes, derive_seed("fixer", 0, settings.name))
-    if settings.untrained == "identity":
-        torch.nn.init.zeros_(net.write.weight)
-    return net

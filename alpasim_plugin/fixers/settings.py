@@ -241,7 +241,15 @@ def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S
         if os.path.isfile(path)
         else Document({"name": name}, {}, f"the defaults of {name}")
     )
-    return validate(model, _absolute(_override(_without_shipped(document, overrides), overrides)))
+    document = _without_shipped(document, overrides)
+    nested = Document(
+        {"fixer": document.data},
+        {("fixer", *loc): mark for loc, mark in document.marks.items()},
+        document.path,
+    )
+    done = apply_overrides(nested, [f"fixer.{text}" for text in overrides])
+    marks = {loc[1:]: mark for loc, mark in done.marks.items()}
+    return validate(model, _absolute(Document(done.data["fixer"], marks, document.path)))
 
 
 def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
@@ -265,20 +273,6 @@ def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
         return document
     kept = {key: value for key, value in weights.items() if key not in ("bundle", "sha256")}
     return replace(document, data={**document.data, "weights": kept})
-
-
-def _override(document: Document, overrides: Sequence[str]) -> Document:
-    """Apply overrides under the prefix that users write, ``--set fixer.KEY=VALUE``, so that
-    messages show it.
-    """
-    nested = Document(
-        {"fixer": document.data},
-        {("fixer", *loc): mark for loc, mark in document.marks.items()},
-        document.path,
-    )
-    done = apply_overrides(nested, [f"fixer.{text}" for text in overrides])
-    marks = {loc[1:]: mark for loc, mark in done.marks.items()}
-    return Document(done.data["fixer"], marks, document.path)
 
 
 def _absolute(document: Document) -> Document:

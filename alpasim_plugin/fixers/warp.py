@@ -74,36 +74,6 @@ class RecordedImage:
     users: Bool | None = None
 
 
-class Lookup(NamedTuple):
-    """What says where the pixels of a view lie in a recorded frame.
-
-    Attributes:
-        depth: ``(H, W)`` of the view, metres; 0 is infinitely far.
-        K, T_world_camera: Of the view.
-        K_then, T_then_world: Of the recorded camera; the second maps the world to it.
-        depth_then: ``(H', W')`` of the recorded frame.
-        T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
-        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the
-            actor was absent.
-        sizes: ``(A, 3)`` length, width and height, metres.
-        free_share: A recorded surface that is at least this share of a point's distance away does
-            not hide the point. Infinite: only one that agrees with the point does not.
-        seen: Where the view sees the boxes.
-    """
-
-    depth: F32
-    K: F64
-    T_world_camera: F64
-    K_then: F64
-    T_then_world: F64
-    depth_then: F32
-    T_box_world: F64
-    T_then_box: F64
-    sizes: F64
-    free_share: float
-    seen: SeenBoxes
-
-
 def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
@@ -113,7 +83,8 @@ def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf
     Args:
         recorded: The recorded frame.
         target: The view.
-        free_share: See `Lookup`.
+        free_share: A recorded surface that is at least this share of a point's distance away does
+            not hide the point. Infinite: only one that agrees with the point does not.
 
     Returns:
         ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with
@@ -121,23 +92,28 @@ def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf
         depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
         actor that was not there.
     """
-    placed = target.placed
+    shape = target.depth.shape
+    x = np.empty(shape, np.float32)
+    y = np.empty(shape, np.float32)
+    held = np.empty(shape, np.uint8)
+    # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is
+    # linear along a row.
+    project = recorded.K @ inverse(recorded.T_world_camera)[:3]
+    A = project[:, :3] @ (target.T_world_camera[:3, :3] @ np.linalg.inv(target.K))
+    b = project[:, :3] @ target.T_world_camera[:3, 3] + project[:, 3]
+    depth = np.ascontiguousarray(target.depth)
+    depth_then = np.ascontiguousarray(recorded.depth)
+    _coordinates(depth, depth_then, A, b, free_share, x, y, held)
+    names, seen = target.placed
     absent = np.full((4, 4), np.nan)
-    T_then_box = np.array([recorded.actors.get(name, absent) for name in placed.names])
-    lookup = Lookup(
-        target.depth,
-        target.K,
-        target.T_world_camera,
-        recorded.K,
-        inverse(recorded.T_world_camera),
-        recorded.depth,
-        placed.T_box_world,
-        T_then_box.reshape(-1, 4, 4),
-        placed.sizes,
-        free_share,
-        placed.seen,
-    )
-    x, y, held = warp_coordinates(lookup)
+    T_then_box = np.array([recorded.actors.get(name, absent) for name in names])
+    to_then: F64 = project @ T_then_box.reshape(-1, 4, 4)
+    shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
+    for i in reversed(shown):  # of two boxes the first counts
+        part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
+        box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
+        images = x[part], y[part], held[part]
+        _coordinates_on_box(depth[part], depth_then, *box, free_share, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.dstack([rgb, held])
 
@@ -146,8 +122,6 @@ class PlacedBoxes(NamedTuple):
     """The A actors that have a box, as a camera sees them."""
 
     names: list[str]
-    T_box_world: F64  # (A, 4, 4)
-    sizes: F64  # (A, 3) length, width and height, metres
     seen: SeenBoxes
 
 
@@ -167,38 +141,7 @@ def place_boxes(
     lengths = [(box.length_m, box.width_m, box.height_m) for box in present]
     sizes = np.array(lengths).reshape(-1, 3)
     seen = see_boxes(K, T_world_camera, T_box_world, sizes, shape)
-    return PlacedBoxes(names, T_box_world, sizes, seen)
-
-
-def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
-    """Return where every pixel of a view is to be looked up in a recorded frame, and how well that
-    holds.
-
-    Returns:
-        Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`,
-        `INCONSISTENT` or 0 ``(H, W)``.
-    """
-    shape = lookup.depth.shape
-    x = np.empty(shape, np.float32)
-    y = np.empty(shape, np.float32)
-    held = np.empty(shape, np.uint8)
-    # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is
-    # linear along a row.
-    project = lookup.K_then @ lookup.T_then_world[:3]
-    A = project[:, :3] @ (lookup.T_world_camera[:3, :3] @ np.linalg.inv(lookup.K))
-    b = project[:, :3] @ lookup.T_world_camera[:3, 3] + project[:, 3]
-    depth = np.ascontiguousarray(lookup.depth)
-    depth_then = np.ascontiguousarray(lookup.depth_then)
-    _coordinates(depth, depth_then, A, b, lookup.free_share, x, y, held)
-    seen = lookup.seen
-    to_then: F64 = project @ lookup.T_then_box
-    shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
-    for i in reversed(shown):  # of two boxes the first counts
-        part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
-        box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
-        images = x[part], y[part], held[part]
-        _coordinates_on_box(depth[part], depth_then, *box, lookup.free_share, *images)
-    return x, y, held
+    return PlacedBoxes(names, seen)
 
 
 @float_kernel
@@ -307,7 +250,10 @@ def see_boxes(
             np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64)
         )
     T_box_camera = T_box_world @ T_world_camera
-    walls = _walls(sizes)
+    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array(
+        [np.negative(AROUND_M), AROUND_M]
+    )
+    walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
     corners = walls[
         :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
     ]  # (A, 8, 3)
@@ -325,17 +271,6 @@ def see_boxes(
     pixels = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1).astype(np.int64)
     ray = np.ascontiguousarray(T_box_camera[:, :3, :3] @ np.linalg.inv(K))
     return SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
-
-
-def _walls(sizes: F64) -> F64:
-    """Return the least and the greatest coordinates ``(..., 2, 3)`` of what moves with boxes
-    ``(..., 3)``.
-    """
-    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array(
-        [np.negative(AROUND_M), AROUND_M]
-    )
-    walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
-    return np.asarray(walls)
 
 
 @float_kernel
