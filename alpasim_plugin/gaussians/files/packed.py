@@ -250,10 +250,23 @@ def read_spz(path: Path | str) -> GaussianArrays:
         data = _gunzip(path, data)
     header = _parse_header(path, data)
     if header.version == 4:
-        streams = _zstd_streams(path, data, header)
+        table = struct.unpack_from("<I", data, 16)[0]
+        at, streams = table + 16 * data[15], []
+        for i, need in enumerate(header.stream_bytes):
+            if need == 0:
+                streams.append(np.zeros(0, dtype=np.uint8))
+                continue
+            packed = struct.unpack_from("<Q", data, table + 16 * i)[0]
+            plain = unzstd(data[at : at + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN)
+            streams.append(np.frombuffer(plain, dtype=np.uint8))
+            at += packed
         extensions = data[32 : struct.unpack_from("<I", data, 16)[0]]
     else:
-        streams = _plain_streams(data, header)
+        body = np.frombuffer(data, dtype=np.uint8, offset=16)
+        ends = np.cumsum(header.stream_bytes)
+        streams = [
+            body[end - size : end] for size, end in zip(header.stream_bytes, ends, strict=True)
+        ]
         extensions = data[16 + sum(header.stream_bytes) :]
     system = _stated_axes(path, extensions) if header.flags & EXTENDED else SYSTEMS[0]
     notes: tuple[str, ...] = ()
@@ -379,28 +392,6 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
     if flags & ~(ANTIALIASED | EXTENDED):
         raise _failure(path, f"flags {flags:#04x} of unknown meaning", "export it without them")
     return SpzHeader(version, count, degree, bits, flags)
-
-
-def _plain_streams(data: bytes, header: SpzHeader) -> list[NDArray[np.uint8]]:
-    """Cut the unpacked body of versions 2 and 3."""
-    body = np.frombuffer(data, dtype=np.uint8, offset=16)
-    ends = np.cumsum(header.stream_bytes)
-    return [body[end - size : end] for size, end in zip(header.stream_bytes, ends, strict=True)]
-
-
-def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np.uint8]]:
-    """Unpack version 4: a table of (compressed, unpacked) sizes, then one zstd frame a stream."""
-    table = struct.unpack_from("<I", data, 16)[0]
-    at, streams = table + 16 * data[15], []
-    for i, need in enumerate(header.stream_bytes):
-        if need == 0:
-            streams.append(np.zeros(0, dtype=np.uint8))
-            continue
-        packed = struct.unpack_from("<Q", data, table + 16 * i)[0]
-        plain = unzstd(data[at : at + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN)
-        streams.append(np.frombuffer(plain, dtype=np.uint8))
-        at += packed
-    return streams
 
 
 def _failure(path: Path, found: str, do_this: str) -> InputError:

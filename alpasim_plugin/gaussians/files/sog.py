@@ -126,7 +126,9 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     constant = np.array(meta["sh0"]["codebook"])[colour[:, :3]]
     rest = _harmonics(document.get("shN"), plane, n) if document.get("shN") else np.zeros((n, 0, 3))
     sh = np.concatenate([constant[:, None], rest], axis=1)
-    quats = _rotations(plane(meta["quats"]["files"][0], n))
+    pixels = plane(meta["quats"]["files"][0], n)
+    three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
+    quats = with_largest(three, np.clip(pixels[:, 3].astype(np.intp) - 252, 0, 3))
     antialiased = document.get("antialias") or model == "antialiased"
     antialias_px2 = EPS2D_PX2 if antialiased else 0.0
     opacities = colour[:, 3] / 255.0
@@ -159,11 +161,6 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(
         data[28:30], "little"
     ) & 0x3FFF
-
-
-def _rotations(pixels: U8) -> F64:
-    three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
-    return with_largest(three, np.clip(pixels[:, 3].astype(np.intp) - 252, 0, 3))
 
 
 def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -> F64:

@@ -179,21 +179,14 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
         & (q > 1 / FAR_M)
         & (sigma < LARGEST_SPREAD * q)
     )
-    known &= _textured(view)[::STRIDE, ::STRIDE]
+    grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
+    step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
+    known &= (cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)[::STRIDE, ::STRIDE]
     if view.mask is not None:
         known &= view.mask[::STRIDE, ::STRIDE]
     depth = np.zeros(view.rgb.shape[:2], np.float32)
     depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
     return depth
-
-
-def _textured(view: PosedView) -> Bool:
-    """Return where there is something to follow ``(H, W)``: flow carries the motion of an edge far
-    into a smooth sky or wall beside it.
-    """
-    grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
-    step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
-    return cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP
 
 
 def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:

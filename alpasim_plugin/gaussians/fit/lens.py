@@ -72,7 +72,32 @@ class Lens:
         if not self.bends:
             return self.K
         if self.model == "fisheye":
-            return self._fisheye_K()
+            middle = np.array([[[self.K[0, 2] - 0.5, self.K[1, 2] - 0.5]]])
+            ends = [
+                (0.0, middle[0, 0, 1]),
+                (self.width - 1.0, middle[0, 0, 1]),
+                (middle[0, 0, 0], 0.0),
+                (middle[0, 0, 0], self.height - 1.0),
+            ]
+            seen = cv2.fisheye.undistortPoints(
+                np.array([ends]), self.K - _FROM_CORNER, self.distortion
+            )[0]  # tangents
+            most = np.tan(FISHEYE_HALF_VIEW_RAD)
+            sides = np.minimum(np.where(np.isfinite(seen), np.abs(seen), most), most)
+            half = np.array(
+                [
+                    min(self.K[0, 2], self.width - self.K[0, 2]),
+                    min(self.K[1, 2], self.height - self.K[1, 2]),
+                ]
+            )
+            focal = float(
+                max(
+                    half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1])
+                )
+            )
+            return np.array(
+                [[focal, 0.0, self.K[0, 2]], [0.0, focal, self.K[1, 2]], [0.0, 0.0, 1.0]]
+            )
         whole, _ = cv2.getOptimalNewCameraMatrix(
             self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0
         )
@@ -101,33 +126,6 @@ class Lens:
             height=height,
             K=np.diag([width / self.width, height / self.height, 1.0]) @ self.K,
         )
-
-    def _fisheye_K(self) -> F64:
-        """Return a pinhole with the lens's middle whose sides look at most `FISHEYE_HALF_VIEW_RAD`
-        apart and stay in the photograph.
-        """
-        middle = np.array([[[self.K[0, 2] - 0.5, self.K[1, 2] - 0.5]]])
-        ends = [
-            (0.0, middle[0, 0, 1]),
-            (self.width - 1.0, middle[0, 0, 1]),
-            (middle[0, 0, 0], 0.0),
-            (middle[0, 0, 0], self.height - 1.0),
-        ]
-        seen = cv2.fisheye.undistortPoints(
-            np.array([ends]), self.K - _FROM_CORNER, self.distortion
-        )[0]  # tangents
-        most = np.tan(FISHEYE_HALF_VIEW_RAD)
-        sides = np.minimum(np.where(np.isfinite(seen), np.abs(seen), most), most)
-        half = np.array(
-            [
-                min(self.K[0, 2], self.width - self.K[0, 2]),
-                min(self.K[1, 2], self.height - self.K[1, 2]),
-            ]
-        )
-        focal = float(
-            max(half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1]))
-        )
-        return np.array([[focal, 0.0, self.K[0, 2]], [0.0, focal, self.K[1, 2]], [0.0, 0.0, 1.0]])
 
 
 PATCH_PX = 7

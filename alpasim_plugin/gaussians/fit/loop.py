@@ -183,10 +183,21 @@ class SplatFit:
         for name in self.model.params:
             if not math.isfinite(numbers.get(name, 0.0)):
                 self._stop(target, f"a gradient of {name} that is not finite")
-        self.adam.update(self.model.params, self._rates())
+        rates = {
+            "means": recipe.lr_means_at(self.step) * self.extent_m,
+            "log_scales": recipe.lr_scales,
+            "quaternions": recipe.lr_quaternions,
+            "logit_opacities": recipe.lr_opacities,
+            "sh_dc": recipe.lr_colour,
+            "sh_rest": recipe.lr_colour / 20,
+        }
+        self.adam.update(self.model.params, rates)
         self.exposure.update(recipe.lr_exposure)
         self.step += 1
-        self._control_density()
+        if recipe.densifies_after(self.step):
+            rng = stream(self.scene_id, recipe.seed, "fit.split", self.step)
+            densify(self.model, self.adam, self.gradients, recipe, self.extent_m, rng)
+            self.gradients = ScreenGradients(len(self.model), self.device)
         psnr = min(CAP_DB, decibels(max(numbers["mse"], 1e-30), peak=1.0))
         return {"loss": numbers["loss"], "psnr_db": psnr, "gaussians": len(self.model)}
 
@@ -208,7 +219,14 @@ class SplatFit:
         )
         lit = out.rgb * self.exposure.gain(target.index)
         rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
-        loss = _loss(rgb, out, target, recipe)
+        # (1 - w) L1 + w (1 - SSIM) (Kerbl et al. 2023, Eq. 7), the opacity that stands before the
+        # sky, and the error of depth.
+        w = recipe.ssim_weight
+        loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
+        if target.sky is not None:
+            loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
+        if target.depth is not None:
+            loss = loss + recipe.depth_weight * _depth_error(out, *target.depth)
         seen, weight = true_rows(out.on_screen)
         shown = out.index[seen]
         if recipe.needle_weight > 0:
@@ -284,23 +302,6 @@ class SplatFit:
         chosen = int(rng.permutation(len(self.targets))[i])
         return (self.coarse if begins else self.targets)[chosen]
 
-    def _rates(self) -> dict[str, float]:
-        r = self.recipe
-        return {
-            "means": r.lr_means_at(self.step) * self.extent_m,
-            "log_scales": r.lr_scales,
-            "quaternions": r.lr_quaternions,
-            "logit_opacities": r.lr_opacities,
-            "sh_dc": r.lr_colour,
-            "sh_rest": r.lr_colour / 20,
-        }
-
-    def _control_density(self) -> None:
-        if self.recipe.densifies_after(self.step):
-            rng = stream(self.scene_id, self.recipe.seed, "fit.split", self.step)
-            densify(self.model, self.adam, self.gradients, self.recipe, self.extent_m, rng)
-            self.gradients = ScreenGradients(len(self.model), self.device)
-
     def _target(self, index: int, view: PosedView) -> _Target:
         camera, device = view.camera, self.device
         T = camera.T_camera_world.copy()
@@ -330,19 +331,6 @@ class SplatFit:
             f"view {target.name!r}, update {self.step}: {found}",
             "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update",
         )
-
-
-def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe) -> Tensor:
-    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), the opacity that stands
-    before the sky, and the error of depth.
-    """
-    w = recipe.ssim_weight
-    loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
-    if target.sky is not None:
-        loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
-    if target.depth is not None:
-        loss = loss + recipe.depth_weight * _depth_error(out, *target.depth)
-    return loss
 
 
 def _depth_error(out: GradientOutput, pixels: Tensor, depth: Tensor) -> Tensor:

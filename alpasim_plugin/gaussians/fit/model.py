@@ -108,8 +108,9 @@ class SplatModel:
             if name in poses:
                 present[i], T[i] = True, poses[name]
                 T[i, :3, 3] -= self.origin
+                w, x, y, z = quat_from_matrix(T[i, :3, :3])
                 quat[i], harmonics[i] = (
-                    _left_product(quat_from_matrix(T[i, :3, :3])),
+                    np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]),
                     _harmonics(T[i, :3, :3].tobytes(), size),
                 )
         tensors = (
@@ -181,14 +182,6 @@ class SplatModel:
             )
             out.append(cloud)
         return out[0], dict(zip(self.actors, out[1:], strict=True))
-
-
-def _left_product(q: F64) -> F64:
-    """Return the matrix ``(4, 4)`` whose product with a wxyz quaternion is the Hamilton product q
-    times it.
-    """
-    w, x, y, z = q
-    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 @lru_cache(maxsize=100_000)
@@ -360,7 +353,15 @@ def densify(
     rows = torch.cat([old, clones, splits, splits])
     _take(model, adam, rows, len(old))
     halves = slice(len(old) + len(clones), len(rows))
-    _scatter(model, halves, rng)
+    p = model.params
+    draw = upload(rng.standard_normal(p["means"][halves].shape, dtype=np.float32), model.device)
+    w, x, y, z = torch.nn.functional.normalize(p["quaternions"][halves], dim=1).unbind(1)
+    along = draw * p["log_scales"][halves].exp()
+    # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).
+    u = torch.stack([x, y, z], dim=1)
+    turned = along + 2 * torch.linalg.cross(u, torch.linalg.cross(u, along) + w[:, None] * along)
+    p["means"][halves] += turned
+    p["log_scales"][halves] -= math.log(SPLIT_SHRINK)
     size, logits = size[rows], logits[rows]
     size[halves] -= math.log(SPLIT_SHRINK)
     faint = logits < math.log(recipe.prune_opacity / (1 - recipe.prune_opacity))
@@ -375,16 +376,3 @@ def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
     rows = rows.to(model.device)
     model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
     adam.take(rows, old)
-
-
-def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
-    """Draw new centres from the Gaussians of a part, and shrink them."""
-    p = model.params
-    draw = upload(rng.standard_normal(p["means"][part].shape, dtype=np.float32), model.device)
-    w, x, y, z = torch.nn.functional.normalize(p["quaternions"][part], dim=1).unbind(1)
-    along = draw * p["log_scales"][part].exp()
-    # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).
-    u = torch.stack([x, y, z], dim=1)
-    turned = along + 2 * torch.linalg.cross(u, torch.linalg.cross(u, along) + w[:, None] * along)
-    p["means"][part] += turned
-    p["log_scales"][part] -= math.log(SPLIT_SHRINK)

@@ -158,7 +158,11 @@ def read_posed_photographs(
             what was found.
     """
     path = folder / FILE
-    document, frames = _frames(path)
+    document = read_json_object(
+        path, do_this=f"give a folder with images and their {FILE} (docs/renderers.md)"
+    )
+    listed = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
+    frames = [{**document, **frame} for frame in listed]
     meant = document.get("axes", axes)
     if not isinstance(meant, str) or meant not in AXES:
         raise InputError(
@@ -239,15 +243,6 @@ def resized(view: PosedView, width: int) -> PosedView:
         np.asarray(rgb, dtype=np.uint8),
         view.name,
     )
-
-
-def _frames(path: Path) -> tuple[JsonObject, list[JsonObject]]:
-    """Return the document, and its frames with what it says for all of them."""
-    document = read_json_object(
-        path, do_this=f"give a folder with images and their {FILE} (docs/renderers.md)"
-    )
-    frames = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
-    return document, [{**document, **frame} for frame in frames]
 
 
 def _photograph(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> PosedPhotograph:

@@ -24,7 +24,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.reading.images import read_image
-from alpasim_plugin.core.types import F32, F64
+from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -122,7 +122,31 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
     total, weight = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
     for view in views:
         if view.sky is not None:
-            _add(view, total, weight)
+            assert view.sky is not None
+            rows, columns = np.nonzero(
+                cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+            )
+            camera = view.camera
+            local = np.stack(
+                [
+                    (columns + 0.5 - camera.cx) / camera.fx,
+                    (rows + 0.5 - camera.cy) / camera.fy,
+                    np.ones(len(rows)),
+                ],
+                axis=1,
+            )
+            x, y, z = (local @ camera.T_camera_world[:3, :3]).T
+            column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
+            row = (
+                np.rint(
+                    (HIGH_RAD - np.arctan2(z, np.hypot(x, y)))
+                    * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
+                )
+                .astype(np.int64)
+                .clip(0, HEIGHT - 1)
+            )
+            np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
+            np.add.at(weight, (row, column), 1.0)
     if not weight.any():
         return None
     return Sky(
@@ -131,34 +155,6 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
             (weight > 0).astype(np.float32),
         )
     )
-
-
-def _add(view: PosedView, total: F64, weight: F64) -> None:
-    """Add a view's sky pixels to their directions; pixels at the sky's edge, which mix it with what
-    is in front, are left out.
-    """
-    assert view.sky is not None
-    rows, columns = np.nonzero(
-        cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
-    )
-    camera = view.camera
-    local = np.stack(
-        [
-            (columns + 0.5 - camera.cx) / camera.fx,
-            (rows + 0.5 - camera.cy) / camera.fy,
-            np.ones(len(rows)),
-        ],
-        axis=1,
-    )
-    x, y, z = (local @ camera.T_camera_world[:3, :3]).T
-    column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
-    row = (
-        np.rint((HIGH_RAD - np.arctan2(z, np.hypot(x, y))) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)))
-        .astype(np.int64)
-        .clip(0, HEIGHT - 1)
-    )
-    np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
-    np.add.at(weight, (row, column), 1.0)
 
 
 def _spread(image: F32, known: F32) -> F32:

@@ -20,7 +20,7 @@ import scipy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, transform_points
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, Bool, Box
+from alpasim_plugin.core.types import F64, Box
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
@@ -91,7 +91,10 @@ def start_from_depth(
         free = np.ones(len(points), dtype=bool)
         for actor_id in sorted(set(view.actors) & set(boxes)):
             local = transform_points(inverse(view.actors[actor_id]), points)
-            mine = free & _inside(local, boxes[actor_id])
+            box = boxes[actor_id]
+            half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
+            above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
+            mine = free & (np.all(np.abs(local) <= half, axis=1) & above_ground)
             owned[actor_id].append((local[mine], rgb[mine]))
             free &= ~mine
         free[share:] = False  # the sample is in random order: its first part is a sample too
@@ -203,12 +206,6 @@ def _joined(parts: Sequence[_Points]) -> _Points:
     return np.concatenate([none, *(points for points, _ in parts)]), np.concatenate(
         [none, *(rgb for _, rgb in parts)]
     )
-
-
-def _inside(local: F64, box: Box) -> Bool:
-    half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
-    above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
-    return np.all(np.abs(local) <= half, axis=1) & above_ground
 
 
 class Match(NamedTuple):

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
 
@@ -85,42 +85,37 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     ids = np.zeros(0, np.int64)
     count = 0
     for i, grey in enumerate(greys):
-        fresh = _corners(grey, points, views[i].mask)
+        mask = views[i].mask
+        free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
+        for x, y in np.rint(points).astype(int):
+            cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
+        found = cv2.goodFeaturesToTrack(
+            grey, max(CORNERS - len(points), 1), QUALITY, APART_PX, mask=free
+        )
+        fresh = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
         points = np.concatenate([points, fresh])
         ids = np.concatenate([ids, count + np.arange(len(fresh))])
         count += len(fresh)
         rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
         if i + 1 < len(views) and len(points):
-            points, kept = _followed(grey, greys[i + 1], points)
+            b = greys[i + 1]
+            options = {"winSize": WINDOW, "maxLevel": 4}
+            there, ok, _ = cv2.calcOpticalFlowPyrLK(grey, b, points[:, None], None, **options)  # type: ignore[call-overload,unused-ignore]
+            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, grey, there, None, **options)  # type: ignore[call-overload,unused-ignore]
+            off = np.linalg.norm(back[:, 0] - points, axis=1)
+            moved = there[:, 0]
+            inside = (
+                (moved[:, 0] >= 0)
+                & (moved[:, 1] >= 0)
+                & (moved[:, 0] <= grey.shape[1] - 1)
+                & (moved[:, 1] <= grey.shape[0] - 1)
+            )
+            points, kept = moved, (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
             points, ids = points[kept], ids[kept]
     view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
     all_ = Tracks(view[order], point[order], at[order], count)
     return all_.only(np.ones(len(order), dtype=bool))
-
-
-def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
-    free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
-    for x, y in np.rint(taken).astype(int):
-        cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
-    found = cv2.goodFeaturesToTrack(
-        grey, max(CORNERS - len(taken), 1), QUALITY, APART_PX, mask=free
-    )
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
-
-
-def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points[:, None], None, winSize=WINDOW, maxLevel=4)  # type: ignore[call-overload,unused-ignore]
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
-    off = np.linalg.norm(back[:, 0] - points, axis=1)
-    moved = there[:, 0]
-    inside = (
-        (moved[:, 0] >= 0)
-        & (moved[:, 1] >= 0)
-        & (moved[:, 0] <= a.shape[1] - 1)
-        & (moved[:, 1] <= a.shape[0] - 1)
-    )
-    return moved, (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +169,11 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         xyz = xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12))
     e, _, local = residuals(xyz, tracks, R, t, K)
     error = np.where(local[:, 2] > 1e-3, np.linalg.norm(e, axis=1), np.inf)
-    return Placed(xyz, error, _angles(xyz, tracks, centre))
+    first = np.searchsorted(tracks.point, np.arange(tracks.count))
+    last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
+    a, b = (xyz - centre[tracks.view[i]] for i in (first, last))
+    cross = np.linalg.norm(np.cross(a, b), axis=1)
+    return Placed(xyz, error, np.arctan2(cross, np.einsum("ij,ij->i", a, b)))
 
 
 def pose_arrays(cameras: Sequence[PinholeCamera]) -> tuple[F64, F64, F64]:
@@ -215,15 +214,6 @@ def huber(e: F64) -> F64:
     error grows.
     """
     return HUBER_PX / np.maximum(np.linalg.norm(e, axis=1), HUBER_PX)
-
-
-def _angles(xyz: F64, tracks: Tracks, centre: F64) -> F64:
-    """Return the angle between the first and the last ray of each point ``(P,)``, radians."""
-    first = np.searchsorted(tracks.point, np.arange(tracks.count))
-    last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
-    a, b = (xyz - centre[tracks.view[i]] for i in (first, last))
-    cross = np.linalg.norm(np.cross(a, b), axis=1)
-    return np.arctan2(cross, np.einsum("ij,ij->i", a, b))
 
 
 class Adjusted(NamedTuple):
@@ -291,7 +281,18 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     view, point = tracks.view, tracks.point
     views, points = len(R), len(xyz)
     error, slope, local = residuals(xyz, tracks, R, t, K)
-    by_pose = np.concatenate([-slope @ _cross(local), slope], axis=2)  # (M, 2, 6)
+    x, y, z = local.T
+    o = np.zeros_like(x)
+    by_pose = np.concatenate(
+        [
+            -slope
+            @ np.stack(
+                [np.stack([o, -z, y], 1), np.stack([z, o, -x], 1), np.stack([-y, x, o], 1)], axis=1
+            ),
+            slope,
+        ],
+        axis=2,
+    )  # (M, 2, 6)
     by_point = slope @ R[view]  # (M, 2, 3)
     weight = huber(error)[:, None, None]
     weighted_pose = by_pose.transpose(0, 2, 1) * weight
@@ -302,7 +303,9 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     pull_points = summed((weighted_point @ error[..., None])[..., 0], point, points)
     prior = np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3)
     of_poses += np.diag(prior)
-    pull_poses += prior * _from_given(R, t, R0, t0)
+    turn = np.array([cv2.Rodrigues(a @ b.T)[0][:, 0] for a, b in zip(R, R0, strict=True)])
+    moved = t - np.einsum("nij,njk,nk->ni", R, R0.transpose(0, 2, 1), t0)
+    pull_poses += prior * np.concatenate([turn, moved], axis=1)
     between = weighted_pose @ by_point  # (M, 6, 3)
     inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
     H, g = _reduced(of_poses, pull_poses, between, inverse, pull_points, view, point)
@@ -325,23 +328,3 @@ def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> 
         H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += U[i]
     g = ga.ravel() - blocks @ (middle @ gb.ravel())
     return H, g
-
-
-def _cross(a: F64) -> F64:
-    """Return the matrices ``(N, 3, 3)`` that multiply vectors ``(N, 3)`` crosswise from the
-    left.
-    """
-    x, y, z = a.T
-    o = np.zeros_like(x)
-    return np.stack(
-        [np.stack([o, -z, y], 1), np.stack([z, o, -x], 1), np.stack([-y, x, o], 1)], axis=1
-    )
-
-
-def _from_given(R: F64, t: F64, R0: F64, t0: F64) -> F64:
-    """Return how far poses are from the given ones ``(V, 6)``: the turn as a rotation vector, and
-    the shift, in the camera's frame.
-    """
-    turn = np.array([cv2.Rodrigues(a @ b.T)[0][:, 0] for a, b in zip(R, R0, strict=True)])
-    moved = t - np.einsum("nij,njk,nk->ni", R, R0.transpose(0, 2, 1), t0)
-    return np.concatenate([turn, moved], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Scenario
+from alpasim_plugin.core.types import F32, F64, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
@@ -50,29 +50,6 @@ class PosedView:
         return self.name.rpartition("-")[0]
 
 
-def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeCamera:
-    """Return a rig's camera at a pose with at most as many pixels as an image of 16:9 with ``width``
-    pixels across has, its view unchanged.
-    """
-    scale = min(1.0, width / np.sqrt(spec.width * spec.height * 16 / 9))
-    w, h = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
-    K = spec.K.copy()
-    K[0] *= w / spec.width
-    K[1] *= h / spec.height
-    return PinholeCamera.from_pose(w, h, K, T_world_camera)
-
-
-def view_times(scenario: Scenario, count: int) -> list[int]:
-    """Return at most ``count`` times spread evenly over the log, both ends included: actors move
-    while the ego stands.
-    """
-    log = scenario.ego_log.t_us
-    return [
-        int(t)
-        for t in np.unique(np.linspace(log[0], log[-1], max(1, count)).round().astype(np.int64))
-    ]
-
-
 def logged_views(
     scenario: Scenario,
     scene: SceneGraph,
@@ -100,13 +77,19 @@ def logged_views(
     shift = np.eye(4)
     shift[1, 3] = lateral_m
     views = []
-    for t_us in view_times(scenario, count // max(1, len(scenario.cameras))):
-        T_world_rig, actors = (
-            interpolate(scenario.ego_log, t_us) @ shift,
-            log_actors(scenario, t_us),
-        )
+    log = scenario.ego_log.t_us
+    instants = max(1, count // max(1, len(scenario.cameras)))
+    times = np.unique(np.linspace(log[0], log[-1], instants).round().astype(np.int64))
+    for t_us in times.tolist():
+        T_world_rig = interpolate(scenario.ego_log, t_us) @ shift
+        actors = log_actors(scenario, t_us)
         for spec in scenario.cameras:
-            camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, width)
+            scale = min(1.0, width / np.sqrt(spec.width * spec.height * 16 / 9))
+            w, h = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
+            K = spec.K.copy()
+            K[0] *= w / spec.width
+            K[1] *= h / spec.height
+            camera = PinholeCamera.from_pose(w, h, K, T_world_rig @ spec.T_rig_camera)
             name = f"{spec.name}-{t_us}"
             view = seen_from(camera, scene, actors, name, threads, float(spec.K[0, 0]))
             views.append(replace(view, t_us=t_us))

@@ -92,7 +92,14 @@ def rasterize_prepared(
     records = np.empty(room * RECORD, np.float32)
     ids = np.empty(room, np.int64)
     workers = threads if room > WORTH_THREADS else 1
-    count = project_parts(workers, parts, view, records, ids)
+    cursor = np.zeros(len(parts) + 1, np.int64)
+
+    def project() -> None:
+        for number, part in enumerate(parts):
+            project_part(cursor, number, *part, view, records, ids)
+
+    run_on_threads(workers, project)
+    count = int(cursor[0])
 
     order = depth_order(records[Z : count * RECORD : RECORD], ids[:count])
     tiles = list_per_tile(order, records, camera, threads)
@@ -105,32 +112,6 @@ def rasterize_prepared(
         "pairs": len(tiles.lists),
     }
     return RasterOutput(rgb, alpha, depth, stats)
-
-
-def project_parts(
-    workers: int,
-    parts: Sequence[Part],
-    view: F32,
-    records: F32,
-    ids: I64,
-) -> int:
-    """Project prepared parts on several threads, and return how many records were written.
-
-    Args:
-        workers: Threads.
-        parts: What `project_part` takes of each part, from its means to its pose.
-        view: The camera, see `camera_numbers`.
-        records: float32 output, RECORD per splat.
-        ids: int64 output, one per splat.
-    """
-    cursor = np.zeros(len(parts) + 1, np.int64)
-
-    def project() -> None:
-        for number, part in enumerate(parts):
-            project_part(cursor, number, *part, view, records, ids)
-
-    run_on_threads(workers, project)
-    return int(cursor[0])
 
 
 def depth_order(depths: F32, ids: I64) -> I64:

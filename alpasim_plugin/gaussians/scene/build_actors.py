@@ -83,7 +83,19 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
     if actor.appearance is not None:
         cloud = read_ply(Path(actor.appearance))
         largest = cloud.scales.max(axis=1, keepdims=True, initial=0.0)
-        _check_size(actor, np.maximum(np.abs(cloud.means), largest))
+        reach = np.maximum(np.abs(cloud.means), largest)
+        if not len(reach):
+            raise InputError(
+                f"{actor.appearance}: no Gaussians", "give a file that shows the actor"
+            )
+        box = actor.box
+        half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + OUTSIDE_M
+        if (reach > half).any(axis=1).mean() > SPILL:
+            own = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
+            raise InputError(
+                f"{actor.appearance}: Gaussians of {own} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
+                "give the actor this size_m, in a file whose origin is the middle of the box",
+            )
         parts = GaussianCloud.concatenate([cloud, _shadow(actor.box, actor.label)])
         return SceneNode(actor.actor_id, "actor", (Level(0.0, parts),))
     rng = stream(scenario.scene_id, scenario.seed, f"scene/actor/{actor.actor_id}")
@@ -101,22 +113,6 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
     return SceneNode(actor.actor_id, "actor", tuple(levels), usual_cell_m=usual_cell_m)
 
 
-def _check_size(actor: Actor, reach: F64) -> None:
-    """Refuse an appearance of which more than `SPILL` lies outside of the actor's box, which is what
-    others hit.
-    """
-    if not len(reach):
-        raise InputError(f"{actor.appearance}: no Gaussians", "give a file that shows the actor")
-    box = actor.box
-    half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + OUTSIDE_M
-    if (reach > half).any(axis=1).mean() > SPILL:
-        own = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
-        raise InputError(
-            f"{actor.appearance}: Gaussians of {own} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
-            "give the actor this size_m, in a file whose origin is the middle of the box",
-        )
-
-
 def _shadow(box: Box, label: str) -> GaussianCloud:
     """Place a soft contact shadow on the ground below."""
     wheels = label in ("car", "truck", "bus")
@@ -125,24 +121,6 @@ def _shadow(box: Box, label: str) -> GaussianCloud:
     means = np.column_stack([x, np.zeros(n), np.full(n, 0.03 - box.height_m / 2)])
     scales = (0.5 * box.length_m / n, 0.42 * box.width_m, 0.01)
     return cloud_of(means, IDENTITY, scales, (0.05, 0.05, 0.05), 0.75 if wheels else 0.45)
-
-
-def _lofted(box: Box, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
-    """Cover a loft with Gaussians and add wheels, lights and plates."""
-    corners, rgb, gloss = loft.quads(body, GLASS_RGB)
-    scale = np.array([box.length_m, box.width_m, box.height_m])
-    quads = corners * scale - np.array([0.0, 0.0, box.height_m / 2])
-    cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
-    # Light from above: roofs bright, flanks in between, undersides dark.
-    shade = (0.80 + 0.24 * normals[:, 2])[owner][:, None, None]
-    sh = ((cloud.sh * C0 + 0.5) * shade - 0.5) / C0
-    cloud = replace(cloud, sh=sh.astype(np.float32))
-    parts = [
-        with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB),
-        _wheels(box, loft, cell_m),
-        _lights(box, loft, cell_m),
-    ]
-    return GaussianCloud.concatenate(parts)
 
 
 def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -229,7 +207,21 @@ def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> Gaus
         kind = "hatch" if draw[1] < 0.4 else "sedan"
         if box.height_m > 1.65:
             kind = "van" if box.height_m > 1.95 else "suv"
-    return _lofted(box, noise, cell_m, STATIONS[kind], _drawn(colours, draw[0]))
+    loft = STATIONS[kind]
+    corners, rgb, gloss = loft.quads(_drawn(colours, draw[0]), GLASS_RGB)
+    scale = np.array([box.length_m, box.width_m, box.height_m])
+    quads = corners * scale - np.array([0.0, 0.0, box.height_m / 2])
+    cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
+    # Light from above: roofs bright, flanks in between, undersides dark.
+    shade = (0.80 + 0.24 * normals[:, 2])[owner][:, None, None]
+    sh = ((cloud.sh * C0 + 0.5) * shade - 0.5) / C0
+    cloud = replace(cloud, sh=sh.astype(np.float32))
+    parts = [
+        with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB),
+        _wheels(box, loft, cell_m),
+        _lights(box, loft, cell_m),
+    ]
+    return GaussianCloud.concatenate(parts)
 
 
 def _drawn(colours: F64, draw: float) -> F64:
@@ -316,18 +308,14 @@ def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     length, width, height = box.length_m, box.width_m, box.height_m
     if max(length, width) < 1.0:
         n = 8 if cell_m < 0.3 else 4
-        z = (np.arange(n) + 0.5) / n
-        radius = 0.30 * min(length, width) * (1.05 - 0.8 * z)
-        rgb = np.where(((z > 0.4) & (z < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
-        means = np.column_stack([np.zeros(n), np.zeros(n), (z - 0.5) * height])
+        up = (np.arange(n) + 0.5) / n
+        radius = 0.30 * min(length, width) * (1.05 - 0.8 * up)
+        rgb = np.where(((up > 0.4) & (up < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
+        means = np.column_stack([np.zeros(n), np.zeros(n), (up - 0.5) * height])
         return cloud_of(
             means, IDENTITY, np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb
         )
-    return _crate(length / 2, width / 2, height / 2, noise, cell_m)
-
-
-def _crate(x: float, y: float, z: float, noise: F64, cell_m: float) -> GaussianCloud:
-    """Return a striped box of half sizes x, y, z."""
+    x, y, z = length / 2, width / 2, height / 2
     faces, colours = [], []
     for turn in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         middle = np.array([*turn, 0]) * [x, y, 0]

@@ -304,38 +304,33 @@ def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
     """Return the ground's nodes: fine tiles along the path, coarse ones around, and the markings'
     strokes.
     """
-    fine_tiles = _corridor(site)
-    fine = paint_ground(site, strokes, FINE_M, _window(site, fine_tiles, FINE_M))
+    # Tiles of the site's raster that come near the path.
+    d = site.path_m
+    n = round(TILE_M / 0.25)
+    h, w = -(-d.shape[0] // n), -(-d.shape[1] // n)
+    padded = np.full((h * n, w * n), np.inf, dtype=np.float32)
+    padded[: d.shape[0], : d.shape[1]] = d
+    fine_tiles = padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
+    # The fine tiles in cells of the image.
+    rows, columns = np.flatnonzero(fine_tiles.any(axis=1)), np.flatnonzero(fine_tiles.any(axis=0))
+    n = round(TILE_M / FINE_M)
+    fine = paint_ground(
+        site,
+        strokes,
+        FINE_M,
+        (
+            int(rows[0]) * n,
+            int(columns[0]) * n,
+            int(rows[-1] - rows[0] + 1) * n,
+            int(columns[-1] - columns[0] + 1) * n,
+        ),
+    )
     coarse = paint_ground(site, strokes, COARSE_M, None)
     nodes = _ground_nodes(site, "ground", fine, fine_tiles, TILE_M, (0, 1, 2, 3), keep_inside=True)
     nodes += _ground_nodes(
         site, "far-ground", coarse, fine_tiles, FAR_TILE_M, (0, 1, 2), keep_inside=False
     )
     return nodes + _stroke_nodes(site, strokes) + _surroundings(site)
-
-
-def _corridor(site: Site) -> Bool:
-    """Return ``(Ty, Tx)`` which tiles of the site's raster come near the path."""
-    d = site.path_m
-    n = round(TILE_M / 0.25)
-    h, w = -(-d.shape[0] // n), -(-d.shape[1] // n)
-    padded = np.full((h * n, w * n), np.inf, dtype=np.float32)
-    padded[: d.shape[0], : d.shape[1]] = d
-    return padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
-
-
-def _window(site: Site, tiles: Bool, cell_m: float) -> tuple[int, int, int, int]:
-    """Return (first row, first column, rows, columns) in cells of ``cell_m`` that hold all fine
-    tiles.
-    """
-    rows, columns = np.flatnonzero(tiles.any(axis=1)), np.flatnonzero(tiles.any(axis=0))
-    n = round(TILE_M / cell_m)
-    return (
-        int(rows[0]) * n,
-        int(columns[0]) * n,
-        int(rows[-1] - rows[0] + 1) * n,
-        int(columns[-1] - columns[0] + 1) * n,
-    )
 
 
 def _ground_nodes(

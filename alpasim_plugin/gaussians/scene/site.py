@@ -214,7 +214,13 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
     )
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
-    taken = _taken(scenario, frame, low, shape)
+    mask = np.zeros(shape, dtype=np.uint8)
+    for actor in scenario.actors:
+        radius = 0.5 * np.hypot(actor.box.length_m, actor.box.width_m) + 0.5
+        points = to_pixels(frame.to_ground(actor.track.xyz), low, CELL_M)
+        thickness = max(1, min(round(2 * radius / CELL_M), 60))
+        cv2.polylines(mask, [points], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
+    taken = mask.astype(bool)
     highway = _is_highway(scenario, near)
     owned = _owned_tiles(whole, low, high, section)
     return Site(
@@ -267,17 +273,6 @@ def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
         ]
         rings += [shapely.get_coordinates(shapely.get_exterior_ring(area)) for area in areas]
     return rings
-
-
-def _taken(scenario: Scenario, frame: GroundFrame, low: F64, shape: tuple[int, int]) -> Bool:
-    """Mark where actors are at any time, with a margin of half a metre."""
-    mask = np.zeros(shape, dtype=np.uint8)
-    for actor in scenario.actors:
-        radius = 0.5 * np.hypot(actor.box.length_m, actor.box.width_m) + 0.5
-        points = to_pixels(frame.to_ground(actor.track.xyz), low, CELL_M)
-        thickness = max(1, min(round(2 * radius / CELL_M), 60))
-        cv2.polylines(mask, [points], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
-    return mask.astype(bool)
 
 
 def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
