@@ -286,7 +286,19 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         info: dict[str, Any] = {"t_us": episode.loop.state.ego.t_us, **facts}
         if ended:
             self._over = True
-            info |= {"ended": ended, "metrics": self._finish(episode)}
+            episode.driving.close()
+            episode.recorder.finish(episode.loop.path_end)
+            folder = episode.recorder.folder
+            _, scored = score_log(
+                folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset
+            )
+            info |= {
+                "ended": ended,
+                "metrics": {
+                    name: entry["value"] if entry["valid"] else None
+                    for name, entry in scored["metrics"].items()
+                },
+            }
             cameras = {} if self._camera is None else {self._camera.name: self._camera}
             self._observation = episode.loop.state.observe(cameras)
         return self._seen(), worth, bool(ended) and not timed_out, timed_out, info
@@ -308,23 +320,14 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._episode.folder.cleanup()
         self._episode = None
 
-    def _finish(self, episode: _Episode) -> dict[str, float | None]:
-        """Close the log and return the scores of the whole rollout; None where a metric is not
-        valid.
-        """
-        episode.driving.close()
-        episode.recorder.finish(episode.loop.path_end)
-        folder = episode.recorder.folder
-        _, scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
-        return {
-            name: entry["value"] if entry["valid"] else None
-            for name, entry in scored["metrics"].items()
-        }
-
     def _seen(self) -> dict[str, Any]:
         observation = self.observation
         speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
-        seen = {"speed": speed.astype(np.float32), "route": _route(observation.route_rig)}
+        known = np.isfinite(observation.route_rig).all(axis=1)
+        out = np.zeros((ROUTE_POINTS, 3), np.float32)
+        out[known, :2] = np.clip(observation.route_rig[known, :2], -ROUTE_M, ROUTE_M)
+        out[known, 2] = 1.0
+        seen = {"speed": speed.astype(np.float32), "route": out}
         if self._camera is not None:
             seen["camera"] = np.array(observation.frames[self._camera.name].rgb)
         return seen
@@ -345,14 +348,6 @@ class _Watching(Recorder):
         """Return the instants since the last call."""
         new, self._new = self._new, []
         return new
-
-
-def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:
-    known = np.isfinite(route_rig).all(axis=1)
-    out = np.zeros((ROUTE_POINTS, 3), np.float32)
-    out[known, :2] = np.clip(route_rig[known, :2], -ROUTE_M, ROUTE_M)
-    out[known, 2] = 1.0
-    return out
 
 
 def _check(

@@ -71,7 +71,14 @@ class Scorer:
             EvaluatorError: A metric that is needed has no value.
         """
         window = [*([] if self._before is None else [self._before]), *instants]
-        found = self._score(window)
+        rollout = self._as_log(window)
+        check_rollout(rollout)
+        scene = self._scenario.scene
+        found = {
+            one.name: one
+            for name, evaluator in self._evaluators
+            for one in run_evaluator(name, evaluator, rollout, scene)
+        }
         is_first, self._before = self._before is None, instants[-1]
         lateral_m = float(self._value(found["lateral_distance_m"])[-1])
         share, length_m = self._value(found["progress"]), self._value(found["gt_dist_traveled_m"])
@@ -94,16 +101,6 @@ class Scorer:
                 "choose a scene with a road and a recorded drive that moves",
             )
         return series.value
-
-    def _score(self, window: Sequence[Instant]) -> dict[str, MetricSeries]:
-        rollout = self._as_log(window)
-        check_rollout(rollout)
-        scene = self._scenario.scene
-        return {
-            one.name: one
-            for name, evaluator in self._evaluators
-            for one in run_evaluator(name, evaluator, rollout, scene)
-        }
 
     def _as_log(self, window: Sequence[Instant]) -> RolloutLog:
         """Return the window as a log of its own; it has no plans and no images, which these
