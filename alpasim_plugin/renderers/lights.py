@@ -62,7 +62,19 @@ class SceneLights:
         self.tips = np.zeros((0, 3))
         self.windows: list[Spot] = []
         if self.is_night and scenario.model is None and scenario.background is None:
-            self.tips, self.windows = _roadside(scenario)
+            metres = len(path_of(scenario))
+            last = int(section_of(np.array(metres - 1)))
+            tips = []
+            for section in range(last + 1) if metres > BUILT_WHOLE_M else (None,):
+                site = make_site(scenario, partial(height_at, scenario.ground), section)
+                houses = place_houses(site)
+                posts = lamp_posts(site, houses)
+                tips.append(posts.tip[site.owns(posts.plan)])
+                half_m, places, facing = lit_windows(site, houses)
+                self.windows += [
+                    Spot(*one, half_m, WINDOW_RGB) for one in zip(places, facing, strict=True)
+                ]
+            self.tips = np.concatenate(tips)
         driven = [one for one in scenario.actors if one.label in WITH_LAMPS and not one.is_static]
         self.boxes = {one.actor_id: one.box for one in driven}
         self.ego_front_m = (
@@ -77,7 +89,16 @@ class SceneLights:
         is_surface = np.isfinite(view.distance_m)
         points = view.points[is_surface]
         beam = view.place - _moved(T_world_rig, self.ego_front_m, LAMP_HEIGHT_M)[:3, 3]
-        lux = _beam_lux(points + beam, T_world_rig[:3, :3], view.ground[is_surface])
+        from_lamp = points + beam
+        local = from_lamp @ T_world_rig[:3, :3]
+        ahead = np.maximum(local[:, 0], NEAREST_M)
+        sideways, upwards = local[:, 1] / ahead, local[:, 2] / ahead
+        below = np.exp(-((upwards / BEAM_DEPTH) ** 2))
+        above = np.exp(-np.maximum(upwards - CUT_OFF, 0) / EDGE) + ABOVE_CUT_OFF
+        shape = np.exp(-((sideways / BEAM_WIDTH) ** 2)) * np.minimum(below, above)
+        distance = np.maximum(np.linalg.norm(local, axis=1), 1)
+        aslant = 1 - view.ground[is_surface] * (1 - np.abs(from_lamp[:, 2]) / distance)
+        lux = HEAD_CD * shape * aslant * (local[:, 0] > 0) / distance**2
         for tip in self.tips[np.linalg.norm(self.tips - view.place, axis=1) < SIGHT_M]:
             lux += _street_lux(points + (view.place - tip))
         total[is_surface] = lux
@@ -114,40 +135,10 @@ def _moved(T: F64, ahead_m: float, up_m: float) -> F64:
     return moved
 
 
-def _roadside(scenario: Scenario) -> tuple[F64, list[Spot]]:
-    """Return the street lamps ``(N, 3)`` and the lit windows of a built scene."""
-    metres = len(path_of(scenario))
-    last = int(section_of(np.array(metres - 1)))
-    tips, windows = [], []
-    for section in range(last + 1) if metres > BUILT_WHOLE_M else (None,):
-        site = make_site(scenario, partial(height_at, scenario.ground), section)
-        houses = place_houses(site)
-        posts = lamp_posts(site, houses)
-        tips.append(posts.tip[site.owns(posts.plan)])
-        half_m, places, facing = lit_windows(site, houses)
-        windows += [Spot(*one, half_m, WINDOW_RGB) for one in zip(places, facing, strict=True)]
-    return np.concatenate(tips), windows
-
-
 def _street_lux(from_lamp: F64) -> F64:
     """Return the light of a street lamp at points ``(N, 3)`` relative to it."""
     distance = np.linalg.norm(from_lamp, axis=1)
     return STREET_CD * np.maximum(-from_lamp[:, 2], 0) / np.maximum(distance, 0.1) ** 3
-
-
-def _beam_lux(from_lamp: F64, R_world_rig: F64, ground: F32) -> F64:
-    """Return the light of low beams at points ``(N, 3)`` relative to them; on the ground it falls
-    aslant.
-    """
-    local = from_lamp @ R_world_rig
-    ahead = np.maximum(local[:, 0], NEAREST_M)
-    sideways, upwards = local[:, 1] / ahead, local[:, 2] / ahead
-    below = np.exp(-((upwards / BEAM_DEPTH) ** 2))
-    above = np.exp(-np.maximum(upwards - CUT_OFF, 0) / EDGE) + ABOVE_CUT_OFF
-    shape = np.exp(-((sideways / BEAM_WIDTH) ** 2)) * np.minimum(below, above)
-    distance = np.maximum(np.linalg.norm(local, axis=1), 1)
-    aslant = 1 - ground * (1 - np.abs(from_lamp[:, 2]) / distance)
-    return HEAD_CD * shape * aslant * (local[:, 0] > 0) / distance**2
 
 
 def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:

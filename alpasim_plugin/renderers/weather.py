@@ -154,7 +154,15 @@ class WeatherRenderer(Renderer):
             illumination = (illumination + compressed * LAMP_RGB).astype(np.float32)
         light *= illumination
         if environment.rain:
-            light += self._mirrored(view, spots, T_world_rig[2, 3])
+            flip = np.array([1.0, 1.0, -1.0])
+            below = [
+                replace(one, middle=one.middle * flip + [0, 0, 2 * T_world_rig[2, 3]])
+                for one in spots
+            ]
+            lamps, _ = drawn(below, view)
+            smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
+            share = view.ground * mirrored_share(-view.rays[..., 2])
+            light += share[..., None] * (self.air_rgb + smeared)
         glow = _draw_lamps(light, view, [*self.lights.windows, *spots])
         if self.extinction:
             through = np.exp(-np.float32(self.extinction) * view.distance_m)[..., None]
@@ -162,33 +170,18 @@ class WeatherRenderer(Renderer):
         if self.lights.is_night:
             light += glow
         if environment.time == "low_sun":
-            light += self._veil(view)
+            start = interpolate(self.scenario.ego_log, self.scenario.ego_log.t_us[0])
+            to_sun = start[:3, 0] + np.array([0, 0, SUN_TANGENT])
+            cosine = view.rays @ (to_sun / np.linalg.norm(to_sun)).astype(np.float32)
+            angle_deg = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1)
+            is_seen = np.isinf(view.distance_m) & (angle_deg == 1)
+            share = is_seen.sum() / max(np.sum(angle_deg == 1), 1)
+            light += np.float32(share * VEIL_DEG2) / angle_deg[..., None] ** 2
         for kind, rate in self.falling:
             key = (self.scenario.scene_id, self.seed, f"{kind.name}.{frame.camera}", frame.t_us)
             covered = kind.covered(depth.shape, frame.K, rate, stream(*key))
             light += covered[..., None] * (DAY_AIR_RGB * illumination - light)
         return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
-
-    def _mirrored(self, view: View, spots: Sequence[Spot], ground_m: float) -> F32:
-        """Return what wet ground reflects of the sky and, smeared, of lamps ``(H, W, 3)``."""
-        flip = np.array([1.0, 1.0, -1.0])
-        below = [replace(one, middle=one.middle * flip + [0, 0, 2 * ground_m]) for one in spots]
-        lamps, _ = drawn(below, view)
-        smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
-        share = view.ground * mirrored_share(-view.rays[..., 2])
-        return share[..., None] * (self.air_rgb + smeared)
-
-    def _veil(self, view: View) -> F32:
-        """Return the sun above the drive's first heading and its veil in the lens ``(H, W, 1)``, as
-        much as is not hidden.
-        """
-        start = interpolate(self.scenario.ego_log, self.scenario.ego_log.t_us[0])
-        to_sun = start[:3, 0] + np.array([0, 0, SUN_TANGENT])
-        cosine = view.rays @ (to_sun / np.linalg.norm(to_sun)).astype(np.float32)
-        angle_deg = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1)
-        is_seen = np.isinf(view.distance_m) & (angle_deg == 1)
-        share = is_seen.sum() / max(np.sum(angle_deg == 1), 1)
-        return np.float32(share * VEIL_DEG2) / angle_deg[..., None] ** 2
 
 
 def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:
