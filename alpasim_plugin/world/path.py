@@ -80,7 +80,24 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
     before, after = _leads(p0, yaw0, p1, yaw1)
     q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
     q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
-    turn = _turn(q0, yaw0, q1, yaw1)
+    chord = float(np.hypot(q1[0] - q0[0], q1[1] - q0[1]))
+    n = max(8, int(np.ceil(1.2 * chord / CONNECTOR_STEP_M)))
+    t = np.linspace(0.0, 1.0, n + 1)
+    still = np.zeros(2)
+    directions = [np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (yaw0, yaw1)]
+    least_peak = np.inf
+    for tangent_m in chord * np.linspace(0.8, 2.4, 33):
+        ends = zip((q0[:2], q1[:2]), directions, strict=True)
+        derivatives = [[point, tangent_m * direction, still] for point, direction in ends]
+        curve = scipy.interpolate.BPoly.from_derivatives([0.0, 1.0], derivatives)
+        d, dd = curve(t, 1), curve(t, 2)
+        speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
+        peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
+        if peak < least_peak - 1e-9:
+            best, d_best, least_peak = curve, d, peak
+    yaw = np.unwrap(np.arctan2(d_best[:, 1], d_best[:, 0]))
+    yaw[0], yaw[-1] = yaw0, yaw0 + (yaw1 - yaw0 + np.pi) % (2 * np.pi) - np.pi
+    turn = np.column_stack([best(t), yaw])
     head = _straight(p0, q0, yaw0)[:-1]
     tail = _straight(q1, p1, float(turn[-1, 2]))[1:]
     curve = np.concatenate([head, turn, tail])
@@ -110,27 +127,6 @@ def _straight(p: F64, q: F64, yaw: float) -> F64:
     n = int(np.ceil(float(np.hypot(*(q[:2] - p[:2]))) / CONNECTOR_STEP_M - 1e-6))
     share = np.linspace(0.0, 1.0, n + 1)[:, None]
     return np.column_stack([p[:2] + share * (q[:2] - p[:2]), np.full(n + 1, yaw)])
-
-
-def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
-    chord = float(np.hypot(p1[0] - p0[0], p1[1] - p0[1]))
-    n = max(8, int(np.ceil(1.2 * chord / CONNECTOR_STEP_M)))
-    t = np.linspace(0.0, 1.0, n + 1)
-    still = np.zeros(2)
-    directions = [np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (yaw0, yaw1)]
-    least_peak = np.inf
-    for tangent_m in chord * np.linspace(0.8, 2.4, 33):
-        ends = zip((p0[:2], p1[:2]), directions, strict=True)
-        derivatives = [[point, tangent_m * direction, still] for point, direction in ends]
-        curve = scipy.interpolate.BPoly.from_derivatives([0.0, 1.0], derivatives)
-        d, dd = curve(t, 1), curve(t, 2)
-        speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
-        peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
-        if peak < least_peak - 1e-9:
-            best, d_best, least_peak = curve, d, peak
-    yaw = np.unwrap(np.arctan2(d_best[:, 1], d_best[:, 0]))
-    yaw[0], yaw[-1] = yaw0, yaw0 + (yaw1 - yaw0 + np.pi) % (2 * np.pi) - np.pi
-    return np.column_stack([best(t), yaw])
 
 
 def offset_line(curve: F64, offset_m: npt.ArrayLike) -> F64:

@@ -270,11 +270,6 @@ def _ring(left: F64, right: F64) -> F64:
     return np.concatenate([left, right[::-1], left[:1]])
 
 
-def inner_mark_type(profile: Profile) -> LaneMarkType:
-    """Return the lane marking left of the innermost lane."""
-    return "solid_yellow" if profile.backward == 0 or profile.median_m > 0 else profile.centre_paint
-
-
 def _lane(
     name: str, side: Literal["f", "b"], k: int, lines: dict[str, F64], profile: Profile
 ) -> Lane:
@@ -282,6 +277,8 @@ def _lane(
     direction.
     """
     outermost = k + 1 == (profile.forward if side == "f" else profile.backward)
+    is_divided = profile.backward == 0 or profile.median_m > 0
+    innermost_type = "solid_yellow" if is_divided else profile.centre_paint
     return Lane(
         f"{name}_{side}{k}",
         lines[f"{side}c{k}"],
@@ -289,7 +286,7 @@ def _lane(
         lines[f"{side}{k + 1}"],
         left_neighbour=f"{name}_{side}{k - 1}" if k > 0 else None,
         right_neighbour=None if outermost else f"{name}_{side}{k + 1}",
-        left_mark_type=inner_mark_type(profile) if k == 0 else profile.lane_mark_type,
+        left_mark_type=innermost_type if k == 0 else profile.lane_mark_type,
         right_mark_type=profile.edge_mark_type if outermost else profile.lane_mark_type,
         speed_limit_mps=profile.speed_limit_mps,
     )

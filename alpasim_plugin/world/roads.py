@@ -290,7 +290,17 @@ def build_road(
     for i, element in enumerate(elements):
         name = f"s{i}"
         if isinstance(element, Curve):
-            stretches.append(_grow_curve(draft, name, tip, element))
+            curve = sample_clothoid(
+                tip.pose,
+                element.length_m,
+                element.start_curvature_per_m,
+                element.end_curvature_per_m,
+            )
+            strip = build_strip(draft, name, curve, tip.profile, tip.joint)
+            _append(draft, tip, curve, strip, strip.forward)
+            stretches.append(
+                Stretch(strip.forward, tuple(range(len(strip.forward))), strip.backward)
+            )
         elif isinstance(element, LaneTaper):
             stretches.append(_grow_taper(draft, name, tip, element))
         else:
@@ -301,18 +311,6 @@ def build_road(
             "add a straight after it",
         )
     return Road(draft.finish(), tuple(stretches))
-
-
-def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve) -> Stretch:
-    curve = sample_clothoid(
-        tip.pose,
-        element.length_m,
-        element.start_curvature_per_m,
-        element.end_curvature_per_m,
-    )
-    strip = build_strip(draft, name, curve, tip.profile, tip.joint)
-    _append(draft, tip, curve, strip, strip.forward)
-    return Stretch(strip.forward, tuple(range(len(strip.forward))), strip.backward)
 
 
 def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper) -> Stretch:
