@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import cv2
@@ -17,7 +18,15 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.shutter import Along
-from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, LensModel
+from alpasim_plugin.core.types import (
+    F32,
+    F64,
+    Bool,
+    CameraSpec,
+    Frame,
+    LensModel,
+    RenderRequest,
+)
 
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the image
 # Of one plane: twice the pixels of the lens. Wider ones have more, and smear what is near.
@@ -50,13 +59,14 @@ class Lens:
         width, height: Pixels of the lens.
         K: ``(3, 3)`` the pinhole to render.
         cover: Its width and height.
-        resample: ``(height, width, 2)`` float32 place in the pinhole's image of every pixel; None
+        resample: ``(height, w, 2)`` float32 place in the pinhole's image of every pixel; None
             where the lens is that pinhole.
-        seen: ``(height, width)`` which pixels of the lens this pinhole shows; None: all.
-        weight: ``(height, width)`` float32, share of this pinhole among those that cover the lens;
-            None: all of it.
+        seen: ``(height, w)`` which pixels of the lens this pinhole shows; None: all.
+        weight: ``(height, w)`` float32, share of this pinhole among those that cover the
+            lens; None: all of it.
         T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
         side: Its name among those that cover the lens; empty where it is the only one.
+        first_column: The column of the lens at which its part of the image begins.
     """
 
     width: int
@@ -68,6 +78,7 @@ class Lens:
     weight: F32 | None = None
     T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
     side: str = ""
+    first_column: int = 0
 
     def spec(self, name: str, T_rig_camera: F64, shutter_us: int = 0) -> CameraSpec:
         """Return the covering pinhole of a lens at a mounting, as a camera."""
@@ -76,41 +87,18 @@ class Lens:
             f"{name}.{self.side}" if self.side else name, *self.cover, self.K, T, shutter_us
         )
 
-    def frame(self, covering: Frame) -> Frame:
-        """Return a covering frame as the lens shows it; where the pinhole does not show the lens it
-        is black and opaque; itself where the lens is the pinhole.
-        """
-        if self.resample is None:
+    @property
+    def part(self) -> tuple[slice, slice]:
+        """Return the part of the lens's image that this pinhole shows, rows and columns."""
+        width = self.width if self.resample is None else self.resample.shape[1]
+        return slice(None), slice(self.first_column, self.first_column + width)
+
+    def shown(self, covering: Any) -> Any:
+        """Return `part` of the lens's image, of one or several channels, of a covering one."""
+        place = self.resample
+        if place is None:
             return covering
-        alpha = None if covering.alpha is None else self.plane(covering.alpha, 1.0)
-        references = tuple(self.image(image) for image in covering.references)
-        return replace(
-            covering, rgb=self.image(covering.rgb), alpha=alpha, depth=None, references=references
-        )
-
-    def image(self, covering: U8) -> U8:
-        """Return the lens's image ``(height, width, 3)`` of a covering one; black where that does
-        not show it.
-        """
-        return self._through(covering, 0)
-
-    def plane(self, covering: F32, outside: float) -> F32:
-        """Return one value a pixel ``(height, width)``, ``outside`` where the pinhole does not show
-        the lens.
-        """
-        return self._through(covering, outside)
-
-    def _through(self, covering: Any, outside: float) -> Any:
-        if self.resample is None:
-            return covering
-        out = _looked_up(covering, self.resample)
-        if self.seen is not None:
-            out[~self.seen] = outside
-        return out
-
-
-def _looked_up(image: Any, place: F32) -> Any:
-    return cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(covering, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 class Rays(NamedTuple):
@@ -154,12 +142,13 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     """Return a camera's lens covered by as few pinholes as show all of it well.
 
     Raises:
-        InputError: See `check_lens`.
+        InputError: Values that make no lens, or a view of more than `WIDEST_OF_CUBE_RAD` from the
+            axis.
     """
     if camera.lens is None:
         return (lens_of(camera),)
-    check_lens(camera)
     rays = rays_of(camera)
+    _require_cover(camera, rays)
     if rays.widest_rad <= WIDEST_OF_ONE_RAD:
         return (_covered(camera, rays, rays.seen, ""),)
     turns = _panels(rays)
@@ -168,14 +157,20 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     ahead = np.stack([rays.ray @ turn[:, 2] for turn in turns.values()])
     behind_most = np.maximum(ahead - ahead.max(axis=0) + BLEND, 0) * rays.seen
     weights = behind_most / np.maximum(behind_most.sum(axis=0), 1e-12)
-    return tuple(
-        replace(
-            _covered(camera, rays, weight > 0, side, turn),
-            weight=weight.astype(np.float32).reshape(camera.height, camera.width),
-        )
-        for (side, turn), weight in zip(turns.items(), weights, strict=True)
-        if weight.any()
-    )
+    sides = []
+    for (side, turn), weight in zip(turns.items(), weights, strict=True):
+        if weight.any():
+            whole = _covered(camera, rays, weight > 0, side, turn)
+            assert whole.resample is not None, "a pinhole that covers a lens"
+            share = weight.astype(np.float32).reshape(camera.height, camera.width)
+            own = np.flatnonzero(share.any(axis=0))
+            first, end = int(own[0]), int(own[-1]) + 1
+            place, share = (
+                np.ascontiguousarray(part[:, first:end]) for part in (whole.resample, share)
+            )
+            part = replace(whole, first_column=first, resample=place, seen=None, weight=share)
+            sides.append(part)
+    return tuple(sides)
 
 
 def _panels(rays: Rays) -> dict[str, F64]:
@@ -192,33 +187,64 @@ def _panels(rays: Rays) -> dict[str, F64]:
     }
 
 
-def joined(sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
-    """Return the frame of a lens from those of its pinholes, in order."""
+def part_of(request: RenderRequest, side: Lens, share: F32 | None = None) -> RenderRequest:
+    """Return the request of one pinhole of a request's lens, exposed as ``share`` says where the
+    lens's shutter rolls.
+    """
+    camera, exposure = request.camera, request.exposure
+    if exposure is not None and share is not None:
+        exposure = replace(exposure, share=share)
+    return replace(
+        request,
+        camera=side.spec(camera.name, camera.T_rig_camera, camera.shutter_us),
+        T_world_camera=request.T_world_camera @ side.T_lens_pinhole,
+        ahead=[part_of(later, side, share) for later in request.ahead],
+        exposure=exposure,
+    )
+
+
+def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
+    """Return the frame of a camera's lens, with its references, from those of its pinholes, in
+    order; where the lens sees nothing it is black and opaque.
+    """
     first = frames[0]
-    if len(sides) == 1:
-        return sides[0].frame(first)
-    shape = sides[0].height, sides[0].width
-    rgb, alpha = np.full((*shape, 3), 0.5, np.float32), np.zeros(shape, np.float32)
-    outside = np.ones(shape, np.float32)
-    for lens, frame in zip(sides, frames, strict=True):
-        assert lens.weight is not None, "one of several pinholes"
-        assert lens.resample is not None, "one of several pinholes"
-        columns = np.flatnonzero(lens.weight.any(axis=0))
-        part = slice(None), slice(int(columns[0]), int(columns[-1]) + 1)
-        place, weight = lens.resample[part], lens.weight[part]
-        outside[part] -= weight
-        rgb[part] += weight[..., None] * _looked_up(frame.rgb, place)
-        if frame.alpha is not None:
-            alpha[part] += weight * _looked_up(frame.alpha, place)
+    if sides[0].resample is None:
+        return first
     events = dict.fromkeys(event for frame in frames for event in frame.events)
+    blank = np.zeros((1, 1, 4), np.uint8)
+    references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
+    alphas = [frame.alpha for frame in frames]
     return replace(
         first,
-        rgb=rgb.astype(np.uint8),
-        alpha=None if first.alpha is None else alpha + outside,
+        camera=camera,
+        rgb=joined_image(sides, [frame.rgb for frame in frames]),
+        alpha=None if first.alpha is None else joined_image(sides, alphas, 1),
         depth=None,
-        references=(),
+        references=tuple(joined_image(sides, images) for images in references),
         events=tuple(events),
+        on_device=None,
     )
+
+
+def joined_image(sides: Sequence[Lens], images: Sequence[Any], outside: int = 0) -> Any:
+    """Return the lens's image ``(height, width, ...)`` of those of its pinholes; ``outside`` where
+    the lens sees nothing.
+    """
+    if len(sides) == 1:
+        out = sides[0].shown(images[0])
+        if sides[0].seen is not None:
+            out[~sides[0].seen] = outside
+        return out
+    shape = sides[0].height, sides[0].width
+    out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
+    shown = np.zeros(shape, np.float32)
+    for lens, image in zip(sides, images, strict=True):
+        assert lens.weight is not None, "one of several pinholes"
+        before, filled = (np.ascontiguousarray(part[lens.part]) for part in (out, shown))
+        out[lens.part] = cv2.blendLinear(before, lens.shown(image), filled, lens.weight)
+        shown[lens.part] += lens.weight
+    out[shown < 0.5] = outside
+    return out
 
 
 def rays_of(camera: CameraSpec) -> Rays:
@@ -346,6 +372,10 @@ def check_lens(camera: CameraSpec) -> None:
             f"camera {camera.name!r}: a {lens.kind} lens that turns back within its image",
             "correct the coefficients, or set max_angle_deg below where it turns",
         )
+    _require_cover(camera, rays)
+
+
+def _require_cover(camera: CameraSpec, rays: Rays) -> None:
     if rays.widest_rad > WIDEST_OF_CUBE_RAD:
         raise InputError(
             f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",

@@ -19,6 +19,7 @@ import numpy as np
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
@@ -53,6 +54,7 @@ class BlockRunner:
         threads: Threads of the map rasteriser.
         on_device: Whether the fixer takes the references and the map of a frame that a device drew
             from there.
+        cover: The pinholes that are rendered of lenses; the fixer sees the lens's image.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -62,6 +64,7 @@ class BlockRunner:
     threads: int | None = None
     references: ReferenceSession | None = None
     on_device: bool = False
+    cover: LensCover = field(default_factory=LensCover)
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def reset_times(self) -> None:
@@ -70,13 +73,25 @@ class BlockRunner:
 
     def render(self, request: RenderRequest) -> ConditionedFrame:
         """Render one frame, warp its references and draw its map."""
+        if request.camera.lens is None:
+            return self._pinhole(request, self.on_device)
+        parts = [self._pinhole(part, False) for part in self.cover.requests(request)]
+        camera = request.camera.name
+        with self._timed("lens"):
+            frame = self.cover.frame(camera, [part.frame for part in parts])
+            image = None
+            if self.scene_map is not None:
+                image = self.cover.image(camera, [part.map for part in parts])
+        return ConditionedFrame(request, frame, image)
+
+    def _pinhole(self, request: RenderRequest, on_device: bool) -> ConditionedFrame:
         frame = self.render_base(request)
         if self.references is not None:
             with self._timed("references"):
-                frame = self.references.added(request, frame, self.on_device)
+                frame = self.references.added(request, frame, on_device)
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
-        device = frame.device if self.on_device else None
+        device = frame.device if on_device else None
         with self._timed("map"):
             image = draw_exposed_map(self.scene_map, request, self.actors, self.threads, device)
         return ConditionedFrame(request, frame, image)
@@ -209,6 +224,7 @@ def fixed_renderer(
     scenario: Scenario,
     threads: int | None = None,
     recorded: Sequence[RecordedFrame] = (),
+    cover: LensCover = LensCover(),
 ) -> Renderer:
     """Return one rollout's renderer whose frames are fixed.
 
@@ -223,6 +239,7 @@ def fixed_renderer(
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
         recorded: Frames of the recorded drive that the base renderer declares.
+        cover: The pinholes that the base renderer draws of the scenario's lenses.
 
     Raises:
         InputError: No installed package has the mode.
@@ -231,7 +248,8 @@ def fixed_renderer(
     references = session_of(settings, scenario, recorded, threads)
     first = complete(make_fixer(), Fixer)
     on_device = first.reads_device
-    runner = BlockRunner(render, scene_map, scenario.actors, threads, references, on_device)
+    drawn = render, scene_map, scenario.actors
+    runner = BlockRunner(*drawn, threads, references, on_device, cover)
     if first.blocks == ONE_BY_ONE:
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)

@@ -19,6 +19,7 @@ from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import FaultOfPart, SimrunError
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.stage import announce
@@ -47,7 +48,7 @@ from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import checked_frames
-from alpasim_plugin.runs.lenses import through_lenses
+from alpasim_plugin.runs.lenses import LensRenderer
 from alpasim_plugin.runs.plan import Cell, RunOptions
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.rollout import run_rollout
@@ -410,21 +411,17 @@ def make_renderer(
     """
     require_kernels()
     spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
-    return through_lenses(
-        scenario, lambda pinholes: _renderer_of_pinholes(spec, pinholes, seed, device, threads)
-    )
-
-
-def _renderer_of_pinholes(
-    spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None
-) -> Renderer:
+    cover = LensCover(scenario.cameras)
+    pinholes = [one for camera in scenario.cameras for one in cover.pinholes(camera)]
+    drawn = replace(scenario, cameras=tuple(pinholes))
     session = {"seed": seed, "device": device, "threads": threads}
-    built: Renderer = build(spec.base, scenario=scenario, **session)
+    built: Renderer = build(spec.base, scenario=drawn, **session)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
 
-    base = in_weather(built, scenario, seed)
+    base = in_weather(built, drawn, seed)
     if spec.fixer is None:
-        return base
+        has_lens = any(camera.lens is not None for camera in scenario.cameras)
+        return LensRenderer(base, cover) if has_lens else base
     from alpasim_plugin.fixers.loop import fixed_renderer
     from alpasim_plugin.fixers.settings import FixerSettings
 
@@ -442,4 +439,5 @@ def _renderer_of_pinholes(
         scenario,
         threads,
         recorded,
+        cover,
     )

@@ -19,7 +19,7 @@ from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverServi
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy, Sessions
 from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
-from alpasim_plugin.alpasim.server.views import read_lens, read_view, straight_of
+from alpasim_plugin.alpasim.server.views import read_sides, read_view, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Plan, SensorSpec
@@ -212,7 +212,7 @@ def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory():
     with pytest.raises(InputError, match="in all"):
         read_view(request(identity, identity, START_US, size=(8192, 4096)))
     with pytest.raises(InputError, match="in all"):
-        read_lens(pinhole(8192, 4096), 8192, 4096)
+        read_sides(pinhole(8192, 4096), 8192, 4096)
     assert read_view(request(identity, identity, START_US, size=(3848, 2168))).width == 3848
 
 

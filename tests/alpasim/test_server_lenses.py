@@ -9,8 +9,9 @@ from numpy.testing import assert_allclose
 
 from alpasim_plugin.alpasim.server import views
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
-from alpasim_plugin.alpasim.server.views import read_lens, straight_of
+from alpasim_plugin.alpasim.server.views import read_sides, straight_of
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import joined_image
 from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import pinhole
 
@@ -18,17 +19,24 @@ Spec = sensorsim_pb2.CameraSpec
 RAYS = np.array([[0.0, 0.0], [0.3, -0.1], [-0.5, 0.2], [0.6, 0.3], [-0.2, -0.35]])  # x / z, y / z
 
 
-def shown_at(lens, pixel):
-    """Return the direction x/z, y/z that a place of the picture shows, read off the covering
-    pinhole.
+def shown_at(sides, pixel):
+    """Return the direction x/z, y/z that a place of the picture shows, read off the pinhole that
+    shows it.
     """
-    if lens.resample is None:
-        return (pixel - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
     column, row = pixel - 0.5
-    place = cv2.remap(lens.resample, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR)[
-        0, 0
-    ]
-    return (place + 0.5 - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
+    for side in sides:
+        if side.resample is None:
+            return (pixel - side.K[:2, 2]) / side.K[[0, 1], [0, 1]]
+        within = np.float32([[column - side.first_column]]), np.float32([[row]])
+        if (
+            side.weight is not None
+            and cv2.remap(side.weight, *within, cv2.INTER_NEAREST)[0, 0] == 0
+        ):
+            continue
+        place = cv2.remap(side.resample, *within, cv2.INTER_LINEAR)[0, 0]
+        ray = side.T_lens_pinhole[:3, :3] @ np.linalg.inv(side.K) @ [*(place + 0.5), 1]
+        return ray[:2] / ray[2]
+    raise AssertionError("no pinhole shows the place")
 
 
 def distorted():
@@ -123,11 +131,11 @@ def by_ftheta(spec):
     ],
 )
 def test_each_direction_is_shown_where_the_lens_puts_it(spec, project):
-    lens = read_lens(spec, 320, 180)
+    sides = read_sides(spec, 320, 180)
     for ray, pixel in zip(RAYS, project(spec), strict=True):
         assert 1 < pixel[0] < 319
         assert 1 < pixel[1] < 179
-        assert_allclose(shown_at(lens, pixel), ray, atol=2e-4)
+        assert_allclose(shown_at(sides, pixel), ray, atol=2e-4)
 
 
 @pytest.mark.parametrize("size", [(320, 180), (640, 360)])
@@ -159,7 +167,7 @@ def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black():
 def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
     spec = fisheye()
     spec.opencv_fisheye_param.max_angle = 0.6
-    lens = read_lens(spec, 320, 180)
+    (lens,) = sides = read_sides(spec, 320, 180)
     width, height = lens.cover
     x, y = np.meshgrid(
         (np.arange(width) + 0.5 - lens.K[0, 2]) / lens.K[0, 0],
@@ -168,10 +176,10 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
     covering = (
         np.stack([128 + 100 * x, 128 + 100 * y, 0 * x], axis=-1).clip(0, 255).astype(np.uint8)
     )
-    image = lens.image(covering)
+    image = joined_image(sides, [covering])
     assert_allclose(image[90, 160, :2].astype(int), 128, atol=1)
     assert image[0, 0].tolist() == [0, 0, 0]
-    assert lens.plane(np.zeros((height, width), np.float32), 1.0)[0, 0] == 1.0
+    assert joined_image(sides, [np.zeros((height, width), np.float32)], 1)[0, 0] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -182,7 +190,7 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
         (lambda s: s.ftheta_param.ClearField("angle_to_pixeldist_poly"), "no polynomial"),
         (lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, -190.0), "does not grow"),
         (
-            lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, 60.0),
+            lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, 75.0),
             "degrees from the axis",
         ),
         (
@@ -196,7 +204,7 @@ def test_intrinsics_that_are_no_lens_are_refused(change, found):
     spec = ftheta(False)
     change(spec)
     with pytest.raises(InputError, match=found):
-        read_lens(spec, 320, 180)
+        read_sides(spec, 320, 180)
 
 
 def test_what_is_kept_of_lenses_has_an_end(monkeypatch):
@@ -208,16 +216,16 @@ def test_what_is_kept_of_lenses_has_an_end(monkeypatch):
         assert straight_of(spec, 320, 180) is straight_of(spec, 320, 180)
         assert few.held <= 8 << 20
     for i in range(200):  # pinholes, which hold no arrays
-        read_lens(pinhole(320 + i, 180), 320 + i, 180)
+        read_sides(pinhole(320 + i, 180), 320 + i, 180)
         assert few.held <= 8 << 20
     assert len(few) < 200
 
 
 def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean():
-    K = read_lens(pinhole(64, 32), 32, 32).K
-    assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
+    (only,) = read_sides(pinhole(64, 32), 32, 32)
+    assert_allclose(only.K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
     spec = ftheta(False)
-    whole, half = read_lens(spec, 320, 180), read_lens(spec, 160, 90)
+    whole, half = read_sides(spec, 320, 180), read_sides(spec, 160, 90)
     assert_allclose(
         shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
     )

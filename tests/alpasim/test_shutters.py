@@ -12,9 +12,9 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
-from alpasim_plugin.alpasim.server.views import camera_of, read_lens, read_view
+from alpasim_plugin.alpasim.server.views import camera_of, read_sides, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
-from alpasim_plugin.core.lens import lens_shares
+from alpasim_plugin.core.lens import lens_of, lens_shares
 from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
@@ -73,12 +73,13 @@ def ask(
 
 
 def exposure(asked):
-    view = read_view(asked)
-    return exposure_of(
-        asked.camera_intrinsics,
-        view,
-        {name: pair[1] for name, pair in view.objects.items()},
-    )
+    view, (side, *_) = read_view(asked), sides_of_request(asked)
+    objects = {name: pair[1] for name, pair in view.objects.items()}
+    return exposure_of(asked.camera_intrinsics, view, side, objects)
+
+
+def sides_of_request(asked):
+    return read_sides(asked.camera_intrinsics, asked.resolution_w, asked.resolution_h)
 
 
 @pytest.mark.parametrize("spec", first_of([ftheta(True), distorted(), fisheye(), ftheta(False)], 2))
@@ -86,7 +87,7 @@ def exposure(asked):
 def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec, shutter_type):
     asked = ask(shutter_type, spec=spec)
     asked.resolution_w, asked.resolution_h = 160, 90
-    found, lens = exposure(asked), read_lens(asked.camera_intrinsics, 160, 90)
+    found, (lens, *_) = exposure(asked), sides_of_request(asked)
     assert lens.resample is not None
     assert found.share.shape == lens.cover[::-1]
     read = cv2.remap(
@@ -94,8 +95,8 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec,
     )
     rows, columns = np.mgrid[:90, :160]
     expected = rows / 89 if shutter_type in (DOWN, UP) else columns / 159
-    expected = 1 - expected if shutter_type in (UP, LEFT) else expected
-    seen = np.ones_like(expected, bool) if lens.seen is None else lens.seen
+    expected = (1 - expected if shutter_type in (UP, LEFT) else expected)[lens.part]
+    seen = np.ones_like(expected, bool) if lens.weight is None else lens.weight > 0
     assert not np.isnan(read[seen]).any()
     assert np.abs(read - expected)[seen].max() < 0.3 / 89
 
@@ -137,13 +138,13 @@ def test_the_map_has_the_shutter_of_the_frame():
     made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE]))
     asked = ask()
     view, entry = read_view(asked), made.scenes.get(asked.scene_id)
-    lens = read_lens(asked.camera_intrinsics, W, H)
+    (lens,) = sides = sides_of_request(asked)
     camera = lens.spec("front", np.eye(4))
     boxes = {name: pair[1] for name, pair in view.objects.items()}
     request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
     drawn, still = (
-        drawn_map(entry, request, lens),
-        drawn_map(entry, replace(request, exposure=None), lens),
+        drawn_map(entry, [request], sides),
+        drawn_map(entry, [replace(request, exposure=None)], sides),
     )
     assert still is not None
     assert (drawn != still).any()
@@ -157,7 +158,7 @@ def test_the_map_has_the_shutter_of_the_frame():
 
 
 def test_what_the_lens_does_not_see_is_exposed_never():
-    lens = read_lens(ftheta(False), 320, 180)
+    lens = lens_of(camera_of(ftheta(False), 320, 180))
     share = lens_shares(camera_of(ftheta(False), 320, 180), lens, "rows", backwards=False)
     sees = ~np.isnan(share)
     used = np.zeros(lens.cover[::-1], bool)

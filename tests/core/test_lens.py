@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, resized, sides_of
@@ -80,11 +80,16 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
         x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
         ray = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(side.K).T
         rgb = colours(ray @ side.T_lens_pinhole[:3, :3].T).round().astype(np.uint8)
-        frames.append(Frame(0, "x", rgb, np.ones((h, w), np.float32)))
-    out, rays = joined(sides, frames), rays_of(spec)
+        held = np.dstack([rgb, np.full((h, w), 255, np.uint8)])
+        frames.append(Frame(0, "x", rgb, np.zeros((h, w), np.float32), references=(held,)))
+    out, rays = joined("lens", sides, frames), rays_of(spec)
     off = np.abs(out.rgb.reshape(-1, 3) - colours(rays.ray)).max(axis=1)
     assert (off[rays.seen] <= 2).mean() > 0.995
     assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()
+    assert_array_equal(out.alpha.ravel() > 0.5, ~rays.seen)
+    (reference,) = out.references
+    assert np.abs(reference[..., :3].astype(int) - out.rgb).max() <= 1
+    assert_allclose(reference[..., 3].ravel(), np.where(rays.seen, 255, 0), atol=1)
     assert len(sides) == (3 if lens.kind == "opencv" else 5)
     assert rays.widest_rad > np.deg2rad(40 if lens.kind == "opencv" else 99)
 

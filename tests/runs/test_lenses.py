@@ -1,4 +1,4 @@
-"""A run sees its cameras through their lenses, whoever renders."""
+"""A run sees its cameras through their lenses, whoever renders and fixes."""
 
 from dataclasses import replace
 
@@ -6,9 +6,12 @@ import numpy as np
 
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.lens import rays_of
+from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest
-from alpasim_plugin.runs.lenses import through_lenses
+from alpasim_plugin.fixers.loop import BlockRunner
+from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
+from alpasim_plugin.runs.lenses import LensRenderer
 
 
 class Directions(Renderer):
@@ -38,14 +41,9 @@ def fisheye(straight_road):
 
 def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
     camera = fisheye(straight_road)
-    scenario = replace(straight_road, cameras=(camera, straight_road.cameras[0]))
-    made = []
-
-    def make(pinholes):
-        made.append(Directions(pinholes))
-        return made[0]
-
-    renderer = through_lenses(scenario, make)
+    cover = LensCover([camera, straight_road.cameras[0]])
+    inner = Directions(straight_road)
+    renderer = LensRenderer(inner, cover)
     T = np.stack([np.eye(4) @ camera.T_rig_camera] * 2)
     exposure = rolling_exposure(camera, {}, {}, 100_000)
     plain = RenderRequest(0, straight_road.cameras[0], T, {})
@@ -56,18 +54,26 @@ def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
     unit = rays.ray / np.linalg.norm(rays.ray, axis=1, keepdims=True)
     off = np.abs(second.rgb.reshape(-1, 3) - (127.5 + 127 * unit @ T[1, :3, :3].T)).max(axis=1)
     assert (off[rays.seen] <= 2).mean() > 0.995
-    names = [camera.name for camera in made[0].scenario.cameras]
+    names = [one.name for one in cover.pinholes(camera)]
     sides = ["fish.ahead", "fish.left", "fish.right", "fish.up", "fish.down"]
-    assert sorted(names) == sorted(["front", *sides])
-    assert {request.camera.name for request in made[0].asked} == set(names)
-    for request in made[0].asked[1:]:
+    assert sorted(names) == sorted(sides)
+    assert [request.camera.name for request in inner.asked] == ["front", *names]
+    for request in inner.asked[1:]:
         share = request.exposure.share
         assert share.shape == (request.camera.height, request.camera.width)
         (later,) = request.ahead
         assert later.camera.name == request.camera.name
-    ahead = made[0].asked[1].exposure
+    ahead = inner.asked[1].exposure
     assert abs(float(np.nanmedian(ahead.share)) - 0.5) < 0.02
 
 
-def test_pinholes_alone_are_rendered_as_they_are(straight_road):
-    assert isinstance(through_lenses(straight_road, Directions), Directions)
+def test_a_fixer_sees_the_image_of_the_lens(straight_road):
+    camera = fisheye(straight_road)
+    scenario = replace(straight_road, cameras=(camera,))
+    cover, inner = LensCover([camera]), Directions(scenario)
+    T = np.stack([np.eye(4) @ camera.T_rig_camera] * 2)
+    runner = BlockRunner(inner.render, prepare_map(scenario.lane_map), (), cover=cover)
+    seen = runner.render(RenderRequest(0, camera, T, {}))
+    assert seen.frame.rgb.shape == seen.map.shape == (150, 200, 3)
+    alone = LensRenderer(inner, cover).render(RenderRequest(0, camera, T, {}))
+    np.testing.assert_array_equal(seen.frame.rgb, alone.rgb)

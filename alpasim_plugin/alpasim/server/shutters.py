@@ -3,7 +3,7 @@ into the pinhole that is rendered.
 
 A rolling shutter exposes the sensor's rows (or columns) one after another, the first at shutter
 start and the last at its end: the row i of H is seen from the pose at i / (H - 1) of the way, as
-NVIDIA's renderers do it. The row is that of the lens, so its pixels lie on a curve in the pinhole
+NVIDIA's renderers do it. The row is that of the lens, so its pixels lie on a curve in a pinhole
 that covers the lens.
 """
 
@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from alpasim_plugin.alpasim.server.lens_cache import lenses
-from alpasim_plugin.alpasim.server.views import View, camera_of, read_lens
-from alpasim_plugin.core.lens import lens_shares
+from alpasim_plugin.alpasim.server.views import View, camera_of
+from alpasim_plugin.core.lens import Lens, lens_shares
 from alpasim_plugin.core.shutter import Along, rolling
 from alpasim_plugin.core.types import F32, F64, Exposure
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -27,20 +27,21 @@ ROLLS: Mapping[int, tuple[Along, bool]] = {
 
 
 def exposure_of(
-    spec: sensorsim_pb2.CameraSpec, view: View, actors: Mapping[str, F64]
+    spec: sensorsim_pb2.CameraSpec, view: View, side: Lens, actors: Mapping[str, F64]
 ) -> Exposure | None:
-    """Return when the pixels of the covering pinhole are exposed; None: all at the shutter's end.
+    """Return when the pixels of a covering pinhole are exposed; None: all at the shutter's end.
 
     Args:
         spec: The request's intrinsics; a shutter of which they say nothing does not roll.
         view: The request.
+        side: The pinhole, one of those of the request's lens.
         actors: Every road user's box pose at shutter end.
     """
     rolls = ROLLS.get(spec.shutter_type)
     if rolls is None or view.start_us == view.t_us:
         return None
-    what = ("shares", view.width, view.height, *rolls)
-    share = lenses.get(spec, what, lambda: _shares(spec, view.width, view.height, *rolls))
+    what = ("shares", view.width, view.height, side.side, *rolls)
+    share = lenses.get(spec, what, lambda: _shares(spec, view, side, *rolls))
     return Exposure(
         share,
         {name: view.objects[name][0] if name in view.objects else T for name, T in actors.items()},
@@ -48,9 +49,8 @@ def exposure_of(
 
 
 def _shares(
-    spec: sensorsim_pb2.CameraSpec, width: int, height: int, along: Along, backwards: bool
+    spec: sensorsim_pb2.CameraSpec, view: View, side: Lens, along: Along, backwards: bool
 ) -> F32:
-    lens = read_lens(spec, width, height)
-    if lens.resample is None:
-        return rolling(width, height, along, backwards)
-    return lens_shares(camera_of(spec, width, height), lens, along, backwards)
+    if side.resample is None:
+        return rolling(view.width, view.height, along, backwards)
+    return lens_shares(camera_of(spec, view.width, view.height), side, along, backwards)

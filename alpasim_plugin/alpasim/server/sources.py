@@ -27,10 +27,10 @@ from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
 from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import View, read_lens, straight_of
+from alpasim_plugin.alpasim.server.views import View, read_sides, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
-from alpasim_plugin.core.lens import Lens
+from alpasim_plugin.core.lens import Lens, joined, joined_image
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
@@ -132,25 +132,34 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     return poses | {track: pair[1] for track, pair in view.objects.items()}
 
 
-def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec) -> RenderRequest:
-    """Return what is to be drawn by the pinhole that covers the request's lens.
+def asked_of(
+    entry: SceneEntry, request: Request, view: View, T_rig_camera: F64, sides: Sequence[Lens]
+) -> list[RenderRequest]:
+    """Return what is to be drawn by each pinhole that covers the request's lens.
 
     Raises:
         InputError: A track that the scene does not have.
     """
-    actors = boxes_at(entry, view)
-    exposure = exposure_of(request.camera_intrinsics, view, actors)
-    return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
+    actors, asked = boxes_at(entry, view), []
+    for side in sides:
+        camera = side.spec(view.camera, T_rig_camera, view.t_us - view.start_us)
+        T = view.T_world_camera @ side.T_lens_pinhole
+        exposure = exposure_of(request.camera_intrinsics, view, side, actors)
+        asked.append(RenderRequest(view.t_us, camera, T, actors, exposure=exposure))
+    return asked
 
 
-def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens, device: Any = None) -> Any:
+def drawn_map(
+    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = None
+) -> Any:
     """Return the semantic map as the lens sees it, of the device that drew its frame; None where
     the fixer takes none.
     """
-    if entry.scene_map is None:
+    scene_map, actors = entry.scene_map, entry.scenario.actors
+    if scene_map is None:
         return None
-    actors = entry.scenario.actors
-    return lens.image(draw_exposed_map(entry.scene_map, asked, actors, device=device))
+    maps = [draw_exposed_map(scene_map, part, actors, device=device) for part in asked]
+    return joined_image(sides, maps)
 
 
 def gated(
@@ -176,7 +185,7 @@ def gated(
         if asked.exposure is not None
         else (asked.T_world_camera[1], asked.actors)
     )
-    beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(mount_of(entry, view)), T)
+    beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(asked.camera.T_rig_camera), T)
     found = contradiction(
         entry.scene_map,
         asked.camera,
@@ -228,17 +237,21 @@ class LocalSource:
         ]
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
-        lens = read_lens(request.camera_intrinsics, view.width, view.height)
+        sides = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
-        camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
-        asked = asked_of(entry, request, view, camera)
-        stays = entry.reads_device and lens.resample is None  # the CPU looks through a lens
-        with left.holding(self._busy):
-            frame = entry.render(asked, stays)
+        asked, frames = asked_of(entry, request, view, mount_of(entry, view), sides), []
+        stays = entry.reads_device and sides[0].resample is None  # the CPU looks through a lens
+        for part in asked:
+            with left.holding(self._busy):
+                frames.append(entry.render(part, stays))
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
-            sdmap = drawn_map(entry, asked, lens, frame.device if stays else None)
-        rendered = Rendered(lens.frame(frame), sdmap)
-        return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view)
+        with left.holding(self._busy):
+            sdmap = drawn_map(entry, asked, sides, frames[0].device if stays else None)
+        rendered = Rendered(joined(view.camera, sides, frames), sdmap)
+        if sdmap is None:
+            return rendered
+        ahead = max(range(len(sides)), key=lambda i: float(sides[i].T_lens_pinhole[2, 2]))
+        return gated(rendered, entry, asked[ahead], frames[ahead].rgb, view)
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.
@@ -350,22 +363,19 @@ class UpstreamSource:
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
             seen = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
-            lens, sized = (
-                read_lens(seen.camera_intrinsics, width, height),
-                replace(view, width=width, height=height),
-            )
-            asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)))
-            sdmap = drawn_map(entry, asked, lens)
+            sides = read_sides(seen.camera_intrinsics, width, height)
+            sized = replace(view, width=width, height=height)
+            asked = asked_of(entry, seen, sized, np.eye(4), sides)
+            sdmap = drawn_map(entry, asked, sides)
             if sdmap is not None:
                 straight = straight_of(seen.camera_intrinsics, width, height)
-                camera = CameraSpec(
-                    view.camera, *straight.size, straight.K, asked.camera.T_rig_camera
-                )
+                mounted = straight.K, mount_of(entry, view)
+                camera = CameraSpec(view.camera, *straight.size, *mounted)
                 shown = straight.image(rgb)
                 rendered = gated(
                     replace(rendered, sdmap=sdmap),
                     entry,
-                    replace(asked, camera=camera),
+                    replace(asked[0], camera=camera, T_world_camera=view.T_world_camera),
                     shown,
                     view,
                 )

@@ -1,8 +1,8 @@
 """What one render request says: where and when a camera looks, and through which lens.
 
-Any lens is rendered by the ideal pinhole that covers it, then resampled (`core.lens`). Where the asked size is not that of the calibration, a pinhole scales per axis; an
-f-theta lens scales its principal point per axis and its polynomial by the mean of both factors, as
-AlpaSim's own overlay does.
+Any lens is rendered by the pinholes that cover it, then resampled (`core.lens`). Where the asked
+size is not that of the calibration, a pinhole scales per axis; an f-theta lens scales its principal
+point per axis and its polynomial by the mean of both factors, as AlpaSim's own overlay does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ import numpy as np
 from alpasim_plugin.alpasim.server.lens_cache import lenses
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.lens import DO_THIS, WIDEST_RAD, Lens, lens_of, place_in_lens, resized
+from alpasim_plugin.core.lens import (
+    DO_THIS,
+    WIDEST_RAD,
+    Lens,
+    lens_of,
+    place_in_lens,
+    resized,
+    sides_of,
+)
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, LensModel
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
@@ -124,8 +132,8 @@ def _digest(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=16).digest()
 
 
-def read_lens(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Lens:
-    """Return the lens of a request.
+def read_sides(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> tuple[Lens, ...]:
+    """Return the lens of a request by the pinholes that cover it.
 
     Args:
         spec: Intrinsics at the calibrated size.
@@ -133,10 +141,10 @@ def read_lens(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Lens:
 
     Raises:
         InputError: No intrinsics, values that make no lens, a windshield model, or a view of more
-            than 80 degrees from the axis.
+            than 110 degrees from the axis.
     """
-    what = ("lens", width, height)
-    return lenses.get(spec, what, lambda: lens_of(camera_of(spec, width, height)))
+    what = ("sides", width, height)
+    return lenses.get(spec, what, lambda: sides_of(camera_of(spec, width, height)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +172,17 @@ class Straight:
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
-    """Return the pinhole for the images ``(height, width)`` of a lens; see `read_lens`."""
+    """Return the pinhole for the images ``(height, width)`` of a lens; see `read_sides`.
+
+    Raises:
+        InputError: Also a view of more than 80 degrees from the axis.
+    """
     what = ("straight", width, height)
     return lenses.get(spec, what, lambda: _straight(spec, width, height))
 
 
 def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
-    lens = read_lens(spec, width, height)
+    lens = lens_of(camera_of(spec, width, height))
     if lens.resample is None:
         return Straight(lens.K, lens.cover, None)
     size = width, max(round(lens.cover[1] * width / lens.cover[0]), 1)
@@ -182,7 +194,7 @@ def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straig
 
 
 def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> CameraSpec:
-    """Return a request's camera at the asked size; see `read_lens`."""
+    """Return a request's camera at the asked size; see `read_sides`."""
     what = f"camera {spec.logical_id!r}"
     if spec.resolution_w == 0 or spec.resolution_h == 0:
         raise InputError(f"{what}: no calibrated resolution", "fill resolution_w and resolution_h")

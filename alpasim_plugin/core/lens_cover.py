@@ -1,0 +1,66 @@
+"""The pinholes that cover the lenses of cameras: what is asked of them, and what a lens shows of
+their frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from alpasim_plugin.core.lens import (
+    check_lens,
+    joined,
+    joined_image,
+    lens_shares,
+    part_of,
+    sides_of,
+)
+from alpasim_plugin.core.types import F32, CameraSpec, Frame, RenderRequest
+
+
+class LensCover:
+    """The lenses of some cameras; a camera without a lens is its own pinhole.
+
+    Args:
+        cameras: Of a scenario.
+
+    Raises:
+        InputError: See `check_lens`.
+    """
+
+    def __init__(self, cameras: Sequence[CameraSpec] = ()) -> None:
+        for camera in cameras:
+            check_lens(camera)
+        self._sides = {
+            camera.name: sides_of(camera) for camera in cameras if camera.lens is not None
+        }
+        self._shares: dict[tuple[str, str], F32] = {}
+
+    def pinholes(self, camera: CameraSpec) -> list[CameraSpec]:
+        """Return the pinholes of a camera."""
+        if camera.lens is None:
+            return [camera]
+        mounted = camera.name, camera.T_rig_camera, camera.shutter_us
+        return [side.spec(*mounted) for side in self._sides[camera.name]]
+
+    def requests(self, request: RenderRequest) -> list[RenderRequest]:
+        """Return the requests of the pinholes of a request's camera."""
+        camera = request.camera
+        if camera.lens is None:
+            return [request]
+        sides = self._sides[camera.name]
+        if request.exposure is None:
+            return [part_of(request, side) for side in sides]
+        for side in sides:
+            key = camera.name, side.side
+            if key not in self._shares:
+                self._shares[key] = lens_shares(camera, side, "rows", backwards=False)
+        return [part_of(request, side, self._shares[camera.name, side.side]) for side in sides]
+
+    def frame(self, camera: str, frames: Sequence[Frame]) -> Frame:
+        """Return a camera's frame of those of its pinholes."""
+        return joined(camera, self._sides[camera], frames) if camera in self._sides else frames[0]
+
+    def image(self, camera: str, images: Sequence[Any]) -> Any:
+        """Return a camera's image of those of its pinholes."""
+        return joined_image(self._sides[camera], images)
