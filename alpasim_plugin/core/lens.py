@@ -220,15 +220,23 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
         rgb=joined_image(sides, [frame.rgb for frame in frames]),
         alpha=None if first.alpha is None else joined_image(sides, alphas, 1),
         depth=None,
-        references=tuple(joined_image(sides, images) for images in references),
+        references=tuple(joined_image(sides, images, holds=True) for images in references),
         events=tuple(events),
         on_device=None,
     )
 
 
-def joined_image(sides: Sequence[Lens], images: Sequence[Any], outside: int = 0) -> Any:
-    """Return the lens's image ``(height, width, ...)`` of those of its pinholes; ``outside`` where
-    the lens sees nothing.
+def joined_image(
+    sides: Sequence[Lens], images: Sequence[Any], outside: int = 0, holds: bool = False
+) -> Any:
+    """Return the lens's image ``(height, width, ...)`` of those of its pinholes.
+
+    Args:
+        sides: The pinholes.
+        images: One of each.
+        outside: The value where the lens sees nothing.
+        holds: Whether the last of four channels says how well a pixel holds; one that does not hold
+            gives way to that of the other pinhole.
     """
     if len(sides) == 1:
         out = sides[0].shown(images[0])
@@ -241,9 +249,11 @@ def joined_image(sides: Sequence[Lens], images: Sequence[Any], outside: int = 0)
     for lens, image in zip(sides, images, strict=True):
         assert lens.weight is not None, "one of several pinholes"
         before, filled = (np.ascontiguousarray(part[lens.part]) for part in (out, shown))
-        out[lens.part] = cv2.blendLinear(before, lens.shown(image), filled, lens.weight)
-        shown[lens.part] += lens.weight
-    out[shown < 0.5] = outside
+        part = lens.shown(image)
+        weight = lens.weight * part[..., 3] if holds else lens.weight
+        out[lens.part] = cv2.blendLinear(before, part, filled, weight)
+        shown[lens.part] += weight
+    out[shown == 0] = outside
     return out
 
 

@@ -64,6 +64,7 @@ class ReferenceIndex:
         T = np.array([frame.T_world_camera for frame in recorded]).reshape(-1, 4, 4)
         self._centres, self._axes = T[:, :3, 3], T[:, :3, 2]
         self._t_us: I64 = np.array([frame.t_us for frame in recorded], dtype=np.int64)
+        self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
 
     def choose(
         self,
@@ -72,11 +73,13 @@ class ReferenceIndex:
         count: int,
         last: Sequence[int] = (),
         past: bool = False,
+        focal_px: float = 1.0,
     ) -> tuple[int, ...]:
         """Return the nearest recorded frames, nearest first.
 
         The distance is that of the cameras' centres, plus `SECOND_M` a second and `TURN_M` a radian
-        between the optical axes.
+        between the optical axes. A frame that shows a surface with a quarter of the view's pixels
+        counts as four times as far.
 
         Args:
             T_world_camera: ``(4, 4)`` of the view.
@@ -84,6 +87,7 @@ class ReferenceIndex:
             count: Frames at most.
             last: What the same camera received for its last frame: these stay a little longer.
             past: Only frames recorded before ``t_us``.
+            focal_px: Of the view.
         """
         if not count or not self.recorded:
             return ()
@@ -91,6 +95,7 @@ class ReferenceIndex:
         turned = np.arccos(np.clip(self._axes @ T_world_camera[:3, 2], -1, 1))
         apart_s = np.abs(self._t_us - t_us) * 1e-6
         distance = moved + TURN_M * turned + SECOND_M * apart_s
+        distance *= np.maximum(focal_px / self._focal_px, 1) ** 2
         distance[list(last)] *= STAY
         usable = (moved <= FARTHEST_M) & (turned < np.pi / 3) & (apart_s <= SPAN_S)
         if past:
@@ -215,7 +220,10 @@ class ReferenceSession:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""
         T_world_camera, camera = request.T_world_camera[1], request.camera.name
         last = self._last.get(camera, ())
-        chosen = self.index.choose(T_world_camera, request.t_us, self.count, last, self.past)
+        focal_px = float(request.camera.K[0, 0])
+        chosen = self.index.choose(
+            T_world_camera, request.t_us, self.count, last, self.past, focal_px
+        )
         if self.hysteresis:
             self._last[camera] = chosen
         at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
