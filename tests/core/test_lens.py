@@ -81,6 +81,8 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
         ray = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(side.K).T
         rgb = colours(ray @ side.T_lens_pinhole[:3, :3].T).round().astype(np.uint8)
         held = np.dstack([rgb, np.full((h, w), 255, np.uint8)])
+        if not frames:  # holds nowhere: its neighbours' references count
+            held[:] = 7, 7, 7, 0
         frames.append(Frame(0, "x", rgb, np.zeros((h, w), np.float32), references=(held,)))
     out, rays = joined("lens", sides, frames), rays_of(spec)
     off = np.abs(out.rgb.reshape(-1, 3) - colours(rays.ray)).max(axis=1)
@@ -88,8 +90,11 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
     assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()
     assert_array_equal(out.alpha.ravel() > 0.5, ~rays.seen)
     (reference,) = out.references
-    assert np.abs(reference[..., :3].astype(int) - out.rgb).max() <= 1
-    assert_allclose(reference[..., 3].ravel(), np.where(rays.seen, 255, 0), atol=1)
+    holds = reference[..., 3] > 0
+    assert np.abs(reference[..., :3].astype(int) - out.rgb)[holds].max() <= 2
+    assert_array_equal(np.unique(reference[..., 3]), [0, 255])
+    assert rays.seen[holds.ravel()].all()
+    assert holds.mean() > 0.2
     assert len(sides) == (3 if lens.kind == "opencv" else 5)
     assert rays.widest_rad > np.deg2rad(40 if lens.kind == "opencv" else 99)
 
