@@ -37,6 +37,8 @@ BLEND = 0.02  # difference of the cosines to two pinholes' axes within which bot
 MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
 CLOSE_PX = 0.05
+# weight of a reference's pixel that does not hold, where 255 is that of one that does
+NOT_HELD = np.float32(1)
 BEYOND_PX = 24  # a lens goes on so far beyond its image's edges, where resampling looks as well
 CHECKED_PX = 192  # across, of the image that a lens is checked with
 TABLE = 4096  # samples of a radius to angle function
@@ -250,7 +252,7 @@ def joined_image(
         assert lens.weight is not None, "one of several pinholes"
         before, filled = (np.ascontiguousarray(part[lens.part]) for part in (out, shown))
         part = lens.shown(image)
-        weight = lens.weight * part[..., 3] if holds else lens.weight
+        weight = lens.weight * (part[..., 3] + NOT_HELD) if holds else lens.weight
         out[lens.part] = cv2.blendLinear(before, part, filled, weight)
         shown[lens.part] += weight
     out[shown == 0] = outside

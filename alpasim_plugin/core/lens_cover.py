@@ -5,12 +5,10 @@ their frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from alpasim_plugin.core.lens import (
     check_lens,
     joined,
-    joined_image,
     lens_shares,
     part_of,
     sides_of,
@@ -24,6 +22,9 @@ class LensCover:
     Args:
         cameras: Of a scenario.
 
+    Attributes:
+        sides: The pinholes of each camera with a lens, by its name.
+
     Raises:
         InputError: See `check_lens`.
     """
@@ -31,7 +32,7 @@ class LensCover:
     def __init__(self, cameras: Sequence[CameraSpec] = ()) -> None:
         for camera in cameras:
             check_lens(camera)
-        self._sides = {
+        self.sides = {
             camera.name: sides_of(camera) for camera in cameras if camera.lens is not None
         }
         self._shares: dict[tuple[str, str], F32] = {}
@@ -41,14 +42,14 @@ class LensCover:
         if camera.lens is None:
             return [camera]
         mounted = camera.name, camera.T_rig_camera, camera.shutter_us
-        return [side.spec(*mounted) for side in self._sides[camera.name]]
+        return [side.spec(*mounted) for side in self.sides[camera.name]]
 
     def requests(self, request: RenderRequest) -> list[RenderRequest]:
         """Return the requests of the pinholes of a request's camera."""
         camera = request.camera
         if camera.lens is None:
             return [request]
-        sides = self._sides[camera.name]
+        sides = self.sides[camera.name]
         if request.exposure is None:
             return [part_of(request, side) for side in sides]
         for side in sides:
@@ -59,8 +60,4 @@ class LensCover:
 
     def frame(self, camera: str, frames: Sequence[Frame]) -> Frame:
         """Return a camera's frame of those of its pinholes."""
-        return joined(camera, self._sides[camera], frames) if camera in self._sides else frames[0]
-
-    def image(self, camera: str, images: Sequence[Any]) -> Any:
-        """Return a camera's image of those of its pinholes."""
-        return joined_image(self._sides[camera], images)
+        return joined(camera, self.sides[camera], frames) if camera in self.sides else frames[0]

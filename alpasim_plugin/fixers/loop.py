@@ -23,6 +23,7 @@ from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
@@ -73,25 +74,25 @@ class BlockRunner:
 
     def render(self, request: RenderRequest) -> ConditionedFrame:
         """Render one frame, warp its references and draw its map."""
+        parts = [self._pinhole(part) for part in self.cover.requests(request)]
         if request.camera.lens is None:
-            return self._pinhole(request, self.on_device)
-        parts = [self._pinhole(part, False) for part in self.cover.requests(request)]
-        camera = request.camera.name
+            return parts[0]
+        sides = self.cover.sides[request.camera.name]
         with self._timed("lens"):
-            frame = self.cover.frame(camera, [part.frame for part in parts])
+            frame = joined(request.camera.name, sides, [part.frame for part in parts])
             image = None
             if self.scene_map is not None:
-                image = self.cover.image(camera, [part.map for part in parts])
+                image = joined_image(sides, [part.map for part in parts])
         return ConditionedFrame(request, frame, image)
 
-    def _pinhole(self, request: RenderRequest, on_device: bool) -> ConditionedFrame:
+    def _pinhole(self, request: RenderRequest) -> ConditionedFrame:
         frame = self.render_base(request)
         if self.references is not None:
             with self._timed("references"):
-                frame = self.references.added(request, frame, on_device)
+                frame = self.references.added(request, frame, self.on_device)
         if self.scene_map is None:
             return ConditionedFrame(request, frame, None)
-        device = frame.device if on_device else None
+        device = frame.device if self.on_device else None
         with self._timed("map"):
             image = draw_exposed_map(self.scene_map, request, self.actors, self.threads, device)
         return ConditionedFrame(request, frame, image)

@@ -90,9 +90,9 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
     assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()
     assert_array_equal(out.alpha.ravel() > 0.5, ~rays.seen)
     (reference,) = out.references
-    holds = reference[..., 3] > 0
-    assert np.abs(reference[..., :3].astype(int) - out.rgb)[holds].max() <= 2
-    assert_array_equal(np.unique(reference[..., 3]), [0, 255])
+    holds = reference[..., 3] > 252
+    assert np.abs(reference[..., :3].astype(int) - out.rgb)[holds].max() <= 3
+    assert (holds == (reference[..., 3] > 0)).mean() > 0.95
     assert rays.seen[holds.ravel()].all()
     assert holds.mean() > 0.2
     assert len(sides) == (3 if lens.kind == "opencv" else 5)

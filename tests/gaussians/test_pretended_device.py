@@ -14,6 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from alpasim_plugin.alpasim.server.caches import SceneEntry
 from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of
+from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.shutter import rolling
 from alpasim_plugin.core.types import (
     OPACITY_MEAN,
@@ -21,6 +22,7 @@ from alpasim_plugin.core.types import (
     CameraSpec,
     Exposure,
     Frame,
+    LensModel,
     RecordedFrame,
     RenderRequest,
     Trajectory,
@@ -33,7 +35,7 @@ from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.renderers.rolling import draw_request
+from alpasim_plugin.renderers.rolling import camera_at, draw_request
 from tests.examples import first_of
 from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
@@ -105,8 +107,13 @@ def test_bands_of_a_rolling_shutter_are_joined_where_they_are_drawn(monkeypatch)
     assert sum(traffic.waits.values()) == 1
 
 
-@pytest.mark.parametrize("capacity", first_of([1 << 16, 10]))
-def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capacity):
+FISHEYE = LensModel("fisheye", (0.01,), max_angle_rad=1.5)
+
+
+@pytest.mark.parametrize(
+    ("capacity", "lens"), [(1 << 16, None), (1 << 16, FISHEYE), *first_of([(10, None)])]
+)
+def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capacity, lens):
     graph, poses = scene()
     spec = camera()
     T = np.linalg.inv(spec.T_camera_world)
@@ -116,11 +123,13 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         RecordedFrame(t, "front", spec.K, T, {}, lambda: (rgb, shown.depth)) for t in range(2)
     ]
     path = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
-    view = CameraSpec("front", spec.width, spec.height, spec.K, T)
+    view = CameraSpec("front", spec.width, spec.height, spec.K, T, lens=lens)
     request = RenderRequest(100_000, view, np.stack([T, T]), {})
 
     def rendered(asked, device="cuda:0"):
-        return graph.render(spec, poses, device=device).surface().frame(asked.t_us, "front")
+        view = camera_at(asked, asked.T_world_camera[1])
+        shown = graph.render(view, poses, device=device).surface()
+        return shown.frame(asked.t_us, asked.camera.name)
 
     def fixed(device):
         references = ReferenceSession(recorded, (), path, 2)
@@ -131,6 +140,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
             (),
             references=references,
             on_device=fixer.reads_device,
+            cover=LensCover([view]),
         )
         for t_us in (0, request.t_us):
             traffic.reset()
@@ -151,6 +161,8 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         if capacity > 10:
             assert traffic.bytes_up < 3_000  # poses, and what is in view of the map
             assert traffic.bytes_down < 3.1 * rgb[..., 0].size + 200
+        if lens is not None:
+            return
         renderer = SimpleNamespace(render_batch=lambda asked: [rendered(*asked)])
         served = SceneEntry(None, None, renderer, ReferenceSession(recorded, (), path, 2), True)
         traffic.reset()

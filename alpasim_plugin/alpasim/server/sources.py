@@ -30,10 +30,11 @@ from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, read_sides, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
-from alpasim_plugin.core.lens import Lens, joined, joined_image
+from alpasim_plugin.core.lens import Lens
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
@@ -240,13 +241,12 @@ class LocalSource:
         sides = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
         asked, frames = asked_of(entry, request, view, mount_of(entry, view), sides), []
-        stays = entry.reads_device and sides[0].resample is None  # the CPU looks through a lens
         for part in asked:
             with left.holding(self._busy):
-                frames.append(entry.render(part, stays))
+                frames.append(entry.render(part, entry.reads_device))
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
         with left.holding(self._busy):
-            sdmap = drawn_map(entry, asked, sides, frames[0].device if stays else None)
+            sdmap = drawn_map(entry, asked, sides, frames[0].device if entry.reads_device else None)
         rendered = Rendered(joined(view.camera, sides, frames), sdmap)
         if sdmap is None:
             return rendered
