@@ -113,12 +113,8 @@ class LearnedNet(nn.Module):
             nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
         )
         self.out = nn.Linear(128, sum(_PARTS))
-        self._init_weights(torch.Generator().manual_seed(seed))
-        self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
-        self.register_buffer("speed_scale", torch.tensor(_SPEED_SCALE), persistent=False)
-
-    def _init_weights(self, random: torch.Generator) -> None:
-        """Initialise as torch does by default, from the given generator; the last layer is zero."""
+        # As torch does by default, from a generator of its own; the last layer is zero.
+        random = torch.Generator().manual_seed(seed)
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
                 bound = float(module.weight[0].numel()) ** -0.5
@@ -128,6 +124,8 @@ class LearnedNet(nn.Module):
         nn.init.normal_(self.word.weight, generator=random)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
+        self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
+        self.register_buffer("speed_scale", torch.tensor(_SPEED_SCALE), persistent=False)
 
     def forward(self, images: Sequence[Tensor], state: Tensor, command: Tensor) -> Prediction:
         """Predict from an image ``(B, 4, H, W)`` of each view, states ``(B, 3)`` and indices of

@@ -176,7 +176,16 @@ class RidgeFilter:
         self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
         _, self._gap, flank = sizes.T
         self._beside = np.maximum(np.rint(flank / 2), 1.0).astype(np.intp)
-        self._seen = _erode_rows(grid.inside, self._gap + flank).astype(np.float32)
+        inside = grid.inside
+        reach = self._gap + flank
+        n = inside.shape[1]
+        any_inside = inside.any(axis=1)
+        first = np.where(any_inside, np.argmax(inside, axis=1), n)
+        last = np.where(any_inside, n - 1 - np.argmax(inside[:, ::-1], axis=1), -1)
+        column = np.arange(n)[None, :]
+        self._seen = (
+            (column >= (first + reach)[:, None]) & (column <= (last - reach)[:, None])
+        ).astype(np.float32)
 
     def response(self, value: U8) -> F32:
         """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the
@@ -306,15 +315,3 @@ def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:
     gap = half + np.maximum(0.15, grid.pixel_m)
     flank = np.maximum(0.3, grid.pixel_m)
     return np.rint(half / CELL_M), np.rint(gap / CELL_M), np.rint(flank / CELL_M)
-
-
-def _erode_rows(inside: Bool, reach: F64) -> Bool:
-    """Return where the whole window of ``reach`` cells to both sides is inside the image; rows of a
-    pinhole view are intervals.
-    """
-    n = inside.shape[1]
-    any_inside = inside.any(axis=1)
-    first = np.where(any_inside, np.argmax(inside, axis=1), n)
-    last = np.where(any_inside, n - 1 - np.argmax(inside[:, ::-1], axis=1), -1)
-    column = np.arange(n)[None, :]
-    return (column >= (first + reach)[:, None]) & (column <= (last - reach)[:, None])

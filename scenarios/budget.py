@@ -18,7 +18,7 @@ from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F64, Environment, Scenario
+from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.world.ground import BUILT_WHOLE_M
 from scenarios.map_lines import lane_edges
 from scenarios.recorded import RecordedLog
@@ -94,7 +94,14 @@ def gaussians_of(scenario: Scenario) -> float:
     # A longer drive is built in sections, of which no more than so much of its path is held.
     held_m = min(driven_m, BUILT_WHOLE_M)
     sides_m = np.minimum(np.ptp(xyz[:, :2], axis=0), held_m) + 2 * REACH_M
-    usual = _gaussians(scenario.environment, held_m, float(np.prod(sides_m)))
+    environment = scenario.environment
+    length = held_m + 40.0
+    trees = environment.trees_per_100m * (0.02 * length + 0.00022 * float(np.prod(sides_m)))
+    height_m = float(np.mean(environment.building_height_m))
+    walls_m2 = environment.buildings * 2 * length * height_m * 2.3
+    spacing = environment.poles_spacing_m
+    poles = 2 * length / spacing if spacing > 0 else 0.0
+    usual = 1500.0 * (length + 100.0) + 760.0 * trees + 22.0 * walls_m2 + 100.0 * poles
     halved = halvings(scenario)
     if not halved:
         return usual
@@ -111,23 +118,6 @@ def gaussians_of(scenario: Scenario) -> float:
 def memory_mb(scenario: Scenario, drawn_pixels: float) -> float:
     """Estimate the most memory that a process takes to show a built scene."""
     return 220.0 + 2e-4 * gaussians_of(scenario) + 3e-5 * drawn_pixels
-
-
-def _gaussians(environment: Environment, driven_m: float, area_m2: float) -> float:
-    """Estimate how many Gaussians a scene takes for usual cameras.
-
-    Args:
-        environment: Surroundings.
-        driven_m: Length of the logged path.
-        area_m2: Area of the rectangle around it, with what is built beside it.
-    """
-    length = driven_m + 40.0
-    trees = environment.trees_per_100m * (0.02 * length + 0.00022 * area_m2)
-    height_m = float(np.mean(environment.building_height_m))
-    walls_m2 = environment.buildings * 2 * length * height_m * 2.3
-    spacing = environment.poles_spacing_m
-    poles = 2 * length / spacing if spacing > 0 else 0.0
-    return 1500.0 * (length + 100.0) + 760.0 * trees + 22.0 * walls_m2 + 100.0 * poles
 
 
 def _check_reach(xyz: F64, where: str) -> None:

@@ -133,25 +133,19 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
         with drawn.at("cameras", "from"):
             cameras = _from_file(path)
         if given.names:
-            cameras = _named(drawn, cameras, given.names)
+            known = {camera.name: camera for camera in cameras}
+            for i, name in enumerate(given.names):
+                if name not in known:
+                    raise drawn.document.error(
+                        ("cameras", "names", i),
+                        f"no camera {name!r} in this calibration",
+                        f"choose from {', '.join(known)}",
+                    )
+            cameras = tuple(known[name] for name in given.names)
     if given.width is not None:
         width = given.width
         cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)
     return tuple(replace(camera, shutter_us=given.shutter_us) for camera in cameras)
-
-
-def _named(
-    drawn: Drawn, cameras: Sequence[CameraSpec], names: Sequence[str]
-) -> tuple[CameraSpec, ...]:
-    known = {camera.name: camera for camera in cameras}
-    for i, name in enumerate(names):
-        if name not in known:
-            raise drawn.document.error(
-                ("cameras", "names", i),
-                f"no camera {name!r} in this calibration",
-                f"choose from {', '.join(known)}",
-            )
-    return tuple(known[name] for name in names)
 
 
 def _from_file(path: Path) -> tuple[CameraSpec, ...]:

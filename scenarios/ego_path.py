@@ -129,7 +129,19 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
         InputError: No such lane there.
     """
     if isinstance(lane, str):
-        return tuple(_follow(road, lane))
+        lanes = road.lane_map.lanes
+        if lane not in lanes:
+            raise InputError(
+                f"lane {lane!r}: the road's lanes are {', '.join(sorted(lanes))}",
+                "choose one of them",
+            )
+        out = [lane]
+        while lanes[out[-1]].successors and len(out) < 100:
+            following = lanes[out[-1]].successors[0]
+            if following in out:
+                break
+            out.append(following)
+        return tuple(out)
     i = ego_path.stretch_at(at_s_m)
     stretch = road.stretches[i]
     ids = []
@@ -163,22 +175,6 @@ def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
         k = before[0]
         out.append((str(part.forward[k]), k))
     return out[::-1]
-
-
-def _follow(road: Road, lane_id: str) -> list[str]:
-    lanes = road.lane_map.lanes
-    if lane_id not in lanes:
-        raise InputError(
-            f"lane {lane_id!r}: the road's lanes are {', '.join(sorted(lanes))}",
-            "choose one of them",
-        )
-    out = [lane_id]
-    while lanes[out[-1]].successors and len(out) < 100:
-        following = lanes[out[-1]].successors[0]
-        if following in out:
-            break
-        out.append(following)
-    return out
 
 
 def grid(end_us: int) -> I64:

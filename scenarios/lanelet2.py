@@ -17,7 +17,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import scipy
@@ -86,7 +85,13 @@ class Osm:
             key = str(element.get("id"))
             if key in of_kind:
                 raise InputError(f"{path}: {element.tag} {key} twice", "give each its own id")
-            of_kind[key] = _item(element)
+            tags = {str(tag.get("k")): str(tag.get("v")) for tag in element.iter("tag")}
+            nodes = [("node", "", str(nd.get("ref"))) for nd in element.iter("nd")]
+            members = [
+                (str(one.get("type")), str(one.get("role")), str(one.get("ref")))
+                for one in element.iter("member")
+            ]
+            of_kind[key] = Item(tags, (*nodes, *members))
             if element.tag == "node":
                 places[key] = {**element.attrib, **of_kind[key].tags}
         self.lanelets = self.relations("lanelet")
@@ -183,16 +188,6 @@ class Osm:
             notes.append(f"origin at latitude {lat:.3f}, longitude {lon:.3f}; x east, y north")
         near(self.path, points)
         return dict(zip(places, points, strict=True)), origin, tuple(notes)
-
-
-def _item(element: Element) -> Item:
-    tags = {str(tag.get("k")): str(tag.get("v")) for tag in element.iter("tag")}
-    nodes = [("node", "", str(nd.get("ref"))) for nd in element.iter("nd")]
-    members = [
-        (str(one.get("type")), str(one.get("role")), str(one.get("ref")))
-        for one in element.iter("member")
-    ]
-    return Item(tags, (*nodes, *members))
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,10 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
             one for one in street.give_way if any(key in lane_map.lanes for key in one.lanes)
         ),
     )
-    driven = _inside_bends(_until(line, goal_m + front_m + 1.0), front_m)
+    keep = line.s <= goal_m + front_m + 1.0
+    driven = _inside_bends(
+        Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep]), front_m
+    )
     duration_us = spec.timing.duration_us
     end_us = round(LONGEST_S * 1e6)
     if duration_us is not None:
@@ -215,11 +218,6 @@ def _around(street: StreetMap, line: Path) -> LaneMap:
             signs=tuple(itertools.compress(beside.signs, _near(line, middles))),
         ),
     )
-
-
-def _until(line: Path, length_m: float) -> Path:
-    keep = line.s <= length_m
-    return Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep])
 
 
 def _inside_bends(line: Path, front_m: float) -> Path:

@@ -112,7 +112,11 @@ def _is_ruled(one: _Drawn, other: _Drawn) -> bool:
     lights = [_before(drawn.lights, s_m) for drawn, s_m in meets]
     first, second = lights
     if first is not None and second is not None:
-        return not _both_open(first, second)
+        cycle_us = sum(lasts_us for _, lasts_us in first.signal.phases)
+        return not any(
+            "red" not in (first.signal.colour_at(t_us), second.signal.colour_at(t_us))
+            for t_us in range(0, cycle_us, 500_000)
+        )
     return sum(gives) == 1 and first is None and second is None
 
 
@@ -120,12 +124,3 @@ def _before(lines: tuple[LightAhead, ...], s_m: float) -> LightAhead | None:
     """Return the last line before a place."""
     found = [line for line in lines if 0.0 <= s_m - line.s_m <= RULED_M]
     return found[-1] if found else None
-
-
-def _both_open(one: LightAhead, other: LightAhead) -> bool:
-    """Return whether two lights are not red at one time."""
-    cycle_us = sum(lasts_us for _, lasts_us in one.signal.phases)
-    return any(
-        "red" not in (one.signal.colour_at(t_us), other.signal.colour_at(t_us))
-        for t_us in range(0, cycle_us, 500_000)
-    )

@@ -124,7 +124,8 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
         incoming, connecting = roads.get(one.incoming), roads.get(one.connecting)
         if incoming is None or connecting is None:
             continue
-        from_start = _starts_at(incoming, one.junction)
+        after = incoming.successor
+        from_start = after is None or (after.kind, after.target) != ("junction", one.junction)
         links = one.lanes
         if not links:
             n_bare += 1
@@ -139,12 +140,6 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
                 key = one.junction, one.connecting, b
                 turns.setdefault(key, []).append((one.incoming, from_start, a))
     return turns, n_bare
-
-
-def _starts_at(road: Road, junction: str) -> bool:
-    """Return whether a road meets a junction with its start, rather than with its end."""
-    after = road.successor
-    return after is None or (after.kind, after.target) != ("junction", junction)
 
 
 def _ahead(

@@ -55,7 +55,10 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
                 top = foot + np.array([0.0, 0.0, max(one.above_m + one.height_m, 2.0)])
                 poles.append(np.concatenate([foot, top]))
             elif one.kind != CROSSWALK and one.height_m > PLATE_M:
-                signs.append(_plate(road, one, T_local_map))
+                heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
+                x, y, z = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0].tolist()
+                pose = se2(x, y, heading, z + one.above_m + one.height_m / 2)
+                signs.append((pose, Box(0.05, one.width_m, one.height_m)))
     return LaneMap(
         {},
         crosswalks=tuple(crosswalks),
@@ -199,11 +202,3 @@ def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float
     heading = float(reference_line(road.records, np.array([s_m]))[0, 2])
     direction = T_local_map[:2, :2] @ np.array([np.cos(heading), np.sin(heading)])
     return float(np.arctan2(direction[1], direction[0])) + (0.0 if along else np.pi)
-
-
-def _plate(road: Road, one: RoadSignal, T_local_map: F64) -> tuple[F64, Box]:
-    """Return the middle of a sign, which faces its traffic, and its size."""
-    heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
-    x, y, z = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0].tolist()
-    pose = se2(x, y, heading, z + one.above_m + one.height_m / 2)
-    return pose, Box(0.05, one.width_m, one.height_m)

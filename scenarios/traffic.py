@@ -70,7 +70,27 @@ def place_actors(
             if isinstance(actor, CrossingActor):
                 late.append((i, actor))
             elif isinstance(actor, IdmActor):
-                followers.append(_follower(placer, actor))
+                path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
+                desired = actor.desired_speed_mps
+                params = {
+                    "desired_speed_mps": max(actor.speed_mps, 1.0) if desired is None else desired,
+                    **actor.model_dump(
+                        include={"headway_s", "min_gap_m", "accel_mps2", "brake_mps2"}
+                    ),
+                }
+                box = box_of(actor)
+                followers.append(
+                    Follower(
+                        actor.id,
+                        actor.label,
+                        path,
+                        s0,
+                        actor.speed_mps,
+                        box,
+                        params,
+                        actor.offset_m,
+                    )
+                )
             else:
                 scripted += _scripted(placer, actor)
     if late:
@@ -244,17 +264,6 @@ def _gap_cars(placer: _Placer) -> list[Actor]:
                 track = standing_track(xyz, heading, placer.t_us, box)
                 out.append(Actor(f"gap{i}-{side}-{n}", "car", box, track, is_static=True))
     return out
-
-
-def _follower(placer: _Placer, actor: IdmActor) -> Follower:
-    path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
-    desired = actor.desired_speed_mps
-    params = {
-        "desired_speed_mps": max(actor.speed_mps, 1.0) if desired is None else desired,
-        **actor.model_dump(include={"headway_s", "min_gap_m", "accel_mps2", "brake_mps2"}),
-    }
-    box = box_of(actor)
-    return Follower(actor.id, actor.label, path, s0, actor.speed_mps, box, params, actor.offset_m)
 
 
 def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Actor:

@@ -23,10 +23,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import (
-    F64,
     Actor,
     CameraSpec,
-    HeightField,
     Scenario,
     Trajectory,
     Vehicle,
@@ -216,13 +214,7 @@ def ground_mesh(scenario: Scenario) -> bytes:
     ]
     low = np.min([p.min(axis=0) for p in points], axis=0) - GROUND_MARGIN_M
     high = np.max([p.max(axis=0) for p in points], axis=0) + GROUND_MARGIN_M
-    return mesh_of(scenario.ground, low, high)
-
-
-def mesh_of(ground: HeightField, low: F64, high: F64) -> bytes:
-    """Return the part of a height field between two corners ``(2,)`` as binary PLY; the step is
-    coarser where the part is large.
-    """
+    ground = scenario.ground
     flat = float(np.ptp(ground.z)) == 0.0
     size = np.maximum(high - low, 1.0)
     step = (

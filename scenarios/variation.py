@@ -77,22 +77,16 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
     written = validate(ScenarioSpec, document)
     scene_id = written.scene_id or _default_id(Path(document.path))
     fixed = tuple(text.partition("=")[0].strip() for text in overrides)
-    document = _varied(document, written, scene_id, fixed)
+    chosen: JsonObject = {}
+    for key, rule in written.variations.items():
+        rng = stream(scene_id, written.seed, f"scenario/variation/{key}")
+        if isinstance(rule, RangeSpec):
+            chosen[key] = float(rng.uniform(rule.low, rule.high))
+        else:
+            chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
+    kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
+    document = apply_overrides(document, kept, origin="variation")
     spec = validate(ScenarioSpec, document)
-    _check_names(document, spec)
-    if spec.seed != AS_WRITTEN:
-        spec = _jitter(spec, scene_id, fixed)
-    return Drawn(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
-
-
-def _default_id(path: Path) -> str:
-    resolved = real(path)
-    if path.suffix in (".yaml", ".yml"):
-        return f"{resolved.parent.name}-{resolved.stem}"
-    return resolved.stem if os.path.isfile(resolved) else resolved.name
-
-
-def _check_names(document: Document, spec: ScenarioSpec) -> None:
     seen: dict[str, int] = {}
     for i, actor in enumerate(spec.actors):
         if actor.id in seen:
@@ -109,23 +103,16 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
             "actors beside a recorded log or a map",
             "remove actors; log.actors and map.vehicles choose the traffic",
         )
+    if spec.seed != AS_WRITTEN:
+        spec = _jitter(spec, scene_id, fixed)
+    return Drawn(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
 
 
-def _varied(
-    document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]
-) -> Document:
-    """Return the document with the variations of this seed written into it, except
-    for keys that an override fixes.
-    """
-    chosen: JsonObject = {}
-    for key, rule in spec.variations.items():
-        rng = stream(scene_id, spec.seed, f"scenario/variation/{key}")
-        if isinstance(rule, RangeSpec):
-            chosen[key] = float(rng.uniform(rule.low, rule.high))
-        else:
-            chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
-    kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
-    return apply_overrides(document, kept, origin="variation")
+def _default_id(path: Path) -> str:
+    resolved = real(path)
+    if path.suffix in (".yaml", ".yml"):
+        return f"{resolved.parent.name}-{resolved.stem}"
+    return resolved.stem if os.path.isfile(resolved) else resolved.name
 
 
 def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:

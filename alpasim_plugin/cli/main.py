@@ -148,7 +148,12 @@ class Verb(TyperCommand):
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         """Parse the words of the verb by its own command."""
         command = load_verb(str(self.name))
-        require_once(command, args)
+        # Of an option that takes one value and stands twice, the last would win.
+        options = [one for one in command.params if isinstance(one, TyperOption)]
+        for option in options:
+            given = [word for word in args if word.partition("=")[0] in option.opts]
+            if len(given) > 1 and not option.multiple and not option.is_flag:
+                raise InputError(f"{given[0]}: given {len(given)} times", "Give it once.")
         return command.make_context(info_name, args, parent, **extra)
 
 
@@ -193,19 +198,6 @@ def load_verb(verb: str) -> Any:
         epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
         target = typer_of({verb: (target, epilog)})
     return click_command(target)
-
-
-def require_once(command: Any, words: list[str]) -> None:
-    """Refuse an option that takes one value and stands twice in a command: the last would win.
-
-    Raises:
-        InputError: One does.
-    """
-    options = [one for one in command.params if isinstance(one, TyperOption)]
-    for option in options:
-        given = [word for word in words if word.partition("=")[0] in option.opts]
-        if len(given) > 1 and not option.multiple and not option.is_flag:
-            raise InputError(f"{given[0]}: given {len(given)} times", "Give it once.")
 
 
 app = typer.Typer(

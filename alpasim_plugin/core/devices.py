@@ -17,17 +17,6 @@ if TYPE_CHECKING:
 WARM_UP = 3  # calls before a function is recorded
 
 
-def check_device_name(name: str) -> str:
-    """Return a device's name.
-
-    Raises:
-        InputError: Neither ``cpu``, ``cuda`` nor ``cuda:N``.
-    """
-    if re.fullmatch(r"cpu|cuda(:[0-9]{1,3})?", name) is None:
-        raise InputError(f"--device {name}: no such device", "Use cpu, cuda or cuda:N")
-    return name
-
-
 def require_device(name: str) -> str:
     """Return a device's full name, ``cpu`` or ``cuda:N``; nothing falls back to another device.
 
@@ -35,7 +24,9 @@ def require_device(name: str) -> str:
         InputError: Neither ``cpu``, ``cuda`` nor ``cuda:N``.
         InfrastructureError: torch sees no such card.
     """
-    if check_device_name(name) == "cpu":
+    if re.fullmatch(r"cpu|cuda(:[0-9]{1,3})?", name) is None:
+        raise InputError(f"--device {name}: no such device", "Use cpu, cuda or cuda:N")
+    if name == "cpu":
         return name
     import torch
 

@@ -89,7 +89,15 @@ def shape_problem(plan: Any, min_rows: int = 1) -> str:
     far_m = float(np.abs(plan.xy).max(initial=0.0))
     if far_m > REACH_M:
         return f"the plan reaches {far_m:.3g} m, farther than the {REACH_M:g} m of the longest road"
-    return _samples_problem(getattr(plan, "samples", ()), n)
+    samples = getattr(plan, "samples", ())
+    if not isinstance(samples, list | tuple):
+        return f"samples is {_a(samples)}, not a tuple of arrays"
+    for sample in samples:
+        if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
+            return f"a sampled alternative is {_a(sample)}, not an array of numbers"
+        if sample.shape != (n, 3) or not (np.abs(sample) <= REACH_M).all():
+            return f"a sampled alternative has shape {sample.shape}, not ({n}, 3), is not finite, or reaches farther than {REACH_M:g} m"
+    return ""
 
 
 def plan_problem(plan: Any, now_us: int) -> str:
@@ -107,17 +115,6 @@ def plan_problem(plan: Any, now_us: int) -> str:
         if (steps <= 0).any()
         else ""
     )
-
-
-def _samples_problem(samples: Any, n: int) -> str:
-    if not isinstance(samples, list | tuple):
-        return f"samples is {_a(samples)}, not a tuple of arrays"
-    for sample in samples:
-        if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
-            return f"a sampled alternative is {_a(sample)}, not an array of numbers"
-        if sample.shape != (n, 3) or not (np.abs(sample) <= REACH_M).all():
-            return f"a sampled alternative has shape {sample.shape}, not ({n}, 3), is not finite, or reaches farther than {REACH_M:g} m"
-    return ""
 
 
 def _a(value: Any) -> str:

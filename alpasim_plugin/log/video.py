@@ -163,7 +163,15 @@ class VideoReader:
                 raise self._refusal(found, "cut it where the size changes")
             yield TimedFrame(image, time, frame.duration or step)
             last = time
-        self._check_end(index + 1, time + 2 * step)
+        # A file that was cut short: fewer frames than it claims, and an end well before that.
+        claimed, length = self.format.frames, self._stream.duration
+        if (
+            claimed
+            and index + 1 < claimed
+            and length
+            and time + 2 * step < (self._stream.start_time or 0) + length
+        ):
+            raise self._refusal(f"it stops after frame {index + 1} of {claimed}")
 
     def _begin(self) -> None:
         if not self._container.streams.video:
@@ -192,19 +200,6 @@ class VideoReader:
             colour=(int(first.colorspace), int(first.color_primaries), int(first.color_trc)),
             left_out=(*tracks, "sound") if self._container.streams.audio else tuple(tracks),
         )
-
-    def _check_end(self, count: int, reached: int) -> None:
-        """Refuse a file that was cut short: fewer frames than it claims, and an end well before the
-        one it claims.
-        """
-        claimed, length = self.format.frames, self._stream.duration
-        if (
-            claimed
-            and count < claimed
-            and length
-            and reached < (self._stream.start_time or 0) + length
-        ):
-            raise self._refusal(f"it stops after frame {count} of {claimed}")
 
     def _all(self) -> Iterator[Any]:
         yield self._first

@@ -54,32 +54,6 @@ SCENES = "scenes"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
 
 
-def write_configs(folder: Path, final: Path, name: str, identity: str) -> None:
-    """Write the three files of one run folder.
-
-    Args:
-        folder: Where to write now.
-        final: The export's own folder when it is done; ``alpasim-reeval`` looks for the scenes
-            below it, by its absolute path.
-        name: The run's name in AlpaSim's tables.
-        identity: What determines the run; equal runs have equal ids.
-    """
-    metadata = {"run_uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, identity)), "run_name": name}
-    wizard = {
-        "services": {
-            "runtime": {"image": "none"}
-        },  # alpasim-reeval needs the key; only its Slurm mode uses the image
-        "scenes": {"scene_cache": str(final.absolute()), "sceneset_path": SCENES},
-        "wizard": {"sqshcaches": []},
-    }
-    for file, content in (
-        (RUN_METADATA, metadata),
-        (EVAL_CONFIG, eval_config()),
-        (WIZARD_CONFIG, wizard),
-    ):
-        write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
-
-
 def eval_config() -> dict[str, Any]:
     """Return AlpaSim's evaluation settings: its defaults, no video, and no unpickling of what a
     driver sent.
@@ -143,7 +117,21 @@ def write_scene(path: Path, ref: ScenarioRef, scenario: Scenario) -> None:
     it, with its own id and vehicle.
     """
     if scenario.source == "usdz":
-        _copy(path, _archive_of(ref), scenario)
+        with (
+            atomic_file(path) as partial,
+            open_regular(_archive_of(ref), ARCHIVE_BYTES) as stream,
+            zipfile.ZipFile(stream) as old,
+            zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
+        ):
+            for info in old.infolist():
+                if info.filename == "metadata.yaml":
+                    metadata = yaml.safe_load(old.read(info)) | {"scene_id": scenario.scene_id}
+                    new.writestr(info, yaml.safe_dump(metadata, sort_keys=False))
+                elif info.filename == "rig_trajectories.json":
+                    new.writestr(info, _with_vehicle(old.read(info), scenario))
+                else:
+                    with old.open(info) as member, new.open(info, "w") as copy:
+                        shutil.copyfileobj(member, copy)
     else:
         write_usdz(path, scenario)
 
@@ -155,24 +143,6 @@ def _archive_of(ref: ScenarioRef) -> Path:
     document = load_yaml(path)
     key = next(key for key in ("usdz", "path") if key in document.data["log"])
     return Path(document.folder_of(("log", key)) / document.data["log"][key])
-
-
-def _copy(path: Path, source: Path, scenario: Scenario) -> None:
-    with (
-        atomic_file(path) as partial,
-        open_regular(source, ARCHIVE_BYTES) as stream,
-        zipfile.ZipFile(stream) as old,
-        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
-    ):
-        for info in old.infolist():
-            if info.filename == "metadata.yaml":
-                metadata = yaml.safe_load(old.read(info)) | {"scene_id": scenario.scene_id}
-                new.writestr(info, yaml.safe_dump(metadata, sort_keys=False))
-            elif info.filename == "rig_trajectories.json":
-                new.writestr(info, _with_vehicle(old.read(info), scenario))
-            else:
-                with old.open(info) as member, new.open(info, "w") as copy:
-                    shutil.copyfileobj(member, copy)
 
 
 def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:
@@ -307,7 +277,25 @@ def _finish(
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{run.renderer} {run.policy}"
-    write_configs(folder, out, name, f"{info.get('content')}/{run.renderer}/{run.policy}")
+    metadata = {
+        "run_uuid": str(
+            uuid.uuid5(uuid.NAMESPACE_URL, f"{info.get('content')}/{run.renderer}/{run.policy}")
+        ),
+        "run_name": name,
+    }
+    wizard = {
+        "services": {
+            "runtime": {"image": "none"}
+        },  # alpasim-reeval needs the key; only its Slurm mode uses the image
+        "scenes": {"scene_cache": str(out.absolute()), "sceneset_path": SCENES},
+        "wizard": {"sqshcaches": []},
+    }
+    for file, content in (
+        (RUN_METADATA, metadata),
+        (EVAL_CONFIG, eval_config()),
+        (WIZARD_CONFIG, wizard),
+    ):
+        write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
     failed = [
         m
         for m in manifests

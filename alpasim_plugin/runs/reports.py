@@ -43,7 +43,9 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
     run = read_run(root)
     if flips and page:
         write_flips(run)
-        write_causes(run)
+        failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
+        for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
+            write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
     write_summary_md(run)
     write_junit(run)
     report = None
@@ -57,13 +59,6 @@ def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | N
 
 
 MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other
-
-
-def write_causes(run: Run) -> None:
-    """Write the page of evidence for the first rollouts that failed, one a scene and variant."""
-    failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
-    for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
-        write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
 
 
 def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:

@@ -53,11 +53,6 @@ class Trial:
         }
 
 
-def broken_renderers() -> list[str]:
-    """Return the registered renderers with a deliberate fault."""
-    return [name for name in names("renderer") if name.startswith("broken-")]
-
-
 def run_self_test(
     spec: GateSpec, root: Path, command: Sequence[str], progress: Progress
 ) -> tuple[list[Trial], Outcome]:
@@ -73,7 +68,7 @@ def run_self_test(
         command: Written to run.json.
         progress: Shows both runs.
     """
-    broken = broken_renderers()
+    broken = [name for name in names("renderer") if name.startswith("broken-")]
     suite = load_suite(SUITE)
     options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)
     plan = make_plan(suite, [REFERENCE, *broken], [POLICY], [SEED], options)

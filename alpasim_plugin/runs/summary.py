@@ -15,7 +15,6 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import real
-from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.rows import rollouts_of_table
@@ -115,7 +114,10 @@ def speed(manifests: Sequence[JsonObject]) -> JsonObject:
         opening = max(int(manifest.get("first_call_frames", 1)), 1)
         total = np.zeros(frames)
         for stage, durations in manifest["stage_ms"].items():
-            total += resample_durations(durations, frames)
+            done = np.concatenate([[0.0], np.cumsum(durations)])
+            total += np.diff(
+                np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done)
+            )
             stages.setdefault(stage, []).extend(
                 durations[opening if len(durations) == frames else 1 :]
             )
@@ -145,19 +147,6 @@ def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, 
         "share": round(total / all_ms, 4),
         "per_frame_ms": round(total / frames, 3),
     }
-
-
-def resample_durations(durations: Sequence[float], frames: int) -> F64:
-    """Distribute the durations of a stage over frames, evenly and in order; the sum is kept.
-
-    Example:
-        >>> resample_durations([2.0, 4.0], 4), resample_durations([1.0, 1.0, 3.0, 3.0], 2)
-        (array([1., 1., 2., 2.]), array([2., 6.]))
-    """
-    done = np.concatenate([[0.0], np.cumsum(durations)])
-    return np.diff(
-        np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done)
-    )
 
 
 def pool_of(

@@ -226,7 +226,18 @@ def _onsets(
 
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:
     """Find the first contact of each actor in each interval at whose start it does not touch."""
-    actor, t0, t1 = _pieces(actors, t_us)
+    # Cut the presence of each actor at the steps and at its own logged times.
+    pieces = [np.zeros((3, 0), dtype=np.int64)]
+    for a in range(len(actors)):
+        logged = actors.times_of(a)
+        knots = np.union1d(t_us, logged)
+        first_us, last_us = max(logged[0], t_us[0]), min(logged[-1], t_us[-1])
+        knots = knots[(knots >= first_us) & (knots <= last_us)]
+        starts, ends = knots[:-1], knots[1:]
+        if len(knots) == 1 and knots[0] not in t_us:
+            starts = ends = knots
+        pieces.append(np.stack([np.full(len(starts), a), starts, ends]))
+    actor, t0, t1 = np.concatenate(pieces, axis=1)
     interval = np.searchsorted(t_us, t0, side="right") - 1
     is_open = ~touch[actor, interval]
     actor, interval, t0, t1 = actor[is_open], interval[is_open], t0[is_open], t1[is_open]
@@ -240,27 +251,6 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     # Pieces of a pair run forward in time: the first hit is the earliest.
     _, first = np.unique(np.stack([actor[rows], interval[rows]], axis=1), axis=0, return_index=True)
     return _Found(actor[rows][first], interval[rows][first], t_s[first], side[first], xy[first])
-
-
-def _pieces(actors: ActorTable, t_us: I64) -> tuple[I64, I64, I64]:
-    """Cut the presence of each actor at the steps and at its own logged times.
-
-    Returns:
-        Actor, start and end ``(M,)`` of each piece, by actor and then by time. An actor that is
-        there at one instant between two steps has a piece without length.
-    """
-    pieces = [np.zeros((3, 0), dtype=np.int64)]
-    for a in range(len(actors)):
-        logged = actors.times_of(a)
-        knots = np.union1d(t_us, logged)
-        first_us, last_us = max(logged[0], t_us[0]), min(logged[-1], t_us[-1])
-        knots = knots[(knots >= first_us) & (knots <= last_us)]
-        starts, ends = knots[:-1], knots[1:]
-        if len(knots) == 1 and knots[0] not in t_us:
-            starts = ends = knots
-        pieces.append(np.stack([np.full(len(starts), a), starts, ends]))
-    actor, start, end = np.concatenate(pieces, axis=1)
-    return actor, start, end
 
 
 def _motions(

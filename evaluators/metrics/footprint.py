@@ -33,20 +33,6 @@ def held(values: F64, preset: Preset) -> F64:
     return values.astype(np.float32).astype(np.float64) if preset.float32 else values
 
 
-def _corners_float32(xy: F64, yaw: F64, size: F64) -> F64:
-    """Return corners rounded to float32 after each step, the centre first, as AlpaSim does: half a
-    millimetre 8 km from the origin.
-    """
-    x, y = (xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
-    c, s = np.cos(yaw.astype(np.float32))[:, None], np.sin(yaw.astype(np.float32))[:, None]
-    along, across = (
-        (UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1)
-    )  # (N, 4)
-    return np.stack([(x + along * c) - across * s, (y + along * s) + across * c], axis=-1).astype(
-        np.float64
-    )
-
-
 @dataclass(frozen=True)
 class Footprints:
     """Boxes of one body at N instants."""
@@ -76,7 +62,18 @@ class Footprints:
     def corners(self) -> F64:
         """Return the corners ``(N, 4, 2)``."""
         if self.float32:
-            return _corners_float32(self.xy, self.yaw, self.size)
+            # Rounded after each step, the centre first, as AlpaSim does.
+            x, y = (self.xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
+            c, s = (
+                np.cos(self.yaw.astype(np.float32))[:, None],
+                np.sin(self.yaw.astype(np.float32))[:, None],
+            )
+            along, across = (
+                (UNIT_CORNERS[:, d] * self.size[:, [d]]).astype(np.float32) for d in (0, 1)
+            )  # (N, 4)
+            return np.stack(
+                [(x + along * c) - across * s, (y + along * s) + across * c], axis=-1
+            ).astype(np.float64)
         return rectangle_corners(self.xy, self.yaw, self.size)
 
     def centres(self) -> F64:

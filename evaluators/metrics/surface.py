@@ -169,32 +169,27 @@ class Region:
             corner, piece = shapely.get_coordinates(pieces, return_index=True)
             nearest, distance = self._nearest(shapely.points(corner))
             np.maximum.at(best, owner[piece], distance)
-            np.maximum.at(best, owner, self._halfway_m(corner, piece, nearest, distance))
+            # A point of each piece about as far from one border as from another.
+            last = np.cumsum(np.bincount(piece)) - 1
+            a = np.lexsort((distance, piece))[last]
+            other = nearest != nearest[a][piece]
+            b = np.lexsort((np.where(other, distance, -1.0), piece))[last]
+            lead = []  # by how much the border near a is nearer than the one near b, at a and at b
+            for index in (a, b):
+                to = [
+                    segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[index])
+                    for k in (a, b)
+                ]
+                lead.append(to[1] - to[0])
+            span = lead[0] - lead[1]
+            f = np.clip(np.divide(lead[0], span, out=np.zeros_like(span), where=span > 0), 0.0, 1.0)
+            point = corner[a] + f[:, None] * (corner[b] - corner[a])
+            is_inside = shapely.contains_xy(self.shape, point)
+            np.maximum.at(best, owner, np.where(is_inside, 0.0, self.border_distance_m(point)))
             bound = self._bound_m(pieces, corner, piece, nearest, distance)
             rows = np.flatnonzero(bound > best[owner] + MARGIN_M)
             owner, pieces = _quartered(owner[rows], pieces[rows])
         return best
-
-    def _halfway_m(self, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
-        """Return for each piece the distance ``(M,)`` of a point of the footprint about as far from
-        one border as from another.
-        """
-        n = np.bincount(piece)
-        last = np.cumsum(n) - 1
-        a = np.lexsort((distance, piece))[last]
-        other = nearest != nearest[a][piece]
-        b = np.lexsort((np.where(other, distance, -1.0), piece))[last]
-        lead = []  # by how much the border near a is nearer than the one near b, at a and at b
-        for index in (a, b):
-            to = [
-                segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[index])
-                for k in (a, b)
-            ]
-            lead.append(to[1] - to[0])
-        span = lead[0] - lead[1]
-        f = np.clip(np.divide(lead[0], span, out=np.zeros_like(span), where=span > 0), 0.0, 1.0)
-        point = corner[a] + f[:, None] * (corner[b] - corner[a])
-        return np.where(shapely.contains_xy(self.shape, point), 0.0, self.border_distance_m(point))
 
     def _bound_m(
         self, pieces: Geometries, corner: F64, piece: I64, nearest: I64, distance: F64
@@ -242,22 +237,15 @@ def closed_union(areas: Geometries, seam_m: float) -> Any:
     added = added[shapely.area(added) > 0]
     if not len(added):
         return shape
-    gaps = shapely.buffer(
-        added[_open_share(added, Region(shape)) < _MOUTH], 5 * _GRID_M, join_style="mitre"
-    )
-    return shapely.union_all(np.concatenate([[shape], gaps]), grid_size=_GRID_M)
-
-
-def _open_share(added: Geometries, region: Region) -> F64:
-    """Return the share ``(M,)`` of the outline of each polygon that does not run along a region's
-    border.
-    """
+    # The share of each outline that does not run along the region's border.
     ring, part = shapely.get_coordinates(shapely.get_exterior_ring(added), return_index=True)
     side = np.flatnonzero(part[1:] == part[:-1])
     length = np.linalg.norm(ring[side + 1] - ring[side], axis=1)
-    apart = region.border_distance_m((ring[side + 1] + ring[side]) / 2) > 10 * _GRID_M
+    apart = Region(shape).border_distance_m((ring[side + 1] + ring[side]) / 2) > 10 * _GRID_M
     whole = np.bincount(part[side], length, minlength=len(added))
-    return np.bincount(part[side], length * apart, minlength=len(added)) / whole
+    share = np.bincount(part[side], length * apart, minlength=len(added)) / whole
+    gaps = shapely.buffer(added[share < _MOUTH], 5 * _GRID_M, join_style="mitre")
+    return shapely.union_all(np.concatenate([[shape], gaps]), grid_size=_GRID_M)
 
 
 def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:

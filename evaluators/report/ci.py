@@ -97,7 +97,7 @@ def write_summary_md(run: Run) -> Path:
             note=". ".join(filter(None, (INTERVAL_NOTE, note))) + ".",
             pair_heads=PAIR_HEADS,
             pairs=pairs,
-            command=_in_block(command_of(run)),
+            command=Markup(terminal(command_of(run)).replace("`", "")),
             **_first_screen(run),
         )
     write_text(path, cut(text))
@@ -110,11 +110,6 @@ def _first_screen(run: Run) -> dict[str, Any]:
     forest = "\n".join(line.plain.rstrip() for line in forest_lines(shown, PLOT_LETTERS))
     body = [shown.cells(row) for row in shown.rows]
     return {"shown": shown, "body": body, "forest": Markup(forest.replace("`", ""))}
-
-
-def _in_block(text: str) -> Markup:
-    """Return one line as it stands between the marks of a block of code."""
-    return Markup(terminal(text).replace("`", ""))
 
 
 def cut(text: str, limit: int = MAX_BYTES) -> str:

@@ -257,8 +257,31 @@ def overview_of(run: Run) -> Overview:
     differences = {} if is_sequential else differences_of(run)
     rows = tuple(_row(run, name, entry, differences) for name, entry in table.items())
     primary = run.table.shown(run.table.primary)
+    asked = run.info.get("asked") or ()
+    size = (plural(len(run.scenes), "scene"), plural(len(run.info.get("seeds") or ()), "seed"))
+    named = some_of(asked, 2)
+    parts = [*([named] if named else []), str(run.summary.get("preset")), " \u00d7 ".join(size)]
+    if len(run.policies) == 1:
+        parts.append(f"policy {run.policies[0]}")
+    elif len(run.renderers) == 1:
+        parts.append(f"renderer {run.renderers[0]}")
+    cautions = fixer_cautions(run.summary)
+    copies = run.summary.get("copies")
+    if copies:
+        cautions.append(
+            f"{copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
+            "a policy without a camera drives once for all renderers."
+        )
+    repeat = run.info.get("repeat") or {}
+    if repeat.get("repeatable") is False:
+        first = repeat.get("first_difference") or {"component": "log", "step": None}
+        step = "" if first["step"] is None else f" at step {first['step']}"
+        cautions.append(
+            "The policy is not repeatable: a rollout that was driven twice differs first in "
+            f"{first['component']}{step}. Paired differences hold that noise too."
+        )
     return Overview(
-        _context(run),
+        " \u00b7 ".join(parts),
         rows,
         primary.words,
         scale_and_unit(primary, primary.unit)[1],
@@ -268,7 +291,7 @@ def overview_of(run: Run) -> Overview:
         else decided(rows)
         if decision is None
         else verdict_text(decision),
-        _cautions(run),
+        tuple(cautions),
     )
 
 
@@ -409,35 +432,3 @@ def _places(entry: JsonView) -> dict[str, list[str]]:
             ending = places.setdefault(outcome.ending or outcome.words, [])
             ending.append(f"{cell['scene']}{seed}{when}")
     return places
-
-
-def _context(run: Run) -> str:
-    """Say in one line what was driven: suite, preset, size, and what all variants share."""
-    asked = run.info.get("asked") or ()
-    size = (plural(len(run.scenes), "scene"), plural(len(run.info.get("seeds") or ()), "seed"))
-    named = some_of(asked, 2)
-    parts = [*([named] if named else []), str(run.summary.get("preset")), " \u00d7 ".join(size)]
-    if len(run.policies) == 1:
-        parts.append(f"policy {run.policies[0]}")
-    elif len(run.renderers) == 1:
-        parts.append(f"renderer {run.renderers[0]}")
-    return " \u00b7 ".join(parts)
-
-
-def _cautions(run: Run) -> tuple[str, ...]:
-    cautions = fixer_cautions(run.summary)
-    copies = run.summary.get("copies")
-    if copies:
-        cautions.append(
-            f"{copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
-            "a policy without a camera drives once for all renderers."
-        )
-    repeat = run.info.get("repeat") or {}
-    if repeat.get("repeatable") is False:
-        first = repeat.get("first_difference") or {"component": "log", "step": None}
-        step = "" if first["step"] is None else f" at step {first['step']}"
-        cautions.append(
-            "The policy is not repeatable: a rollout that was driven twice differs first in "
-            f"{first['component']}{step}. Paired differences hold that noise too."
-        )
-    return tuple(cautions)

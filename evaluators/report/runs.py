@@ -62,7 +62,8 @@ class RunEntry:
         not known.
         """
         try:
-            return as_utc(str(self.info.get("started_at")))
+            time = datetime.fromisoformat(str(self.info.get("started_at")))
+            return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
         except ValueError:
             return datetime.min.replace(tzinfo=UTC)
 
@@ -116,12 +117,6 @@ class RunEntry:
             "rollouts": planned,
             "failed": failed if self.state == "finished" else None,
         }
-
-
-def as_utc(text: str) -> datetime:
-    """Read a time, in UTC where it names no zone."""
-    time = datetime.fromisoformat(text)
-    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
 
 
 def read_entry(folder: Path) -> RunEntry:

@@ -183,19 +183,6 @@ RULES: dict[str, dict[str, Rule]] = {
 }
 
 
-def _scores(name: str, parts: Mapping[str, Part], rule: Rule) -> dict[str, Part]:
-    """Return a score and its least and greatest value; without a value it is the parts that would
-    decide it.
-    """
-    known = {part: value for part, value in parts.items() if not isinstance(value, str)}
-    missing = {part: reason for part, reason in parts.items() if isinstance(reason, str)}
-    full_marks = known | dict.fromkeys(missing, 1.0)
-    least, most = rule(known | dict.fromkeys(missing, 0.0)), rule(full_marks)
-    reasons = [reason for part, reason in missing.items() if rule(full_marks | {part: 0.0}) < most]
-    score: Part = least if least == most else "; ".join(dict.fromkeys(reasons))
-    return {name: score, f"{name}_least": least, f"{name}_most": most}
-
-
 def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the parts and scores of the preset's benchmark, the same at every step; nothing by
     presets that are none's.
@@ -210,7 +197,16 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         parts = MEASURES[benchmark](rollout, scene, preset, scored)
     values: dict[str, Part] = {}
     for name, rule in RULES[benchmark].items():
-        values |= _scores(name, parts, rule)
+        # Without a value, it is the parts that would decide the score.
+        known = {part: value for part, value in parts.items() if not isinstance(value, str)}
+        missing = {part: reason for part, reason in parts.items() if isinstance(reason, str)}
+        full_marks = known | dict.fromkeys(missing, 1.0)
+        least, most = rule(known | dict.fromkeys(missing, 0.0)), rule(full_marks)
+        reasons = [
+            reason for part, reason in missing.items() if rule(full_marks | {part: 0.0}) < most
+        ]
+        score: Part = least if least == most else "; ".join(dict.fromkeys(reasons))
+        values |= {name: score, f"{name}_least": least, f"{name}_most": most}
     out = []
     for name, value in (values | parts).items():
         is_known = not isinstance(value, str)

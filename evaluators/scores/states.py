@@ -107,7 +107,11 @@ def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F6
     """
     t_us = rear.t_us
     yaw, rear_xy = np.unwrap(yaw_from_quat(rear.quat)), rear.xyz[:, :2] - origin[:2]
-    velocity = in_axes(_rate(rear_xy, t_us), yaw)
+    vectors = _rate(rear_xy, t_us)
+    c, s = np.cos(yaw), np.sin(yaw)
+    velocity = np.stack(
+        [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1
+    )
     # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
     turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
     size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
@@ -152,14 +156,6 @@ def _rate(values: F64, t_us: I64) -> F64:
     one.
     """
     return np.zeros_like(values) if len(values) < 2 else np.gradient(values, t_us * 1e-6, axis=0)
-
-
-def in_axes(vectors: F64, yaw: F64) -> F64:
-    """Return vectors ``(T, 2)`` of the world along and to the left of headings ``(T,)``."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.stack(
-        [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1
-    )
 
 
 def smooth(values: F64) -> F64:

@@ -49,25 +49,6 @@ def table_of_run(run: Run) -> RolloutTable:
     )
 
 
-def rows_of_run(run: Run) -> list[JsonObject]:
-    """Return one flat row per planned rollout: key, status, and METRIC with METRIC_valid."""
-    rows = []
-    for rollout in run.rollouts:
-        row: JsonObject = {
-            "renderer": rollout.renderer,
-            "policy": rollout.policy,
-            "scene": rollout.scene,
-            "seed": rollout.seed,
-            "status": rollout.status,
-            "failure_class": rollout.failure_class or None,
-        }
-        for name in run.metric_names:
-            value = rollout.metrics.get(name)
-            row[name], row[f"{name}_valid"] = value, value is not None
-        rows.append(row)
-    return rows
-
-
 @dataclass(frozen=True)
 class Baseline:
     """What a baseline file holds."""
@@ -90,11 +71,25 @@ class Baseline:
 def baseline_of(run: Run) -> Baseline:
     """Return a run's results as a baseline."""
     made_with = {key: run.info[key] for key in MADE_WITH if key in run.info}
+    rows = []
+    for rollout in run.rollouts:
+        row: JsonObject = {
+            "renderer": rollout.renderer,
+            "policy": rollout.policy,
+            "scene": rollout.scene,
+            "seed": rollout.seed,
+            "status": rollout.status,
+            "failure_class": rollout.failure_class or None,
+        }
+        for name in run.metric_names:
+            value = rollout.metrics.get(name)
+            row[name], row[f"{name}_valid"] = value, value is not None
+        rows.append(row)
     return Baseline(
         _preset(run),
         scene_hashes(run),
         dict(run.info.get("weights") or {}),
-        rows_of_run(run),
+        rows,
         made_with,
         dict(run.info.get("metrics") or {}),
         is_repeatable(run),

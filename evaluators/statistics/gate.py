@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import Document, guess, load_yaml, validate
+from alpasim_plugin.core.config import guess, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
@@ -169,16 +169,6 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
         )
     document = load_yaml(path)
     spec = validate(GateSpec, document)
-    _check_names(spec, document, known)
-    return spec, str(path)
-
-
-def shipped_gates() -> list[str]:
-    """Return the names of the gates that come with the package."""
-    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
-
-
-def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None:
     for name, rule in spec.metrics.items():
         try:
             facts = known.info(name)
@@ -199,6 +189,12 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
     if spec.preset is not None and spec.preset not in PRESETS:
         hint = f"{guess(spec.preset, PRESETS)}known: {', '.join(PRESETS)}"
         raise document.error(("preset",), f"preset {spec.preset!r}", hint)
+    return spec, str(path)
+
+
+def shipped_gates() -> list[str]:
+    """Return the names of the gates that come with the package."""
+    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 
 
 Kind = Literal["margin", "limit"]

@@ -236,7 +236,20 @@ def write_cause(run: Run, cause: Cause) -> Path:
     path = run.folder / rollout.path / WHY_NAME
     document: JsonObject = {"queries": [], "lens": None, "failed": None}
     if cause.log is not None:
-        document = _document(run, cause, cause.log)
+        log = cause.log
+        content, recorded = scene_of(run, cause.rollout.scene)
+        place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
+        cameras = log.info["cameras"]
+        document = {
+            "own": cause.rollout.renderer,
+            "map": map_data(content, recorded, place),
+            "users": [user_data(actor, place) for actor in log.actors.values()],
+            "ego": place.track(log.ego),
+            "rear": round(100 * float(log.T_rig_box[0, 3])),
+            "lens": lens_data(cameras[0], WIDTH_PX) if cameras else None,
+            "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
+            "queries": _queries(run, cause, log, place),
+        }
     names = dict.fromkeys(name for query in document["queries"] for name in query["seen"])
     html = fill(
         "cause.html.j2",
@@ -252,23 +265,6 @@ def write_cause(run: Run, cause: Cause) -> Path:
     )
     write_text(path, html)
     return path
-
-
-def _document(run: Run, cause: Cause, log: RolloutLog) -> JsonObject:
-    """Return what the script of the page draws."""
-    content, recorded = scene_of(run, cause.rollout.scene)
-    place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
-    cameras = log.info["cameras"]
-    return {
-        "own": cause.rollout.renderer,
-        "map": map_data(content, recorded, place),
-        "users": [user_data(actor, place) for actor in log.actors.values()],
-        "ego": place.track(log.ego),
-        "rear": round(100 * float(log.T_rig_box[0, 3])),
-        "lens": lens_data(cameras[0], WIDTH_PX) if cameras else None,
-        "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
-        "queries": _queries(run, cause, log, place),
-    }
 
 
 def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[JsonObject]:

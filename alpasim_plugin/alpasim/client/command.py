@@ -241,20 +241,6 @@ class Served:
 _served: dict[str, Served] = {}
 
 
-def served_by(command: Command) -> Served:
-    """Return the running command; it is started if it does not run.
-
-    Raises:
-        PolicyError: As `Served`.
-    """
-    held = _served.get(command.text)
-    if held is None or not held.is_running():
-        if held is not None:
-            held.stop()  # gives back its place
-        held = _served[command.text] = Served(command)
-    return held
-
-
 class CommandPolicy(DriverPolicy):
     """A policy that a command serves.
 
@@ -271,7 +257,12 @@ class CommandPolicy(DriverPolicy):
 
     def __init__(self, scenario: Scenario, address: str) -> None:
         command = Command.parse(address)
-        self._served = served_by(command)
+        held = _served.get(command.text)
+        if held is None or not held.is_running():
+            if held is not None:
+                held.stop()  # gives back its place
+            held = _served[command.text] = Served(command)
+        self._served = held
         try:
             super().__init__(
                 scenario,

@@ -44,20 +44,15 @@ def main(grace_s: float, command: list[str]) -> int:
         ready, _, _ = select.select([sys.stdin.fileno(), bell], [], [])
         woken_by = os.read(bell, 64) if bell in ready else b""
         if sys.stdin.fileno() in ready or signal.SIGTERM in woken_by:
-            end_group(child, grace_s)
+            _signal_group(child.pid, signal.SIGTERM)
+            end_s = time.monotonic() + grace_s
+            while child.poll() is None and time.monotonic() < end_s:
+                time.sleep(POLL_S)
+            _signal_group(child.pid, signal.SIGKILL)
             break
     _signal_group(child.pid, signal.SIGKILL)  # what the command left running behind it
     code = child.wait()
     return code if code >= 0 else 128 - code
-
-
-def end_group(child: subprocess.Popen[bytes], grace_s: float) -> None:
-    """Ask a process group to end, and end it after the grace time."""
-    _signal_group(child.pid, signal.SIGTERM)
-    end_s = time.monotonic() + grace_s
-    while child.poll() is None and time.monotonic() < end_s:
-        time.sleep(POLL_S)
-    _signal_group(child.pid, signal.SIGKILL)
 
 
 def _signal_group(group: int, number: int) -> None:

@@ -82,7 +82,16 @@ def find(kind: KindName, name: str) -> Entry:
 def _unknown(kind: str, name: str, known: Collection[str]) -> InputError:
     file = Path(name if name.endswith(".py") else f"{name}.py")
     if name.endswith(".py") or os.path.isfile(file):
-        return _classless(kind, file)
+        if not os.path.isfile(file):
+            return no_such_file(kind, file)
+        classes = classes_of(file)
+        if not classes:
+            return InputError(f"{file}: it has no class", f"Write the {kind} as a class in it.")
+        named = " or ".join(f"{file}:{name}" for name in classes)
+        return InputError(
+            f"{file}: a file, and not which of its classes is the {kind}",
+            f"Name its {kind}: {named}.",
+        )
     for other in ("renderer", "fixer", "policy", "controller"):
         if name in entries(other):
             option = "renderer" if other == "fixer" else other
@@ -92,19 +101,6 @@ def _unknown(kind: str, name: str, known: Collection[str]) -> InputError:
     return InputError(
         f"name {name!r}: no {kind} has that name",
         f"{guess(name, known)}known: {', '.join(known)}; or name one of your own as package.module:Class",
-    )
-
-
-def _classless(kind: str, file: Path) -> InputError:
-    """Return the error for a file without a class: it names the classes of the file, unrun."""
-    if not os.path.isfile(file):
-        return no_such_file(kind, file)
-    classes = classes_of(file)
-    if not classes:
-        return InputError(f"{file}: it has no class", f"Write the {kind} as a class in it.")
-    named = " or ".join(f"{file}:{name}" for name in classes)
-    return InputError(
-        f"{file}: a file, and not which of its classes is the {kind}", f"Name its {kind}: {named}."
     )
 
 

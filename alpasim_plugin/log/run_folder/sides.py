@@ -64,11 +64,6 @@ def metric_names(rows: Iterable[Row]) -> list[str]:
     return list(names)
 
 
-def is_ok(row: Row) -> bool:
-    """Return whether a rollout ran to its end."""
-    return bool(row.get("status", "ok") == "ok")
-
-
 @dataclass(frozen=True, eq=False)
 class Side:
     """The rollouts of one renderer, laid out by cell: what every statistic over rollouts reads.
@@ -116,7 +111,7 @@ class Side:
     def of(cls, rows: Sequence[Row]) -> Side:
         """Lay out rows of one renderer, flat (``rollouts.parquet``) or nested (manifests)."""
         keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
-        ok = np.array([is_ok(row) for row in rows], dtype=bool)
+        ok = np.array([row.get("status", "ok") == "ok" for row in rows], dtype=bool)
 
         def raw(metric: str) -> F64:
             values = np.array([value_of(row, metric) for row in rows], dtype=np.float64)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,9 +158,22 @@ def write_tables(
     rollouts = rollout_table(manifests)
     write_parquet(tables / ROLLOUTS, rollouts)
     parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
-    _join_parquet(
-        tables / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts
-    )
+    path = tables / STEPS
+    schema = STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        atomic_file(path) as partial,
+        pq.ParquetWriter(partial, schema, compression="zstd", write_page_checksum=True) as writer,
+    ):
+        held = []
+        rows = 0
+        for part in parts:
+            held.append(read_parquet(part, {}))  # a few kilobytes each
+            rows += len(held[-1])
+            if rows >= GROUP_ROWS:
+                writer.write_table(pa.concat_tables(held))
+                held, rows = [], 0
+        writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
     return rollouts
 
 
@@ -189,26 +202,6 @@ def write_parquet(path: Path, table: pa.Table) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
     write_bytes(path, sink.getvalue().to_pybytes())
-
-
-def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
-    """Write the rows of many parquet files into one, atomically and in order, in the memory of one
-    row group.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        atomic_file(path) as partial,
-        pq.ParquetWriter(partial, schema, compression="zstd", write_page_checksum=True) as writer,
-    ):
-        held = []
-        rows = 0
-        for part in parts:
-            held.append(read_parquet(part, {}))  # a few kilobytes each
-            rows += len(held[-1])
-            if rows >= GROUP_ROWS:
-                writer.write_table(pa.concat_tables(held))
-                held, rows = [], 0
-        writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
 
 
 @dataclass(frozen=True)

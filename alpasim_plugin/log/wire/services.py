@@ -285,19 +285,13 @@ class Reflection:
                 f"{kind}: {getattr(request, kind)!r} is not served here"
             )
             return response
-        response.file_descriptor_response.file_descriptor_proto.extend(_with_needed(file))
+        # The file and all that it imports, which comes later, as clients expect.
+        found: dict[str, bytes] = {}
+        todo = [file]
+        while todo:
+            one = todo.pop(0)
+            if one.name not in found:
+                found[one.name] = one.serialized_pb
+                todo.extend(one.dependencies)
+        response.file_descriptor_response.file_descriptor_proto.extend(found.values())
         return response
-
-
-def _with_needed(file: FileDescriptor) -> list[bytes]:
-    """Return a file and all that it imports, serialised; what is imported comes later, as clients
-    expect.
-    """
-    found: dict[str, bytes] = {}
-    todo = [file]
-    while todo:
-        one = todo.pop(0)
-        if one.name not in found:
-            found[one.name] = one.serialized_pb
-            todo.extend(one.dependencies)
-    return list(found.values())
