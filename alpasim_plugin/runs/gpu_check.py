@@ -11,20 +11,27 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
-from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.devices import download, require_device, upload
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F32, Actor, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
@@ -33,9 +40,11 @@ from scenarios.load import load_scenario
 
 SCENE = "smoke/curve"
 SIZES = ((256, 144), (960, 544), (1920, 1088))
+SPLATS = 5_000  # of the image whose gradients are compared
 REPEATS = 5
-LEVELS = 2  # grey levels by which a card may differ from the CPU
-ODD_SHARE = 1e-3  # of the pixels may differ by more: splats of nearly equal depth change places
+# Grey levels, or thousandths of the largest gradient, by which a card may differ from the CPU.
+LEVELS = 2
+ODD_SHARE = 1e-3  # of the numbers may differ by more: splats of nearly equal depth change places
 
 Facts = dict[str, Any]
 
@@ -70,8 +79,6 @@ def _failed(why: str) -> Facts:
 
 def card(device: str) -> Facts:
     """Return what the card is, after one product of matrices on it."""
-    import torch
-
     name = require_device(device)
     ones = torch.ones(64, 64, device=name)
     facts: Facts = {"ok": float((ones @ ones).sum()) == 64.0**3, "torch": torch.__version__}
@@ -106,6 +113,32 @@ def fixer(device: str) -> Facts:
     return _checked(facts)
 
 
+def semantic_map(device: str) -> Facts:
+    """Compare maps of a street with those of the CPU, and time them."""
+    scenario = load_scenario(SCENE)
+    scene = prepare_map(scenario.lane_map)
+    facts: Facts = {"ok": True}
+    for width, height in SIZES:
+        request = frame_request(scenario, width, height)
+        draw = partial(_map, scene, request, scenario.actors)
+        facts[f"{width}x{height}"] = compared(partial(draw, device), partial(draw, "cpu"))
+    return _checked(facts)
+
+
+def gradient(device: str) -> Facts:
+    """Compare the gradients of an image with those of the CPU, in thousandths of the largest of
+    their kind, and time them.
+    """
+    facts: Facts = {"ok": True}
+    for width, height in SIZES:
+        ours, theirs = (_gradients(width, height, name) for name in (device, "cpu"))
+        largest = np.concatenate([np.full(part.shape, np.abs(part).max()) for part in theirs()])
+        facts[f"{width}x{height}"] = compared(
+            partial(_in_thousandths, ours, largest), partial(_in_thousandths, theirs, largest)
+        )
+    return _checked(facts)
+
+
 def rollout(device: str) -> Facts:
     """Drive a scene behind the fixer on the device, and time a frame of it."""
     scenario = load_scenario(SCENE)
@@ -120,17 +153,21 @@ def rollout(device: str) -> Facts:
 SECTIONS: dict[str, Callable[[str], Facts]] = {
     "card": card,
     "rasteriser": rasteriser,
+    "semantic_map": semantic_map,
     "fixer": fixer,
+    "gradient": gradient,
     "rollout": rollout,
 }
 
 
 def compared(ours: Callable[[], Any], theirs: Callable[[], Any]) -> Facts:
-    """Return by how many grey levels two images differ, and how long each takes."""
-    differs = np.abs(ours().astype(int) - theirs())
+    """Return by how many levels two arrays differ, and how long each takes."""
+    differs = np.abs(ours().astype(float) - theirs())
     return {
-        "levels": int(differs.max()),
+        "levels": round(float(differs.max()), 3),
+        "different": int((differs > 0).sum()),
         "odd_share": float((differs > LEVELS).mean()),
+        "launches": _launches(ours),
         "ms": _median_ms(ours),
         "cpu_ms": _median_ms(theirs),
     }
@@ -140,8 +177,15 @@ def _checked(facts: Facts) -> Facts:
     sizes = [value for value in facts.values() if isinstance(value, dict)]
     facts["ok"] = all(size["odd_share"] <= ODD_SHARE for size in sizes)
     if not facts["ok"]:
-        facts["why"] = f"images differ from the CPU by more than {LEVELS} grey levels"
+        facts["why"] = f"too much differs from the CPU by more than {LEVELS} levels"
     return facts
+
+
+def _launches(make: Callable[[], Any]) -> int:
+    """Return how many kernels and graphs a call launches on a card."""
+    with torch.profiler.profile() as profile:
+        make()
+    return sum("Launch" in event.name for event in profile.events())
 
 
 def _median_ms(make: Callable[[], Any]) -> float:
@@ -168,6 +212,48 @@ def frame_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
 
 def _rendered(renderer: Renderer, request: RenderRequest) -> Any:
     return renderer.render(request).rgb
+
+
+def _map(scene: PreparedMap, request: RenderRequest, actors: Sequence[Actor], device: str) -> Any:
+    if device == "cpu":
+        return draw_exposed_map(scene, request, actors)
+    (image,) = download(draw_exposed_map(scene, request, actors, device=torch.device(device)))
+    return image
+
+
+def _gradients(width: int, height: int, device: str) -> Callable[[], list[F32]]:
+    """Return a call that differentiates an image of splats of all shapes, also behind and beside
+    the camera, by their parameters.
+    """
+    rng = stream("gpu-check", 0, "splats")
+    cloud = GaussianCloud(
+        rng.uniform([-9, -5, -2], [9, 5, 30], (SPLATS, 3)),
+        rng.normal(size=(SPLATS, 4)),
+        np.exp(rng.normal(-3, 1, (SPLATS, 3))),
+        rng.random(SPLATS),
+        rng.normal(0, 0.3, (SPLATS, 16, 3)),
+    )
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
+    camera = PinholeCamera(width, height, K, np.eye(4))
+    splats = [upload(part.numpy(), device) for part in Splats.from_cloud(cloud)]
+    weights = upload(rng.normal(size=(height, width, 5)).astype(np.float32), device)
+    compositor = None if device == "cpu" else TileCompositor(device)
+
+    def differentiate() -> list[F32]:
+        leaves = [part.detach().requires_grad_() for part in splats]
+        out = rasterize_gradient(Splats(*leaves), camera, compositor=compositor)
+        planes = [out.rgb, out.alpha[..., None], out.depth[..., None]]
+        (torch.cat(planes, dim=2) * weights).sum().backward()  # type: ignore[no-untyped-call]
+        pairs, *found = download(out.pairs, *(leaf.grad for leaf in leaves))
+        if compositor is None or compositor.had_room(compositor.capacity, int(pairs)):
+            return [part.ravel() for part in found]
+        return differentiate()
+
+    return differentiate
+
+
+def _in_thousandths(make: Callable[[], list[F32]], largest: F32) -> F32:
+    return 1e3 * np.concatenate(make()) / largest
 
 
 def _streaming(device: str, width: int, height: int) -> Callable[[], Any]:

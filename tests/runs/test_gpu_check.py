@@ -32,6 +32,19 @@ def test_images_that_differ_fail_the_section():
     assert not gpu_check._checked({"ok": True, "1x1": other})["ok"]
 
 
+@pytest.mark.parametrize("section", ["semantic_map", "gradient"])
+def test_a_section_compares_a_card_with_the_processor(section, monkeypatch):
+    pytest.importorskip("triton", reason="Triton is not installed")
+    from tests.pretended_device import pretended_device
+
+    for name, value in {"SIZES": [(32, 18)], "SPLATS": 100, "REPEATS": 1}.items():
+        monkeypatch.setattr(gpu_check, name, value)
+    with pretended_device(monkeypatch) as traffic:
+        facts = gpu_check.SECTIONS[section]("cuda:0")
+        assert traffic.launches
+    assert facts["ok"], facts
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
 def test_without_a_card_the_check_ends_with_an_error_of_the_machine():
     assert run_command(["doctor", "--gpu", "--budget", "5"]) == 4
