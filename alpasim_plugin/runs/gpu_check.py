@@ -11,7 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,13 +21,12 @@ import torch
 
 from alpasim_plugin.core.devices import download, require_device, upload
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, Actor, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F32, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
-from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
+from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
@@ -47,6 +46,7 @@ LEVELS = 2
 ODD_SHARE = 1e-3  # of the numbers may differ by more: splats of nearly equal depth change places
 
 Facts = dict[str, Any]
+Call = Callable[[], Any]  # makes an array of the host
 
 
 def check_gpu(device: str, budget_s: float) -> Iterator[tuple[str, Facts]]:
@@ -94,49 +94,57 @@ def card(device: str) -> Facts:
 def rasteriser(device: str) -> Facts:
     """Compare frames of a built street with those of the CPU, and time them."""
     scenario = load_scenario(SCENE)
-    ours, theirs = (make_renderer("clean", scenario, 0, name) for name in (device, "cpu"))
-    facts: Facts = {"ok": True}
-    for width, height in SIZES:
+    renderers = {name: make_renderer("clean", scenario, 0, name) for name in (device, "cpu")}
+
+    def renders(width: int, height: int, name: str) -> Call:
         request = frame_request(scenario, width, height)
-        facts[f"{width}x{height}"] = compared(
-            partial(_rendered, ours, request), partial(_rendered, theirs, request)
-        )
-    return _checked(facts)
+        return lambda: renderers[name].render(request).rgb
 
-
-def fixer(device: str) -> Facts:
-    """Compare frames of the fixer with those of the CPU, and time them."""
-    facts: Facts = {"ok": True}
-    for width, height in SIZES:
-        ours, theirs = _streaming(device, width, height), _streaming("cpu", width, height)
-        facts[f"{width}x{height}"] = compared(ours, theirs)
-    return _checked(facts)
+    return compared(device, renders)
 
 
 def semantic_map(device: str) -> Facts:
     """Compare maps of a street with those of the CPU, and time them."""
     scenario = load_scenario(SCENE)
     scene = prepare_map(scenario.lane_map)
-    facts: Facts = {"ok": True}
-    for width, height in SIZES:
+
+    def draws(width: int, height: int, name: str) -> Call:
         request = frame_request(scenario, width, height)
-        draw = partial(_map, scene, request, scenario.actors)
-        facts[f"{width}x{height}"] = compared(partial(draw, device), partial(draw, "cpu"))
-    return _checked(facts)
+        draw = partial(draw_exposed_map, scene, request, scenario.actors)
+        on_card = partial(draw, device=torch.device(name))
+        return draw if name == "cpu" else lambda: download(on_card())[0]
+
+    return compared(device, draws)
+
+
+def fixer(device: str) -> Facts:
+    """Compare frames of the fixer with those of the CPU, and time them."""
+    return compared(device, _streaming)
 
 
 def gradient(device: str) -> Facts:
-    """Compare the gradients of an image with those of the CPU, in thousandths of the largest of
-    their kind, and time them.
+    """Compare the gradients of an image of splats of all shapes, also behind and beside the camera,
+    with those of the CPU, in thousandths of the largest of their kind, and time them.
     """
-    facts: Facts = {"ok": True}
-    for width, height in SIZES:
-        ours, theirs = (_gradients(width, height, name) for name in (device, "cpu"))
-        largest = np.concatenate([np.full(part.shape, np.abs(part).max()) for part in theirs()])
-        facts[f"{width}x{height}"] = compared(
-            partial(_in_thousandths, ours, largest), partial(_in_thousandths, theirs, largest)
+    rng = stream("gpu-check", 0, "splats")
+    cloud = GaussianCloud(
+        rng.uniform([-9, -5, -2], [9, 5, 30], (SPLATS, 3)),
+        rng.normal(size=(SPLATS, 4)),
+        np.exp(rng.normal(-3, 1, (SPLATS, 3))),
+        rng.random(SPLATS),
+        rng.normal(0, 0.3, (SPLATS, 16, 3)),
+    )
+
+    def differentiates(width: int, height: int, name: str) -> Call:
+        K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
+        view = cloud, PinholeCamera(width, height, K, np.eye(4))
+        units = [1e-3 * np.abs(part).max() for part in _gradients(*view, None)]
+        compositor = None if name == "cpu" else TileCompositor(name)
+        return lambda: np.concatenate(
+            [part / unit for part, unit in zip(_gradients(*view, compositor), units, strict=True)]
         )
-    return _checked(facts)
+
+    return compared(device, differentiates)
 
 
 def rollout(device: str) -> Facts:
@@ -160,35 +168,39 @@ SECTIONS: dict[str, Callable[[str], Facts]] = {
 }
 
 
-def compared(ours: Callable[[], Any], theirs: Callable[[], Any]) -> Facts:
-    """Return by how many levels two arrays differ, and how long each takes."""
-    differs = np.abs(ours().astype(float) - theirs())
-    return {
-        "levels": round(float(differs.max()), 3),
-        "different": int((differs > 0).sum()),
-        "odd_share": float((differs > LEVELS).mean()),
-        "launches": _launches(ours),
-        "ms": _median_ms(ours),
-        "cpu_ms": _median_ms(theirs),
-    }
+def compared(device: str, make: Callable[[int, int, str], Call]) -> Facts:
+    """Return by how many levels arrays of a device differ from the CPU's, and how long each takes.
 
-
-def _checked(facts: Facts) -> Facts:
-    sizes = [value for value in facts.values() if isinstance(value, dict)]
-    facts["ok"] = all(size["odd_share"] <= ODD_SHARE for size in sizes)
-    if not facts["ok"]:
-        facts["why"] = f"too much differs from the CPU by more than {LEVELS} levels"
+    Args:
+        device: The card.
+        make: Returns what makes an array of a width and a height on a device.
+    """
+    facts: Facts = {"ok": True}
+    for width, height in SIZES:
+        ours, theirs = make(width, height, device), make(width, height, "cpu")
+        differs = np.abs(ours().astype(float) - theirs())
+        odd_share = float((differs > LEVELS).mean())
+        facts[f"{width}x{height}"] = {
+            "levels": round(float(differs.max()), 3),
+            "different": int((differs > 0).sum()),
+            "odd_share": odd_share,
+            "launches": _launches(ours),
+            "ms": _median_ms(ours),
+            "cpu_ms": _median_ms(theirs),
+        }
+        if odd_share > ODD_SHARE:
+            facts |= {"ok": False, "why": f"it differs from the CPU by more than {LEVELS} levels"}
     return facts
 
 
-def _launches(make: Callable[[], Any]) -> int:
+def _launches(make: Call) -> int:
     """Return how many kernels and graphs a call launches on a card."""
     with torch.profiler.profile() as profile:
         make()
     return sum("Launch" in event.name for event in profile.events())
 
 
-def _median_ms(make: Callable[[], Any]) -> float:
+def _median_ms(make: Call) -> float:
     """Return the median time of a call, which ends with an array on the host."""
     times_s = []
     for _ in range(REPEATS):
@@ -210,53 +222,22 @@ def frame_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
     return RenderRequest(t_us, larger, np.stack([pose, pose]), log_actors(scenario, t_us))
 
 
-def _rendered(renderer: Renderer, request: RenderRequest) -> Any:
-    return renderer.render(request).rgb
+def _gradients(
+    cloud: GaussianCloud, camera: PinholeCamera, compositor: TileCompositor | None
+) -> list[F32]:
+    """Return the gradients of the sum of an image's squares by every parameter."""
+    device = "cpu" if compositor is None else compositor.device
+    splats = [upload(part.numpy(), device).requires_grad_() for part in Splats.from_cloud(cloud)]
+    out = rasterize_gradient(Splats(*splats), camera, compositor=compositor)
+    planes = torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], dim=2)
+    planes.square().sum().backward()  # type: ignore[no-untyped-call]
+    pairs, *found = download(out.pairs, *(part.grad for part in splats))
+    if compositor is None or compositor.had_room(compositor.capacity, int(pairs)):
+        return [part.ravel() for part in found]
+    return _gradients(cloud, camera, compositor)
 
 
-def _map(scene: PreparedMap, request: RenderRequest, actors: Sequence[Actor], device: str) -> Any:
-    if device == "cpu":
-        return draw_exposed_map(scene, request, actors)
-    (image,) = download(draw_exposed_map(scene, request, actors, device=torch.device(device)))
-    return image
-
-
-def _gradients(width: int, height: int, device: str) -> Callable[[], list[F32]]:
-    """Return a call that differentiates an image of splats of all shapes, also behind and beside
-    the camera, by their parameters.
-    """
-    rng = stream("gpu-check", 0, "splats")
-    cloud = GaussianCloud(
-        rng.uniform([-9, -5, -2], [9, 5, 30], (SPLATS, 3)),
-        rng.normal(size=(SPLATS, 4)),
-        np.exp(rng.normal(-3, 1, (SPLATS, 3))),
-        rng.random(SPLATS),
-        rng.normal(0, 0.3, (SPLATS, 16, 3)),
-    )
-    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
-    camera = PinholeCamera(width, height, K, np.eye(4))
-    splats = [upload(part.numpy(), device) for part in Splats.from_cloud(cloud)]
-    weights = upload(rng.normal(size=(height, width, 5)).astype(np.float32), device)
-    compositor = None if device == "cpu" else TileCompositor(device)
-
-    def differentiate() -> list[F32]:
-        leaves = [part.detach().requires_grad_() for part in splats]
-        out = rasterize_gradient(Splats(*leaves), camera, compositor=compositor)
-        planes = [out.rgb, out.alpha[..., None], out.depth[..., None]]
-        (torch.cat(planes, dim=2) * weights).sum().backward()  # type: ignore[no-untyped-call]
-        pairs, *found = download(out.pairs, *(leaf.grad for leaf in leaves))
-        if compositor is None or compositor.had_room(compositor.capacity, int(pairs)):
-            return [part.ravel() for part in found]
-        return differentiate()
-
-    return differentiate
-
-
-def _in_thousandths(make: Callable[[], list[F32]], largest: F32) -> F32:
-    return 1e3 * np.concatenate(make()) / largest
-
-
-def _streaming(device: str, width: int, height: int) -> Callable[[], Any]:
+def _streaming(width: int, height: int, device: str) -> Call:
     """Return a call that fixes the next frame of a drawn clip."""
     session = make_fixer("onefixer", scene_id="gpu-check", device=device)
     rng = stream("gpu-check", 0, "clip")

@@ -23,13 +23,13 @@ def test_a_section_that_the_budget_does_not_reach_is_not_begun(monkeypatch):
     assert not any(section["ok"] for section in facts.values())
 
 
-def test_images_that_differ_fail_the_section():
+@pytest.mark.parametrize("levels", [0, 9])
+def test_images_that_differ_fail_the_section(levels, monkeypatch):
+    monkeypatch.setattr(gpu_check, "SIZES", [(10, 10)])
     image = np.zeros((10, 10, 3), np.uint8)
-    same = gpu_check.compared(lambda: image, lambda: image)
-    other = gpu_check.compared(lambda: image + 9, lambda: image)
-    assert (same["levels"], other["levels"]) == (0, 9)
-    assert gpu_check._checked({"ok": True, "1x1": same})["ok"]
-    assert not gpu_check._checked({"ok": True, "1x1": other})["ok"]
+    images = {"cpu": image, "cuda": image + levels}
+    facts = gpu_check.compared("cuda", lambda width, height, name: lambda: images[name])
+    assert (facts["10x10"]["levels"], facts["ok"]) == (levels, levels == 0)
 
 
 @pytest.mark.parametrize("section", ["semantic_map", "gradient"])
