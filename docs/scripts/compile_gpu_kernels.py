@@ -27,7 +27,7 @@ TYPES = {
     "*u8": ("levels",),
     "*fp64": ("poses", "camera", "means", "primitives", "samples"),
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
-    "*i64": ("order", "ends", "places"),
+    "*i64": ("order", "ends", "places", "count"),
     "fp32": ("near_m",),
     "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height", "rows", "top"),
     "constexpr": tuple(CONSTANTS),

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.fixers.semantic_map.draw import draw_map, primitives_of
+from alpasim_plugin.fixers.semantic_map.draw import draw_map, seen_from
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.fixers.semantic_map.style import COLOURS
 from tests.examples import first_of
@@ -283,8 +283,8 @@ def test_a_gpu_draws_the_same_pixels():
 
     (scene, boxes), rows = street(), slice(3, 25)
     view = replace(PIN, width=48, height=27, K=np.diag([0.1875, 0.1875, 1]) @ PIN.K)
-    seen = primitives_of(scene, view, at(x=1.0), boxes)
-    found = draw_tiles(*seen, (view.height, view.width), rows, torch.device("cpu"))
+    seen = seen_from(scene, view, at(x=1.0), boxes)
+    found = draw_tiles(scene, *seen, rows, torch.device("cpu"))
     assert_array_equal(found, draw_map(scene, view, at(x=1.0), boxes, rows=rows))
 
 

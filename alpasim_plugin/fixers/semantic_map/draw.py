@@ -79,28 +79,7 @@ def primitives_of(
     scene: PreparedMap, camera: CameraSpec, T_world_camera: F64, actors: Sequence[ActorBox]
 ) -> tuple[F64, F64, F64]:
     """Return the strokes of lines, the shapes, and the strokes of boxes' edges that are seen."""
-    view, pose = view_of(scene, camera, T_world_camera)
-    # The faces of road users, the nearest first, so that hidden ones are not shaded. Boxes cut by
-    # the near plane show their inner faces; of others, faces turned away are culled.
-    poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
-    boxes = [actor.box for actor in actors]
-    lengths = [(box.length_m, box.width_m, box.height_m) for box in boxes]
-    sizes = np.array(lengths, dtype=np.float64).reshape(-1, 1, 3)
-    centres = poses[:, :3, 3] - scene.origin
-    order = np.argsort(centres @ pose[2, :3], kind="stable")
-    rotated = (CORNERS * sizes) @ poses[:, :3, :3].transpose(0, 2, 1)
-    corners = (rotated + centres[:, None, :])[order]
-    uncut = (corners @ pose[2, :3] + pose[2, 3]).min(axis=1, initial=np.inf) > NEAR_M
-    colours = [BOX_COLOURS[box_class(actors[i].label)] for i in order]
-    style = np.array([(0.0, *front, *back) for front, back in colours]).reshape(-1, 7)
-    n = len(TRIANGLES)
-    # Tiled once, an array keeps the order of its index; the kernel would be compiled for that order
-    # as well.
-    shade = np.ascontiguousarray(np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1)))
-    triangles = corners[:, TRIANGLES].reshape(-1, 3, 3)
-    faces = Triangles(triangles, np.repeat(uncut, n), shade, np.repeat(style, n, axis=0))
-    ends = corners[:, EDGES].reshape(-1, 2, 3)
-    edges = Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
+    view, pose, faces, edges = seen_from(scene, camera, T_world_camera, actors)
     shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
     return strokes_of(scene.segments, pose, view), shapes, strokes_of(edges, pose, view)
 
@@ -136,21 +115,54 @@ def draw_exposed_map(
         if device is None:
             part: Any = draw_map(*seen, threads=threads, rows=band.rows)
         else:
-            part = draw_tiles(*primitives_of(*seen), size, band.rows, device)
+            part = draw_tiles(scene, *seen_from(*seen), band.rows, device)
         band.put(out, part[:, band.columns])
     return out
 
 
-def view_of(scene: PreparedMap, camera: CameraSpec, T_world_camera: F64) -> tuple[F64, F64]:
-    """Return the view as `kernels` reads it, and the pose ``(3, 4)`` that maps the scene's own
-    coordinates into the camera's.
+def seen_from(
+    scene: PreparedMap, camera: CameraSpec, T_world_camera: F64, actors: Sequence[ActorBox]
+) -> tuple[F64, F64, Triangles, Segments]:
+    """Return the view as `kernels` reads it, the pose ``(3, 4)`` that maps the scene's own
+    coordinates into the camera's, and the faces and edges of road users.
     """
     K = np.asarray(camera.K, dtype=np.float64)
     intrinsics = (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2])
     view = (*intrinsics, camera.width, camera.height, camera.width / WIDTH_DEFINED_AT_PX)
     T = np.array(T_world_camera, dtype=np.float64)
     T[:3, 3] -= scene.origin  # the difference of large coordinates is taken here, once, in float64
-    return np.array(view), np.ascontiguousarray(inverse(T)[:3])
+    pose = np.ascontiguousarray(inverse(T)[:3])
+    return np.array(view), pose, *actor_geometry(actors, scene, pose)
+
+
+def actor_geometry(
+    actors: Sequence[ActorBox], scene: PreparedMap, pose: F64
+) -> tuple[Triangles, Segments]:
+    """Return the faces and edges of road users, the nearest first, so that hidden ones are not
+    shaded.
+
+    Boxes cut by the near plane show their inner faces; other boxes are marked closed, so that faces
+    turned away are culled.
+    """
+    poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
+    boxes = [actor.box for actor in actors]
+    lengths = [(box.length_m, box.width_m, box.height_m) for box in boxes]
+    sizes = np.array(lengths, dtype=np.float64).reshape(-1, 1, 3)
+    centres = poses[:, :3, 3] - scene.origin
+    order = np.argsort(centres @ pose[2, :3], kind="stable")
+    rotated = (CORNERS * sizes) @ poses[:, :3, :3].transpose(0, 2, 1)
+    corners = (rotated + centres[:, None, :])[order]
+    uncut = (corners @ pose[2, :3] + pose[2, 3]).min(axis=1, initial=np.inf) > NEAR_M
+    colours = [BOX_COLOURS[box_class(actors[i].label)] for i in order]
+    style = np.array([(0.0, *front, *back) for front, back in colours]).reshape(-1, 7)
+    n = len(TRIANGLES)
+    # Tiled once, an array keeps the order of its index; the kernel would be compiled for that order
+    # as well.
+    shade = np.ascontiguousarray(np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1)))
+    triangles = corners[:, TRIANGLES].reshape(-1, 3, 3)
+    faces = Triangles(triangles, np.repeat(uncut, n), shade, np.repeat(style, n, axis=0))
+    ends = corners[:, EDGES].reshape(-1, 2, 3)
+    return faces, Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
 
 
 def strokes_of(part: Segments, pose: F64, view: F64) -> F64:

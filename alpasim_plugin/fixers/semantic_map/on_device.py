@@ -1,6 +1,7 @@
-"""Draw the semantic map on a GPU: what is in view is sent, and its image stays there.
+"""Draw the semantic map on a GPU: a scene is uploaded once, a frame sends its pose and road users,
+and its image stays there.
 
-A primitive is a stroke or a shape, as `kernels` gives them, in `COLUMNS` columns:
+A primitive is a stroke or a shape, for which see `kernels`, in `COLUMNS` columns:
 
 - 0 to 3: its box, least x and y and greatest x and y, pixels
 - 4 and 5: its largest and smallest 1/depth; 6 to 8: 1/depth as a plane over the image, (a, b, c) of
@@ -14,13 +15,19 @@ A primitive is a stroke or a shape, as `kernels` gives them, in `COLUMNS` column
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.fixers.semantic_map import kernels, tile_kernel
+from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, Segments, Triangles
 from alpasim_plugin.fixers.semantic_map.raster import SAMPLES
+from alpasim_plugin.fixers.semantic_map.style import DEPTH_MAX_M, NEAR_M
 
 COLUMNS = 29
 TILE = 16  # pixels of a tile's side
@@ -28,27 +35,37 @@ SHORTEST = 1e-300  # in place of a squared length of 0
 
 
 def draw_tiles(
-    lines: F64, shapes: F64, edges: F64, size: tuple[int, int], rows: slice, device: torch.device
+    scene: PreparedMap,
+    view: F64,
+    pose: F64,
+    faces: Triangles,
+    edges: Segments,
+    rows: slice,
+    device: torch.device,
 ) -> Tensor:
-    """Return rows of the map of an image ``(h, W, 3)`` uint8; see `raster.draw_bands`.
+    """Return rows of the map of an image ``(h, W, 3)`` uint8; see `draw.draw_map`.
 
     Args:
-        lines, shapes, edges: Strokes, shapes, and strokes again, as `kernels` gives them.
-        size: Height and width of the image.
+        scene: Its static part is sent once.
+        view, pose: See `draw.view_of`.
+        faces, edges: Of road users.
         rows: Of the image.
         device: Where to draw.
     """
-    height, width = size
-    stretch = width / height
-    parts = _of_strokes(lines, stretch), _of_shapes(shapes), _of_strokes(edges, stretch)
-    primitives = np.concatenate(parts)
+    width, height = view[kernels.WIDTH : kernels.SCALE].astype(int).tolist()
+    segments, triangles, samples = _uploaded(scene, device)
+    camera = upload(np.concatenate([pose.ravel(), view, [1.0, width / height]]), device)
+    strokes = _strokes(torch.cat([segments, _rows(edges, device)]), camera)
+    shapes = _shapes(torch.cat([triangles, _rows(faces, device)]), camera)
+    primitives = torch.cat([strokes[: len(segments)], shapes, strokes[len(segments) :]])
+    hidden = primitives[:, 4] == 0
     levels = torch.empty((rows.stop - rows.start, width, 3), dtype=torch.uint8, device=device)
     tiles_x, tiles_y = -(-width // TILE), -(-len(levels) // TILE)
     tile_kernel.draw_tiles[(tiles_x * tiles_y,)](
-        torch.from_numpy(primitives).to(device),
-        torch.from_numpy(SAMPLES).to(device),
+        primitives[torch.sort(hidden, stable=True).indices],
+        samples,
         levels,
-        len(primitives),
+        (~hidden).sum(),
         rows.start,
         len(levels),
         width,
@@ -60,42 +77,92 @@ def draw_tiles(
     return levels
 
 
-def _of_strokes(strokes: F64, stretch: float) -> F64:
-    """Return the primitives of strokes; ``stretch`` is the image's width over its height."""
-    ends = strokes[:, : kernels.HALF].reshape(-1, 2, 3)
-    places, inverse = ends[..., :2], ends[..., 2]
-    half, style = strokes[:, kernels.HALF : kernels.BIAS], strokes[:, kernels.BIAS :]
-    scale = np.array([1.0, stretch])  # to where a stroke is as wide as it is high
-    begin, end = (places * scale).swapaxes(0, 1)
-    step = end - begin
-    share = step / np.maximum(np.sum(step**2, axis=1, keepdims=True), SHORTEST)
-    along = np.hstack([share * scale, -np.sum(share * begin, axis=1, keepdims=True)])
+@lru_cache(maxsize=8)
+def _uploaded(scene: PreparedMap, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a scene's segments and triangles, and the samples of a pixel, on a device."""
+    parts = _rows(scene.segments, device), _rows(scene.triangles, device)
+    return *parts, upload(SAMPLES, device)
+
+
+def _rows(part: Segments | Triangles, device: torch.device) -> Tensor:
+    """Send segments ``(S, 11)`` or triangles ``(T, 20)``, all their arrays side by side."""
+    flat = [array.reshape(len(array), math.prod(array.shape[1:])) for array in vars(part).values()]
+    return upload(np.hstack(flat), device)
+
+
+def _seen_at(points: Tensor, camera: Tensor) -> Tensor:
+    """Return points of the scene ``(..., 3)`` as pixels times depth, and depth."""
+    pose, (fx, skew, fy, cx, cy) = camera[:12].view(3, 4), camera[12:17]
+    x, y, z = (points @ pose[:, :3].T + pose[:, 3]).unbind(-1)
+    return torch.stack([fx * x + skew * y + cx * z, fy * y + cy * z, z], dim=-1)
+
+
+def _strokes(rows: Tensor, camera: Tensor) -> Tensor:
+    """Return the primitives of segments ``(S, COLUMNS)``, 0 where nothing is seen.
+
+    Args:
+        rows: See `_rows`.
+        camera: A pose, a view as of `kernels`, and by what x and y are multiplied so that a stroke
+            is as wide as it is high.
+    """
+    size, pixels, scale = camera[17:].split([2, 1, 2])
+    ends, style = _seen_at(rows[:, :6].unflatten(1, (2, 3)), camera), rows[:, 6:]
+    begin, step, depth = ends[:, :1], ends[:, 1:] - ends[:, :1], ends[..., 2]
+    limits = torch.cat([NEAR_M - depth[:, :1], DEPTH_MAX_M - depth[:, :1]], dim=1)
+    part = (limits / step[..., 2]).nan_to_num(0.0).sort(dim=1).values.clamp(0, 1)
+    cut = begin + part[..., None] * step
+    inverse = 1 / cut[..., 2:].clamp(min=NEAR_M)
+    places = cut[..., :2] * inverse
+    half = 0.5 * pixels * style[:, :1]
+    seen = (depth >= NEAR_M).any(1) & (depth < DEPTH_MAX_M).any(1)
+    seen &= ((places.amax(1) >= -half) & (places.amin(1) <= size + half)).all(1)
+    start, way = places[:, 0] * scale, (places[:, 1] - places[:, 0]) * scale
+    share = way / way.square().sum(1, keepdim=True).clamp(min=SHORTEST)
+    along = torch.cat([share * scale, -(share * start).sum(1, keepdim=True)], dim=1)
+    plane = along * (inverse[:, 1] - inverse[:, 0])
+    plane[:, 2:] += inverse[:, 0]
     columns = [
-        places.min(axis=1) - half / scale,
-        places.max(axis=1) + half / scale,
-        inverse.max(axis=1, keepdims=True),
-        inverse.min(axis=1, keepdims=True),
-        along * np.diff(inverse) + inverse[:, :1] * [0, 0, 1],
-        style,
+        places.amin(1) - half / scale,
+        places.amax(1) + half / scale,
+        inverse.amax(1),
+        inverse.amin(1),
+        plane,
         style[:, 1:],
+        style[:, 2:],
         half,
         along,
-        begin,
-        step,
-        np.zeros((len(ends), 5)),
+        start,
+        way,
+        half.new_zeros(len(half), 5),
     ]
-    return np.hstack(columns)
+    return torch.where(seen[:, None], torch.cat(columns, dim=1), 0.0)
 
 
-def _of_shapes(shapes: F64) -> F64:
-    """Return the primitives of shapes that have an area."""
-    corners = shapes[:, : kernels.NEAREST].reshape(-1, 3, 4).swapaxes(1, 2)
-    matrix = np.insert(corners[:, :2], 2, 1.0, axis=1)
-    seen = np.linalg.det(matrix) != 0.0
-    corners = corners[seen]
-    planes = np.linalg.inv(matrix[seen])  # each 1 in a corner, and 0 on the opposite edge
-    inverse, shade = ((corners[:, k : k + 1] @ planes)[:, 0] for k in (2, 3))
-    rest = shapes[seen, kernels.NEAREST :]
-    box = corners[:, :2].min(axis=2), corners[:, :2].max(axis=2)
-    flat = planes.reshape(-1, 9)
-    return np.hstack([*box, rest[:, :2], inverse, rest[:, 2:], 0 * flat[:, :1], flat, shade])
+def _shapes(rows: Tensor, camera: Tensor) -> Tensor:
+    """Return the primitives of triangles ``(T, COLUMNS)``, 0 where nothing is seen; see `_strokes`.
+    Of a triangle that crosses the near plane the kernel draws what lies beyond.
+    """
+    corners, closed, shade, style = rows.split([9, 1, 3, 7], dim=1)
+    seen_at = _seen_at(corners.unflatten(1, (3, 3)), camera)
+    planes = torch.linalg.cross(seen_at.roll(-1, 1), seen_at.roll(-2, 1))
+    volume = (planes * seen_at)[:, :1].sum(2)  # negative where the front is seen
+    planes = planes / volume[..., None]  # each 1/depth in a corner, and 0 on the opposite edge
+    depth = seen_at[..., 2]
+    near, far = depth.amin(1, keepdim=True), depth.amax(1, keepdim=True)
+    places = seen_at[..., :2] / depth[..., None]
+    low = torch.where(near < NEAR_M, -torch.inf, places.amin(1))
+    high = torch.where(near < NEAR_M, torch.inf, places.amax(1))
+    seen = (volume != 0) & ((volume < 0) | (closed == 0)) & (near < DEPTH_MAX_M) & (far >= NEAR_M)
+    seen &= ((high >= 0) & (low <= camera[17:19])).all(1, keepdim=True)
+    columns = [
+        low,
+        high,
+        1 / near.clamp(min=NEAR_M),
+        1 / far,
+        planes.sum(1),
+        style,
+        torch.zeros_like(near),
+        planes.flatten(1),
+        (planes * shade[..., None]).sum(1),
+    ]
+    return torch.where(seen, torch.cat(columns, dim=1), 0.0)

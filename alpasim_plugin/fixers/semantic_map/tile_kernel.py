@@ -14,6 +14,7 @@ import triton.language as tl
 
 from alpasim_plugin.fixers.semantic_map import style
 
+_NEAR_M = tl.constexpr(style.NEAR_M)
 _DEPTH_MAX_M = tl.constexpr(style.DEPTH_MAX_M)
 
 
@@ -22,7 +23,7 @@ def draw_tiles(
     primitives,
     samples,
     levels,
-    total,
+    count,
     top,
     rows,
     width,
@@ -48,7 +49,7 @@ def draw_tiles(
     stretch = tl.cast(width, tl.float64) / height
     depth = tl.full((TILE * TILE, 4), 0.0, tl.float32)
     colour = tl.full((TILE * TILE, 4), 0, tl.int32)
-    for k in range(total):
+    for k in range(tl.load(count)):
         p = primitives + k * COLUMNS
         in_columns = (tl.load(p) < left + TILE) & (tl.load(p + 2) > left)
         in_rows = (tl.load(p + 1) < tile_top + TILE) & (tl.load(p + 3) > tile_top)
@@ -73,8 +74,8 @@ def draw_tiles(
             else:
                 b = tl.load(p + 20) * sample_x + tl.load(p + 21) * sample_y + tl.load(p + 22)
                 c = tl.load(p + 23) * sample_x + tl.load(p + 24) * sample_y + tl.load(p + 25)
-                drawn = (a >= 0.0) & (b >= 0.0) & (c >= 0.0)
                 inverse = ix * sample_x + iy * sample_y + i0
+                drawn = (a >= 0.0) & (b >= 0.0) & (c >= 0.0) & (inverse * _NEAR_M <= 1.0)
                 inverse = tl.minimum(tl.maximum(inverse, farthest), nearest)
             inverse = inverse / tl.maximum(1.0 - tl.load(p + 9) * inverse, 1e-3)
             packed = tl.full((TILE * TILE, 1), 0, tl.int32)
