@@ -65,7 +65,9 @@ def draw_map(
         rows: The part of the image to draw and to return; None: all.
     """
     rows = slice(0, camera.height) if rows is None else rows
-    lines, shapes, box_edges = primitives_of(scene, camera, T_world_camera, actors)
+    view, pose, faces, edges = seen_from(scene, camera, T_world_camera, actors)
+    lines, box_edges = (strokes_of(part, pose, view) for part in (scene.segments, edges))
+    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
     image: U8 = np.empty((rows.stop, camera.width, 3), np.uint8)
     band = np.full(1, rows.start // BAND, np.int64)
     stretch = camera.width / camera.height
@@ -73,15 +75,6 @@ def draw_map(
         thread_count(threads), draw_bands, band, lines, box_edges, shapes, stretch, image
     )
     return image[rows]
-
-
-def primitives_of(
-    scene: PreparedMap, camera: CameraSpec, T_world_camera: F64, actors: Sequence[ActorBox]
-) -> tuple[F64, F64, F64]:
-    """Return the strokes of lines, the shapes, and the strokes of boxes' edges that are seen."""
-    view, pose, faces, edges = seen_from(scene, camera, T_world_camera, actors)
-    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
-    return strokes_of(scene.segments, pose, view), shapes, strokes_of(edges, pose, view)
 
 
 def draw_exposed_map(

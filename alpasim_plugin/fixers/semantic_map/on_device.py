@@ -107,15 +107,15 @@ def _strokes(rows: Tensor, camera: Tensor) -> Tensor:
     """
     size, pixels, scale = camera[17:].split([2, 1, 2])
     ends, style = _seen_at(rows[:, :6].unflatten(1, (2, 3)), camera), rows[:, 6:]
-    begin, step, depth = ends[:, :1], ends[:, 1:] - ends[:, :1], ends[..., 2]
-    limits = torch.cat([NEAR_M - depth[:, :1], DEPTH_MAX_M - depth[:, :1]], dim=1)
-    part = (limits / step[..., 2]).nan_to_num(0.0).sort(dim=1).values.clamp(0, 1)
-    cut = begin + part[..., None] * step
-    inverse = 1 / cut[..., 2:].clamp(min=NEAR_M)
+    begin, end, depth = ends[:, :1], ends[:, 1:], ends[..., 2:]
+    # Where a segment meets the near plane; beyond the far one the kernel draws nothing of it.
+    met = begin + (NEAR_M - begin[..., 2:]) / (end - begin)[..., 2:] * (end - begin)
+    cut = torch.where(depth >= NEAR_M, ends, met)
+    inverse = 1 / cut[..., 2:]
     places = cut[..., :2] * inverse
     half = 0.5 * pixels * style[:, :1]
-    seen = (depth >= NEAR_M).any(1) & (depth < DEPTH_MAX_M).any(1)
-    seen &= ((places.amax(1) >= -half) & (places.amin(1) <= size + half)).all(1)
+    on_image = (places.amax(1) >= -half) & (places.amin(1) <= size + half)
+    seen = (depth >= NEAR_M).any(1) & (depth < DEPTH_MAX_M).any(1) & on_image.all(1, keepdim=True)
     start, way = places[:, 0] * scale, (places[:, 1] - places[:, 0]) * scale
     share = way / way.square().sum(1, keepdim=True).clamp(min=SHORTEST)
     along = torch.cat([share * scale, -(share * start).sum(1, keepdim=True)], dim=1)
@@ -135,7 +135,7 @@ def _strokes(rows: Tensor, camera: Tensor) -> Tensor:
         way,
         half.new_zeros(len(half), 5),
     ]
-    return torch.where(seen[:, None], torch.cat(columns, dim=1), 0.0)
+    return torch.where(seen, torch.cat(columns, dim=1), 0.0)
 
 
 def _shapes(rows: Tensor, camera: Tensor) -> Tensor:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.geometry import wrap_angle
 from alpasim_plugin.core.types import F32, F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -84,9 +86,18 @@ class Sky:
         import torch.nn.functional as F
 
         if device not in self._uploaded:
-            panorama = torch.from_numpy(self._panorama.transpose(2, 0, 1).copy())
-            self._uploaded[device] = panorama.to(device)[None]
-        coarse = torch.from_numpy(np.stack(self._places(camera)).astype(np.float32)).to(device)
+            self._uploaded[device] = upload(self._panorama.transpose(2, 0, 1), device)[None]
+        along = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K)
+        v, u = (
+            STEP_PX * torch.arange(-(-size // STEP_PX) + 1, device=device).double()
+            for size in (camera.height, camera.width)
+        )
+        x, y, z = (a * u + (b * v + c)[:, None] for a, b, c in along.tolist())
+        ahead = math.atan2(*camera.T_camera_world[2, 1::-1])
+        turn = torch.remainder(torch.atan2(y, x) - ahead + math.pi, 2 * math.pi) - math.pi
+        above = torch.atan2(z, torch.hypot(x, y)) - HIGH_RAD
+        columns = (ahead + turn) * (WIDTH / (2 * math.pi))
+        coarse = torch.stack([columns, above * ((HEIGHT - 1) / (LOW_RAD - HIGH_RAD))]).float()
         finer = F.interpolate(
             coarse[None], scale_factor=STEP_PX, mode="bilinear", align_corners=False
         )
