@@ -1,11 +1,15 @@
 """The check of a card, tried on the CPU: its sections, and how it reports those that fail."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.runs import gpu_check
+from tests.fixers.views import EMPTY
 
 
 def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch):
@@ -32,12 +36,15 @@ def test_images_that_differ_fail_the_section(levels, monkeypatch):
     assert (facts["10x10"]["levels"], facts["ok"]) == (levels, levels == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section", ["semantic_map", "gradient"])
 def test_a_section_compares_a_card_with_the_processor(section, monkeypatch):
     pytest.importorskip("triton", reason="Triton is not installed")
     from tests.pretended_device import pretended_device
 
-    for name, value in {"SIZES": [(32, 18)], "SPLATS": 100, "REPEATS": 1}.items():
+    part = {"prepare_map": lambda full: prepare_map(replace(EMPTY, road_edges=full.road_edges[:1]))}
+    small = {"SIZES": [(16, 9)], "SPLATS": 40, "REPEATS": 1, **part}
+    for name, value in small.items():
         monkeypatch.setattr(gpu_check, name, value)
     with pretended_device(monkeypatch) as traffic:
         facts = gpu_check.SECTIONS[section]("cuda:0")

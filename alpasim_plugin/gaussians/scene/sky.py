@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -10,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.devices import upload
-from alpasim_plugin.core.geometry import wrap_angle
-from alpasim_plugin.core.types import F32, F64
+from alpasim_plugin.core.geometry import se2, wrap_angle
+from alpasim_plugin.core.types import F32, F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 Kind = Literal["clear", "overcast", "dusk"]
 WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
 LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
+SPAN_PX = np.array([WIDTH, HEIGHT - 1], np.float32)
+PX_PER_RAD = SPAN_PX / np.array([2 * np.pi, LOW_RAD - HIGH_RAD])
 BLOCK = 16  # rows that are painted at once
 PARTS = 32  # of a pixel, between which colours are interpolated
 STEP_PX = 8  # directions are computed this often and interpolated in between
@@ -65,7 +68,7 @@ class Sky:
     def __init__(self, panorama: F32) -> None:
         # One column repeated at the seam: interpolation never leaves the image.
         self._panorama = np.ascontiguousarray(np.concatenate([panorama, panorama[:, :1]], axis=1))
-        self._uploaded: dict[str, Tensor] = {}
+        self._uploaded: dict[str, list[Tensor]] = {}
 
     @property
     def panorama(self) -> F32:
@@ -86,30 +89,28 @@ class Sky:
         import torch.nn.functional as F
 
         if device not in self._uploaded:
-            self._uploaded[device] = upload(self._panorama.transpose(2, 0, 1), device)[None]
-        along = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K)
-        v, u = (
-            STEP_PX * torch.arange(-(-size // STEP_PX) + 1, device=device).double()
-            for size in (camera.height, camera.width)
-        )
-        x, y, z = (a * u + (b * v + c)[:, None] for a, b, c in along.tolist())
+            parts = self._panorama.transpose(2, 0, 1), PX_PER_RAD, 2 / SPAN_PX
+            self._uploaded[device] = [upload(part, device) for part in parts]
+        panorama, px_per_rad, shares = self._uploaded[device]
         ahead = math.atan2(*camera.T_camera_world[2, 1::-1])
-        turn = torch.remainder(torch.atan2(y, x) - ahead + math.pi, 2 * math.pi) - math.pi
-        above = torch.atan2(z, torch.hypot(x, y)) - HIGH_RAD
-        columns = (ahead + turn) * (WIDTH / (2 * math.pi))
-        coarse = torch.stack([columns, above * ((HEIGHT - 1) / (LOW_RAD - HIGH_RAD))]).float()
-        finer = F.interpolate(
-            coarse[None], scale_factor=STEP_PX, mode="bilinear", align_corners=False
-        )
+        T_camera_ahead = camera.T_camera_world[:3, :3] @ se2(0, 0, ahead)[:3, :3]
+        rays = T_camera_ahead.T @ np.linalg.inv(camera.K)
+        middle = np.array([ahead, -HIGH_RAD]) * PX_PER_RAD
+        numbers = upload(np.concatenate([rays.ravel(), middle]), device)
+        corners = _corners(camera.height, camera.width, device)
+        x, y, z = numbers[:9].view(3, 3) @ corners.flatten(1)
+        angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=1)
+        places = torch.addcmul(numbers[9:], angles, px_per_rad).float().T
+        coarse = places.view(1, 2, *corners.shape[1:])
+        finer = F.interpolate(coarse, scale_factor=STEP_PX, mode="bilinear", align_corners=False)
         first = STEP_PX // 2
         window = finer[0, :, first : first + camera.height, first : first + camera.width]
         # OpenCV interpolates at the nearest 32nd of a pixel.
-        columns, rows = (window * PARTS).round_().div_(PARTS).unbind()
-        columns = columns + WIDTH * (columns < 0)
-        places = torch.stack([columns * (2 / WIDTH) - 1, rows * (2 / (HEIGHT - 1)) - 1], dim=-1)
+        window = (window * PARTS).round_().div_(PARTS)
+        window[0].remainder_(WIDTH)
         image = F.grid_sample(
-            self._uploaded[device],
-            places[None],
+            panorama[None],
+            (window.permute(1, 2, 0) * shares - 1)[None],
             mode="bilinear",
             padding_mode="border",
             align_corners=True,
@@ -121,8 +122,7 @@ class Sky:
         be negative.
         """
         h, w = camera.height, camera.width
-        u = np.arange(-(-w // STEP_PX) + 1) * STEP_PX
-        v = np.arange(-(-h // STEP_PX) + 1) * STEP_PX
+        u, v = _steps(w), _steps(h)
         x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
         ray = np.stack(
             [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
@@ -140,6 +140,18 @@ class Sky:
         azimuth = ahead + wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
         rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
         return azimuth * (WIDTH / (2 * np.pi)), rows
+
+
+def _steps(size: int) -> I64:
+    """Return every `STEP_PX`-th pixel corner along an axis, as far as the image goes."""
+    return np.arange(-(-size // STEP_PX) + 1) * STEP_PX
+
+
+@lru_cache(maxsize=8)
+def _corners(height: int, width: int, device: str) -> Tensor:
+    """Return these corners on a device ``(3, H', W')``: u, v, 1."""
+    u, v = np.meshgrid(_steps(width), _steps(height))
+    return upload(np.stack([u, v, np.ones_like(u)]).astype(np.float64), device)
 
 
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
