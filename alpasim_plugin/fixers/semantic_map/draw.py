@@ -125,18 +125,8 @@ def seen_from(
     T = np.array(T_world_camera, dtype=np.float64)
     T[:3, 3] -= scene.origin  # the difference of large coordinates is taken here, once, in float64
     pose = np.ascontiguousarray(inverse(T)[:3])
-    return np.array(view), pose, *actor_geometry(actors, scene, pose)
-
-
-def actor_geometry(
-    actors: Sequence[ActorBox], scene: PreparedMap, pose: F64
-) -> tuple[Triangles, Segments]:
-    """Return the faces and edges of road users, the nearest first, so that hidden ones are not
-    shaded.
-
-    Boxes cut by the near plane show their inner faces; other boxes are marked closed, so that faces
-    turned away are culled.
-    """
+    # The faces of road users, the nearest first, so that hidden ones are not shaded. Boxes cut by
+    # the near plane show their inner faces; of others, faces turned away are culled.
     poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
     boxes = [actor.box for actor in actors]
     lengths = [(box.length_m, box.width_m, box.height_m) for box in boxes]
@@ -155,7 +145,8 @@ def actor_geometry(
     triangles = corners[:, TRIANGLES].reshape(-1, 3, 3)
     faces = Triangles(triangles, np.repeat(uncut, n), shade, np.repeat(style, n, axis=0))
     ends = corners[:, EDGES].reshape(-1, 2, 3)
-    return faces, Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
+    edges = Segments(ends, np.tile(EDGE_STYLE, (len(ends), 1)))
+    return np.array(view), pose, faces, edges
 
 
 def strokes_of(part: Segments, pose: F64, view: F64) -> F64:
