@@ -222,7 +222,12 @@ def _moved(tensor, device, func, args, kwargs):
         rest = [value for value in args[1:] if _device_of(value) is None]
         others = {key: value for key, value in kwargs.items() if key != "device"}
         return func(tensor, *rest, **others) if rest or others else tensor
-    moved = _uploaded(tensor) if device.type == "cuda" else _downloaded(tensor.held.clone())  # type: ignore[attr-defined]
+    if device.type == "cuda":
+        moved = _uploaded(tensor)
+        if kwargs.get("non_blocking") is not True:
+            traffic.waits["copy to the device"] += 1
+    else:
+        moved = _downloaded(tensor.held.clone())
     types = [value for value in (*args[1:], *kwargs.values()) if isinstance(value, torch.dtype)]
     return moved.to(types[0]) if types else moved
 

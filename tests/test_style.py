@@ -182,3 +182,27 @@ def test_files_are_read_in_one_place_which_refuses_pipes_and_devices():
         if not module.name.startswith("alpasim_plugin.lab") and reads_files(module)
     }
     assert found - set(READERS) == set()
+
+
+MAKES = ("torch.tensor", "torch.as_tensor", "torch.from_numpy")
+
+
+def makes_the_host_wait(call):
+    """Return whether a call sends a tensor of the host to a device, and waits for it."""
+    arguments = {keyword.arg: keyword.value for keyword in call.keywords}
+    if "device" in arguments and dotted(call.func) in MAKES:
+        return not isinstance(arguments["device"], ast.Constant)
+    sends = isinstance(call.func, ast.Attribute) and call.func.attr in ("to", "cuda")
+    inner = (dotted(node.func) for node in ast.walk(call.func) if isinstance(node, ast.Call))
+    of_type = call.args and dotted(call.args[0]).startswith("torch.")
+    return sends and any(name in MAKES for name in inner) and not of_type
+
+
+def test_tensors_of_the_host_are_sent_in_one_place_which_does_not_wait():
+    found = {
+        f"{module.name}:{node.lineno}"
+        for module in modules()
+        for node in module.nodes
+        if isinstance(node, ast.Call) and makes_the_host_wait(node)
+    }
+    assert found == set()

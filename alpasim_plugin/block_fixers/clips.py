@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8
 from alpasim_plugin.fixers.views import HALF, ClipSize, Views
@@ -120,7 +121,7 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
     """
 
     def video(images: U8 | F32) -> Tensor:
-        x = torch.from_numpy(images).to(device).float()
+        x = upload(images, device).float()
         x = x if images.dtype == np.float32 else x.div_(HALF).sub_(1)
         x = x.permute(0, 4, 1, 2, 3)
         short = frames_due - x.shape[2]

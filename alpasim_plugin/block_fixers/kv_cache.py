@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.block_fixers.attention import Rope3D, RopeTable, attend
+from alpasim_plugin.core.devices import upload
 
 
 class BlockCache(ABC):
@@ -124,5 +125,5 @@ class RollingCache(BlockCache):
         return attend(q, *torch.cat([buffer[:, :, :past], own], dim=2))
 
     def _token_rows(self, latents: list[int]) -> Tensor:
-        first = torch.tensor(latents, dtype=torch.long, device=self.device)[:, None] * self.tokens
+        first = upload(torch.tensor(latents, dtype=torch.long), self.device)[:, None] * self.tokens
         return (first + torch.arange(self.tokens, device=self.device)).flatten()

@@ -25,6 +25,7 @@ from alpasim_plugin.block_fixers.clips import (
 from alpasim_plugin.block_fixers.networks import LATENT, load_networks
 from alpasim_plugin.block_fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.seeding import stream
@@ -190,7 +191,7 @@ class OneFixer(Fixer):
         drawn = latent_noise(
             self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape
         )
-        noise = [eps.to(self.networks.device) for eps in drawn]
+        noise = [upload(eps, self.networks.device) for eps in drawn]
         video, state = self.pipeline.run(history.state, clip.rgb, clip.alpha, clip.maps, noise)
         video = crop_clip(video, view.size)
         images = to_images(video, view.size)

@@ -51,11 +51,14 @@ def share_card(device: str, workers: int) -> None:
         torch.cuda.set_per_process_memory_fraction(1 / workers, device)
 
 
-def upload(array: npt.ArrayLike, place: device | str) -> Tensor:
-    """Return a copy of an array as a tensor of a device, for which the host does not wait."""
+def upload(array: npt.ArrayLike | Tensor, place: device | str) -> Tensor:
+    """Return a copy of an array as a tensor of a device, or a tensor there, for which the host does
+    not wait.
+    """
     import torch
 
-    return torch.tensor(array).to(place, non_blocking=True)
+    tensor = array if isinstance(array, torch.Tensor) else torch.tensor(array)
+    return tensor.to(place, non_blocking=True)
 
 
 def download(*parts: Tensor) -> list[Any]:

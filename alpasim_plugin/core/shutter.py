@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp, transform_points
 from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Exposure, RenderRequest
 
@@ -57,7 +58,7 @@ class Band:
         else:
             import torch
 
-            exposed = torch.from_numpy(self.exposed.copy()).to(whole.device)
+            exposed = upload(self.exposed, whole.device)
             exposed = exposed.reshape(*exposed.shape, *[1] * (part.ndim - 2))
             window[...] = torch.where(exposed, part, window)
 

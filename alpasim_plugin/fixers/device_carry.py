@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.fixers import ground
@@ -48,10 +49,10 @@ class UploadedImage:
     hidden: Tensor
 
 
-def upload(recorded: RecordedImage, device: torch.device) -> UploadedImage:
+def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage:
     """Send a recorded frame, as of `ground.with_users`, to a device."""
     parts = recorded.rgb, recorded.depth, ground.hidden_by_users(recorded).depth
-    rgb, depth, hidden = (torch.from_numpy(part.copy()).to(device) for part in parts)
+    rgb, depth, hidden = (upload(part, device) for part in parts)
     return UploadedImage(recorded, rgb.permute(2, 0, 1)[None].float(), depth, hidden)
 
 
@@ -91,12 +92,12 @@ def _rays(depth: Tensor) -> Tensor:
 
 def _column(values: F64, like: Tensor) -> Tensor:
     """Return numbers ``(M,)`` as an image of one pixel on a device."""
-    return torch.from_numpy(np.array(values)).to(like.device)[:, None, None]
+    return upload(values, like.device)[:, None, None]
 
 
 def _turned(matrix: F64, points: Tensor) -> Tensor:
     """Return a matrix ``(M, 3)`` times points."""
-    return torch.tensordot(torch.from_numpy(np.array(matrix)).to(points.device), points, dims=1)
+    return torch.tensordot(upload(matrix, points.device), points, dims=1)
 
 
 def _warp(

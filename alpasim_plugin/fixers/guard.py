@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.devices import known_false
+from alpasim_plugin.core.devices import known_false, upload
 from alpasim_plugin.core.image_metrics import BLACK_MAX
 from alpasim_plugin.core.types import F32, U8
 
@@ -53,7 +53,7 @@ def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     """
     first = (fixed[0], raw[0]) if before is None else before
     images, pasts = (
-        [torch.from_numpy(np.ascontiguousarray(part)).to(video.device) for part in parts]
+        [upload(part, video.device) for part in parts]
         for parts in (
             (fixed, raw),
             (

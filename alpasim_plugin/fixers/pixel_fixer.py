@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.devices import CapturedFunction, Sizes, download, sizes_of
+from alpasim_plugin.core.devices import CapturedFunction, Sizes, download, sizes_of, upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import OPACITY_MEAN, U8, Frame
@@ -261,7 +261,7 @@ class PixelFixer(Fixer):
         frames = [block[index] for (index,) in view.index]
         drawn = [] if isinstance(view.rgb, np.ndarray) else planes_of(frames)
         rgb, alpha, maps, references = (
-            None if part is None else torch.as_tensor(part[:, 0]).to(device)
+            None if part is None else upload(torch.as_tensor(part[:, 0]), device)
             for part in (view.rgb, view.alpha, view.maps, view.references)
         )
         assert rgb is not None
@@ -338,7 +338,7 @@ class PixelFixer(Fixer):
             ]
             for draw in range(len(settings.steps))
         ]
-        return torch.tensor(keys).to(rgb.device)
+        return upload(keys, rgb.device)
 
     def _run(self, given: GivenFrame) -> FixedFrame:
         """Run `fix_frame`, on a GPU as a graph that was recorded for tensors of these sizes."""

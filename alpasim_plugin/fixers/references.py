@@ -201,7 +201,7 @@ class ReferenceSession:
         for i in chosen:
             recorded = self._recorded_image(i)
             if i not in self._uploaded:
-                self._uploaded[i] = device_carry.upload(recorded, device)
+                self._uploaded[i] = device_carry.upload_image(recorded, device)
         images = [self._uploaded[i] for i in chosen]
 
         def carried(drawn: DevicePlanes) -> Mapping[str, Any]:

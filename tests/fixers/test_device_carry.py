@@ -8,7 +8,7 @@ import torch
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.fixers.device_carry import carry_on_device, upload
+from alpasim_plugin.fixers.device_carry import carry_on_device, upload_image
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
 from tests.fixers.test_ground import K, recorded, rig, street
@@ -35,7 +35,7 @@ def test_images_equal_those_of_the_processor(count, wall_m):
     wanted = carry(images, view, rig(10.0))
     on_device = replace(view, depth=torch.from_numpy(depth))
     found = carry_on_device(
-        [upload(one, torch.device("cpu")) for one in images], on_device, rig(10.0)
+        [upload_image(one, torch.device("cpu")) for one in images], on_device, rig(10.0)
     )
     assert found.dtype == torch.uint8
     for one, other in zip(found.numpy(), wanted, strict=True):

@@ -141,9 +141,7 @@ class SplatModel:
         if not len(moving):
             parts = [*(p[name][:still] for name in NAMES[:4]), sh[:still]]
             return Splats(*parts), torch.arange(still, device=self.device)
-        node, moving = (
-            rows.to(self.device, non_blocking=True) for rows in (self.node[moving], moving)
-        )
+        node, moving = (upload(rows, self.device) for rows in (self.node[moving], moving))
         means = (
             torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
             + motion.shift[node]
@@ -373,6 +371,6 @@ def densify(
 
 def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
     model.node = model.node[rows]
-    rows = rows.to(model.device)
+    rows = upload(rows, model.device)
     model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
     adam.take(rows, old)

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.types import F32
 
 CHANCE = 0.3  # of each of two cut-outs
@@ -33,7 +33,7 @@ def cut_out(rng: np.random.Generator, render: Tensor, tries: int = 2) -> Tensor:
         for _ in range(tries):
             if rng.random() < CHANCE:
                 one *= 1 - soft_mask(rng, height, width)
-    return (render + 1) * torch.from_numpy(keep).to(render)[:, None, None] - 1
+    return (render + 1) * upload(keep, render.device)[:, None, None] - 1
 
 
 def soft_mask(rng: np.random.Generator, height: int, width: int) -> F32:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.sampling import context_level, mixed_source
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers.network.schedule import TABLE, interpolant, shifted
 from alpasim_plugin.lab.training.clip_batches import ClipBatches, Drawn
@@ -157,10 +158,10 @@ def noise_levels(
     t = s.t[:, first]
     t = config.shift * t / (1 + (config.shift - 1) * t) if config.shift != 1 else t
     rng = stream("training", seed, "generator.levels", index)
-    kind = torch.from_numpy(rng.random(tuple(s.t.shape))).to(device)[:, first]
+    kind = upload(rng.random(tuple(s.t.shape)), device)[:, first]
     t = torch.where(kind < config.source_share, torch.ones_like(t), t)
     t = torch.where(kind > 1 - config.context_share, torch.full_like(t, context_level().sigma), t)
-    from_noise = torch.from_numpy(rng.random(len(s.t)) < config.noise_share).to(device)[
+    from_noise = upload(rng.random(len(s.t)) < config.noise_share, device)[
         :, None, None, None, None
     ]
     return t, from_noise

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstrations_digest
@@ -88,8 +89,8 @@ class PolicyTask:
         self.net, self.demonstrations, self.recipe = net, demonstrations, recipe
         self.ends = np.cumsum([len(one) for one in demonstrations])
         device = next(net.parameters()).device
-        self.weights = torch.from_numpy(knot_weights()).float().to(device)
-        knots_m = torch.tensor(KNOTS_M).to(device)
+        self.weights = upload(knot_weights(), device).float()
+        knots_m = upload(KNOTS_M, device)
         self.rows = knots_m.long()  # knots lie on whole metres
         self.unit_m = recipe.lateral_scale_m + recipe.lateral_scale_per_m * knots_m
 

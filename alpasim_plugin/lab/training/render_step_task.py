@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.image_fixers.settings import RenderStepSettings
@@ -155,6 +156,6 @@ def largest_distance(
         render, clean = batches[
             len(found)
         ]  # any batches will do, as long as they are always the same
-        shown = (images[:, :, -1].to(device) for images in (render, clean))
+        shown = (upload(images[:, :, -1], device) for images in (render, clean))
         found += distance(*shown).tolist()
     return float(f"{np.quantile(found, share):.3g}")

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.core.atomic import atomic_file, disk_error, write_safetensors, write_text
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.reading import parse_json, parsing, read_text
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
@@ -410,7 +411,7 @@ def moved(value: Any, device: torch.device) -> Any:
     of them; anything else as it is.
     """
     if isinstance(value, Tensor):
-        return value.to(device)
+        return upload(value, device)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {field.name: getattr(value, field.name) for field in fields(value)}
         return replace(value, **moved(parts, device))

@@ -20,7 +20,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.codec_weights import LatentStats
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
-from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.devices import require_device, upload
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.bundle import parts_of
@@ -157,7 +157,7 @@ class VaeTask:
         noise = stream("training", self.recipe.seed, f"vae.noise.{which}", index).standard_normal(
             z.shape, dtype="float32"
         )
-        return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
+        return z, z + self.recipe.latent_noise * upload(noise, z.device).to(z.dtype)
 
 
 def train_vae(
