@@ -144,16 +144,16 @@ def test_sigma_sends_no_gradient_into_the_plan(root):
 
 def test_an_update_on_a_device_waits_once(root, tmp_path, monkeypatch):
     pytest.importorskip("triton", reason="Triton is not installed")
-    from tests.pretended_device import pretended_device
+    from tests.pretended_device import pretended_device, traffic
 
     def update(device):
         net = LearnedNet(0).to(device)
         task = PolicyTask(net, read_demonstrations(root, "train"), PolicyRecipe(batch=4))
         trainer = Trainer(net, tmp_path / device, Schedule(1), task.batch, task.loss, {})
+        traffic.reset()
         return trainer._update()["loss"]
 
     wanted = update("cpu")
-    with pretended_device(monkeypatch) as traffic:
-        traffic.reset()
+    with pretended_device(monkeypatch):
         assert update("cuda") == pytest.approx(wanted, rel=1e-4)
         assert sum(traffic.waits.values()) == 1
