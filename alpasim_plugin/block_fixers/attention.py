@@ -28,6 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.layers import RMSNorm
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
 
 BASE = 10000.0
@@ -108,7 +109,7 @@ class Rope3D:
             ],
             dim=-1,
         ).reshape(-1, self.head_width // 2)
-        return half.cos().float().to(device), half.sin().float().to(device)
+        return upload(half.cos().float(), device), upload(half.sin().float(), device)
 
 
 def rotate(x: Tensor, table: RopeTable) -> Tensor:

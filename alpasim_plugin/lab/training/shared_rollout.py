@@ -22,6 +22,7 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.sampling import finalise, flow_step, mixed_source
+from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import interpolant
 from alpasim_plugin.lab.training.graph_cache import GraphCache
@@ -179,7 +180,8 @@ def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
     return (
         squares
         if channel_weights is None
-        else squares * channel_weights.to(squares.device).view(1, -1, *[1] * (squares.ndim - 2))
+        else squares
+        * upload(channel_weights, squares.device).view(1, -1, *[1] * (squares.ndim - 2))
     )
 
 
