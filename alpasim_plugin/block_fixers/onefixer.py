@@ -165,7 +165,17 @@ class OneFixer(Fixer):
             self._pending = tuple(
                 self._fix(view, history) for view, history in zip(views, self._history, strict=True)
             )
-        return self._frames(block)
+        out = list(block)
+        for pending in self._pending:
+            for b, mine in enumerate(pending.views.index):
+                for t, i in enumerate(mine):
+                    event = pending.events[b][t]
+                    out[i] = (
+                        replace(block[i], events=(*block[i].events, event))
+                        if event
+                        else replace(block[i], rgb=pending.images[b, t])
+                    )
+        return tuple(out)
 
     def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
         """Fix a block and add it to the history. A block equal to the last preview's is not
@@ -213,16 +223,3 @@ class OneFixer(Fixer):
             keep(block.state),
             tuple(zip(block.images[:, -1], view.rgb[:, -1], strict=True)),
         )
-
-    def _frames(self, block: Sequence[Frame]) -> tuple[Frame, ...]:
-        out = list(block)
-        for pending in self._pending:
-            for b, mine in enumerate(pending.views.index):
-                for t, i in enumerate(mine):
-                    event = pending.events[b][t]
-                    out[i] = (
-                        replace(block[i], events=(*block[i].events, event))
-                        if event
-                        else replace(block[i], rgb=pending.images[b, t])
-                    )
-        return tuple(out)

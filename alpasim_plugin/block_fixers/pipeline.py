@@ -145,8 +145,7 @@ class BlockPipeline:
             else:
                 cache.commit()
 
-        latent = state.latent + z_0.shape[2]
-        return out, PipelineState(latent, encoder, decoder, cache, write)
+        return out, PipelineState(state.latent + z_0.shape[2], encoder, decoder, cache, write)
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:

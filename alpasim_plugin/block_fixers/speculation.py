@@ -161,7 +161,18 @@ class SpeculativeRenderer(FixedRenderer):
             frames = [frame for _, frame in predicted]
             shown = forecasts
         else:
-            frames = self._make_draft(ordered)
+            # A draft: the true frames so far with the predicted rest of the block.
+            left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
+            coming = min(left, *(len(request.ahead) for request in ordered))
+            block = list(self.true)
+            block += [
+                [self.runner.render(request.ahead[k]) for request in ordered] for k in range(coming)
+            ]
+            fixed = self._fix(self.fixer.preview, block)
+            self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]
+            self.stats.drafts += 1
+            self.stats.redrafts += len(self.true) > 1
+            frames = fixed[len(self.true) - 1]
         self.stats.frames += len(ordered)
         self.stats.predicted += len(forecasts)
         self.stats.hits += len(ordered) if is_hit else 0
@@ -172,22 +183,6 @@ class SpeculativeRenderer(FixedRenderer):
             for i, frame in enumerate(frames)
         }
         return [made[request.camera.name] for request in requests]
-
-    def _make_draft(self, requests: Sequence[RenderRequest]) -> list[Frame]:
-        """Fix the true frames so far with the predicted rest of the block and return the newest
-        true ones.
-        """
-        left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
-        coming = min(left, *(len(request.ahead) for request in requests))
-        block = list(self.true)
-        block += [
-            [self.runner.render(request.ahead[k]) for request in requests] for k in range(coming)
-        ]
-        fixed = self._fix(self.fixer.preview, block)
-        self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]
-        self.stats.drafts += 1
-        self.stats.redrafts += len(self.true) > 1
-        return fixed[len(self.true) - 1]
 
     def _fix(
         self, call: Callable[..., Sequence[Frame]], block: Sequence[Sequence[ConditionedFrame]]

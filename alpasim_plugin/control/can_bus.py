@@ -145,7 +145,8 @@ class Exchange:
         Raises:
             PolicyError: The bus refuses to send.
         """
-        self._drain(t_us)
+        while (frame := self.bus.recv(0)) is not None:
+            self.counts["late"] += bool(self._take(frame, t_us))
         for sent in self.codec.map.send:
             if t_us % sent.period_us == 0:
                 try:
@@ -189,13 +190,6 @@ class Exchange:
             else {}
         )
         return {"frames": dict(self.counts), "latency_ms": quantiles}
-
-    def _drain(self, t_us: int) -> None:
-        """Take in what came after the last deadline: too late for its instant, yet the newest that
-        is known.
-        """
-        while (frame := self.bus.recv(0)) is not None:
-            self.counts["late"] += bool(self._take(frame, t_us))
 
     def _take(self, frame: can.Message, t_us: int) -> list[_Command]:
         """Take in a frame; return the commands that it renews, none where it is refused or

@@ -221,28 +221,23 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         ) from error
     codec = Codec(can_map, loaded)
     for part in can_map.parts:
-        _check(codec, database, part)
+        where = f"{database}, message {part.message}"
+        trial = Codec(codec.map, codec.database)
+        try:
+            if isinstance(part, Sent):
+                frame = trial.encode(part, dict.fromkeys(part.signals.values(), 0.0))
+            else:
+                frame = trial.encode_command(part, 0.0)
+                trial.decode(part, bytes(frame.data))
+            codec.message(part.message).decode(bytes(frame.data))
+        except Exception as refusal:  # the library raises errors of many kinds
+            raise InputError(
+                f"{where}: it cannot be sent as the map says: {type(refusal).__name__}: {refusal}",
+                "correct the map, or name a database of the vehicle that the map is for",
+            ) from refusal
+        if codec.message(part.message).is_multiplexed():
+            raise InputError(f"{where}: it is multiplexed", "name messages of one layout")
     return codec
-
-
-def _check(codec: Codec, database: Path, part: Sent | Received) -> None:
-    """Refuse a message that cannot be sent or read as a map says: it is made and read once."""
-    where = f"{database}, message {part.message}"
-    trial = Codec(codec.map, codec.database)
-    try:
-        if isinstance(part, Sent):
-            frame = trial.encode(part, dict.fromkeys(part.signals.values(), 0.0))
-        else:
-            frame = trial.encode_command(part, 0.0)
-            trial.decode(part, bytes(frame.data))
-        codec.message(part.message).decode(bytes(frame.data))
-    except Exception as error:  # the library raises errors of many kinds
-        raise InputError(
-            f"{where}: it cannot be sent as the map says: {type(error).__name__}: {error}",
-            "correct the map, or name a database of the vehicle that the map is for",
-        ) from error
-    if codec.message(part.message).is_multiplexed():
-        raise InputError(f"{where}: it is multiplexed", "name messages of one layout")
 
 
 def is_fd(message: Any) -> bool:

@@ -24,7 +24,15 @@ import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, grip_share, step
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_from_quat, yaw_of
+from alpasim_plugin.core.geometry import (
+    direction_of,
+    interpolate,
+    left_of,
+    se2,
+    wrap_angle,
+    yaw_from_quat,
+    yaw_of,
+)
 from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
@@ -47,7 +55,7 @@ _BEFORE = np.tril(
     np.ones((NODES, NODES)), -1
 )  # d steer at the start of step k / d change in step j
 _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
-_UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
+_UP_TO = np.tril(np.ones((NODES, NODES), bool))
 
 
 def check_interval(state: EgoState, to_us: int) -> float:
@@ -116,7 +124,7 @@ class PerfectController(Controller):
         turn = float(wrap_angle(yaw_of(pose) - yaw_of(state.T_world_rig)))
         # The chord of the step points along its mean heading.
         mean_yaw = yaw_of(state.T_world_rig) + turn / 2
-        speed = float(moved @ np.array([np.cos(mean_yaw), np.sin(mean_yaw)])) / dt_s
+        speed = float(moved @ direction_of(mean_yaw)) / dt_s
         yaw_rate = turn / dt_s
         steer = (
             float(np.arctan(self.vehicle.wheelbase_m * yaw_rate / speed))
@@ -147,7 +155,7 @@ class ReferencePath:
         return (
             self.path_s[1:] - self.path_s[:-1],
             step,
-            np.stack([-tangent[:, 1], tangent[:, 0]], axis=1),
+            left_of(tangent),
         )
 
     def progress(self, t_s: F64) -> F64:
@@ -189,7 +197,7 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     """
     xy = plan.xyz[:, :2] - origin_xy
     yaw = yaw_from_quat(plan.quat)
-    heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    heading = direction_of(yaw)
     mean = heading[:-1] + heading[1:]
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     s = np.concatenate([[0.0], np.cumsum(np.sum((xy[1:] - xy[:-1]) * mean, axis=1))])
@@ -295,17 +303,15 @@ class PlanTracker(Controller):
         for _ in range(GAUSS_NEWTON_STEPS):
             max_steer = self.vehicle.max_steer_rad
             middle = np.minimum(np.maximum(start + _MIDDLE @ change, -max_steer), max_steer)
-            turn = ds * np.tan(middle) / wheelbase
-            yaw_middle = now.yaw_rad + _MIDDLE @ turn
-            along = np.stack([np.cos(yaw_middle), np.sin(yaw_middle)], axis=1)
+            yaw_middle = now.yaw_rad + _MIDDLE @ (ds * np.tan(middle) / wheelbase)
+            along = direction_of(yaw_middle)
             position = np.array([now.x_m, now.y_m]) + ds * np.cumsum(along, axis=0)
             error = np.sum(normal * (position - target), axis=1)
             d_turn = (ds / wheelbase / np.cos(middle) ** 2)[:, None] * _MIDDLE
             d_yaw = _MIDDLE @ d_turn
-            left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            left = left_of(along)
             # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
-            lever = np.where(_UP_TO, ds * (normal @ left.T), 0.0)
-            jacobian = lever @ d_yaw
+            jacobian = np.where(_UP_TO, ds * (normal @ left.T), 0.0) @ d_yaw
             hessian = jacobian.T @ jacobian
             hessian.reshape(-1)[:: NODES + 1] += weight**2
             change = change - np.linalg.solve(hessian, jacobian.T @ error + weight**2 * change)

@@ -118,6 +118,16 @@ def yaw_of(transform: F64) -> float:
     return float(np.arctan2(transform[1, 0], transform[0, 0]))
 
 
+def direction_of(yaw_rad: npt.ArrayLike) -> F64:
+    """Return the unit vectors ``(..., 2)`` of headings ``(...)``."""
+    return np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+
+
+def left_of(along: F64) -> F64:
+    """Return vectors ``(..., 2)`` turned to the left by a right angle."""
+    return np.stack([-along[..., 1], along[..., 0]], axis=-1)
+
+
 def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
     """Interpolate unit quaternions ``(N, 4)`` on the shorter arc; falls back to normalised lerp
     below 1e-8 rad, where it is exact.

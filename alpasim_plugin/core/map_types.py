@@ -31,6 +31,11 @@ class Box:
     width_m: float
     height_m: float
 
+    @property
+    def size_m(self) -> tuple[float, float, float]:
+        """Return length, width and height."""
+        return self.length_m, self.width_m, self.height_m
+
 
 @dataclass(frozen=True)
 class Lane:

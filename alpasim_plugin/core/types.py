@@ -34,6 +34,7 @@ F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.floating]  # of either precision
 RecordT = TypeVar("RecordT")
 
 

@@ -164,8 +164,7 @@ def _built(
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
-    points = _points(drive, folder, tell)
-    placed = place(drive, points, camera_height_m)
+    placed = place(drive, _points(drive, folder, tell), camera_height_m)
     check_motion(drive, placed)
     roads, notes = (
         given_map(map_file, drive, placed)
@@ -313,7 +312,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     T = rough.T_world_source
     return points.joined(
         road_points(front, rough.poses[drive.front], rough.strip).moved(
-            np.asarray(np.linalg.inv(T), dtype=np.float64)
+            np.asarray(np.linalg.inv(T), np.float64)
         )
     )
 
@@ -428,8 +427,7 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the
     middle.
     """
-    photograph = drive.of(name)[0]
-    lens = photograph.lens
+    lens = drive.of(name)[0].lens
     width = (
         min(RENDER_PX * lens.width // max(lens.width, lens.height), lens.width) // SIDE_PX * SIDE_PX
     )

@@ -208,7 +208,7 @@ def _records(model: Path, name: str, record: Callable[[_Binary | _Words], T]) ->
 
 def _are_points(words: Sequence[str]) -> bool:
     try:
-        return len(words) % 3 == 0 and np.array(words, dtype=np.float64).size > 0
+        return len(words) % 3 == 0 and np.array(words, np.float64).size > 0
     except ValueError:
         return False
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, Bool, HeightField
 from alpasim_plugin.drives.source import Points
 
@@ -50,7 +50,7 @@ WHEELS, LATERAL_WEIGHT = (
 )  # half the width of what is driven over, and what points beside it count: kerbs come and go
 FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are assessed
 CROSS_AT: F64 = np.asarray(
-    np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64
+    np.arange(-4, 5) * CROSS_KNOTS, np.float64
 )  # offsets of the cross section's knots
 CELL_M, BESIDE_M, TILTED_M = (
     1.0,
@@ -72,9 +72,7 @@ class PathFrame:
         s = arc_lengths(line[:, :2])
         ends = []
         for at, away in ((s[0], min(s[-1], s[0] + 3 * unit)), (s[-1], max(s[0], s[-1] - 3 * unit))):
-            here, there = (
-                np.array([np.interp(x, s, line[:, axis]) for axis in range(3)]) for x in (at, away)
-            )
+            here, there = resample(line, [at, away], s)
             direction = here - there
             ends.append(
                 here + direction * (AHEAD * unit) / max(float(np.linalg.norm(direction[:2])), 1e-9)
@@ -82,7 +80,7 @@ class PathFrame:
         line = np.concatenate([[ends[0]], line, [ends[1]]])
         s = arc_lengths(line[:, :2])
         at = np.linspace(0.0, s[-1], max(2, int(s[-1] / (STEP * unit)) + 1))
-        self.line = np.stack([np.interp(at, s, line[:, axis]) for axis in range(3)], axis=1)
+        self.line = resample(line, at, s)
         self.s = at - AHEAD * unit
         along = np.gradient(self.line[:, :2], axis=0)
         self.along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)

@@ -28,7 +28,7 @@ from alpasim_plugin.core.reading import (
 from alpasim_plugin.core.reading.images import check_image
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, SourceDrive, name_numbers
-from alpasim_plugin.gaussians.fit.lens import Lens
+from alpasim_plugin.gaussians.fit.lens import FROM_CORNER, Lens
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 
 # Left and right; the first pair that is there is read.
@@ -45,7 +45,6 @@ ROWS = {  # of `calib.txt` by the folder of their images
 UNUSED = re.compile(r"Tr.*|[RSKDT](_rect)?_?\d*(_rect)?|calib_time|corner_dist")
 SUFFIXES = (".png", ".jpg", ".jpeg")
 ROW_OF_12 = "give a row of 12 numbers for each, and no header"
-FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # KITTI counts from pixel centres
 
 
 def is_kitti(folder: Path) -> bool:
@@ -132,7 +131,7 @@ def _table(path: Path, columns: int, do_this: str) -> F64:
     for i, line in enumerate(read_text(path).splitlines()):
         if line.strip():
             with parsing(f"{path}, line {i + 1}", do_this, "not only numbers"):
-                rows.append(np.array(line.split(), dtype=np.float64).reshape(columns))
+                rows.append(np.array(line.split(), np.float64).reshape(columns))
     return np.array(rows).reshape(-1, columns)
 
 
@@ -155,7 +154,7 @@ def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
 
     Rows without names count from P0.
     """
-    rows: dict[str, F64] = {}
+    rows = {}
     unknown = []
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     for i, line in enumerate(lines):
@@ -168,7 +167,7 @@ def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
             raise InputError(f"{path}: a second row {name}", "give each camera one row")
         if re.fullmatch(r"P\d", name):
             with parsing(f"{path}, row {name}", ROW_OF_12):
-                rows[name] = np.array(words.split(), dtype=np.float64).reshape(3, 4)
+                rows[name] = np.array(words.split(), np.float64).reshape(3, 4)
         elif UNUSED.fullmatch(name) is None:
             unknown.append(name)
     return rows, [f"calib.txt: unknown rows are not read: {', '.join(unknown)}"] if unknown else []
@@ -187,7 +186,7 @@ def _camera(projections: dict[str, F64], name: str, path: Path) -> tuple[F64, F6
     Lens(1, 1, K).check(f"{path}, row {row}", "give the projection of a rectified camera")
     T = np.eye(4)
     T[:3, 3] = -np.linalg.solve(K, P[:, 3])
-    return K + FROM_CORNER, T
+    return K + FROM_CORNER, T  # KITTI counts from pixel centres
 
 
 def _times(path: Path, count: int, notes: list[str]) -> list[int]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import matrix_from_quat
+from alpasim_plugin.core.geometry import left_of, matrix_from_quat
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -83,7 +83,14 @@ def standing_obstacles(
     grid = np.zeros(cells.max(axis=0) + 3)
     np.add.at(grid, (cells[:, 0] + 1, cells[:, 1] + 1), area)
     occupied = grid > LEAST_M2
-    driven = _driven(occupied, low, ego, vehicle)
+    # The cells that the recorded car drove over.
+    x, y = np.meshgrid(
+        np.arange(grid.shape[0]) - 0.5, np.arange(grid.shape[1]) - 0.5, indexing="ij"
+    )
+    s, left, _ = frame.place(low + np.column_stack([x.ravel(), y.ravel()]) * CELL_M)
+    end_m = frame.s[-1] + frame.s[0] + vehicle.box.length_m
+    inside = (np.abs(left) < vehicle.box.width_m / 2 + SPARE_M) & (s > -1.0) & (s < end_m)
+    driven = inside.reshape(grid.shape)
     cleared = int((occupied & driven).sum())
     occupied = scipy.ndimage.binary_closing(occupied, _disc(GAP_M / 2)) & ~driven
     label, _ = scipy.ndimage.label(occupied, structure=np.ones((3, 3)))
@@ -112,7 +119,7 @@ def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
     """
     cloud = cloud.take((cloud.opacities > OPAQUE) & (cloud.scales.max(axis=1) < LARGEST_M))
     means, quats, scales, opacities = (
-        np.asarray(array, dtype=np.float64)
+        np.asarray(array, np.float64)
         for array in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
     )
     order = np.argsort(-scales, axis=1)[:, :2]
@@ -122,19 +129,6 @@ def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
     shown = [means, *(means + sign * end for end in ends for sign in (1, -1))]
     surface = np.pi * sizes[:, 0] * sizes[:, 1] * opacities / len(shown)
     return np.concatenate(shown), np.tile(surface, len(shown))
-
-
-def _driven(grid: Bool, low: F64, ego: Trajectory, vehicle: Vehicle) -> Bool:
-    """Return which cells the recorded car drove over."""
-    x, y = np.meshgrid(
-        np.arange(grid.shape[0]) - 0.5, np.arange(grid.shape[1]) - 0.5, indexing="ij"
-    )
-    xy = low + np.column_stack([x.ravel(), y.ravel()]) * CELL_M
-    frame = PathFrame(ego.xyz, 1.0)
-    s, left, _ = frame.place(xy)
-    begins, ends = -1.0, frame.s[-1] + frame.s[0] + vehicle.box.length_m
-    inside = (np.abs(left) < vehicle.box.width_m / 2 + SPARE_M) & (s > begins) & (s < ends)
-    return inside.reshape(grid.shape)
 
 
 def _boxes(
@@ -157,7 +151,7 @@ def _boxes(
         mine = label == number
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))
         along = frame.along[k]
-        across = np.array([-along[1], along[0]])
+        across = left_of(along)
         u, v = at[mine] @ along, at[mine] @ across
         middle = along * (u.max() + u.min()) / 2 + across * (v.max() + v.min()) / 2
         top = float(tops[mine].max())

@@ -122,7 +122,7 @@ def _transforms(folder: Path, need_files: bool) -> SourceDrive:
         )
         cloud = read_points(path)
         rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
-        xyz = np.asarray(cloud.means, dtype=np.float64)
+        xyz = np.asarray(cloud.means, np.float64)
         points = Points(xyz, rgb, np.zeros((len(cloud), 3, 3)))
     return SourceDrive(
         "transforms",

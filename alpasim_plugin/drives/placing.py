@@ -14,6 +14,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     interpolate,
     inverse,
+    left_of,
     se3,
     trajectory_from_poses,
 )
@@ -167,7 +168,7 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
             break
         own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
         line, along = strip.frame.line[own], strip.frame.along[own]
-        left = np.column_stack([-along[:, 1], along[:, 0]])
+        left = left_of(along)
         xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
         A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
         slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
@@ -318,8 +319,7 @@ def given_map(
             f"{path}: a map in metres for poses without a unit",
             "give poses in metres, in the map's coordinates",
         )
-    files = SourceFiles()
-    odr = parse_map(path, files.read_xml(path))
+    odr = parse_map(path, SourceFiles().read_xml(path))
     lane_map, notes = lane_map_of(path, odr, placed.T_world_source)
     centres = np.concatenate(
         [lane.centre for lane in lane_map.lanes.values() if lane.kind == "vehicle"]

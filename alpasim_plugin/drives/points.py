@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, transform_points
+from alpasim_plugin.core.geometry import inverse, left_of, transform_points
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.drives.ground import GroundStrip
 from alpasim_plugin.drives.source import Points, SourceDrive
@@ -80,8 +80,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     """
     cameras = [view.camera for view in views]
     if tracks.count:  # observations that do not fit are left out once
-        error_px = place(tracks, cameras).error_px
-        tracks = tracks.only(error_px < 3 * ERROR_PX)
+        tracks = tracks.only(place(tracks, cameras).error_px < 3 * ERROR_PX)
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     found = place(tracks, cameras)
@@ -105,7 +104,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     return Points(
         found.xyz,
         colours,
-        np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64),
+        np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, np.float64),
     ).chosen(good)
 
 
@@ -286,7 +285,7 @@ def _piece_ahead(strip: GroundStrip, centre: F64, lateral: float) -> F64:
     for ahead in np.linspace(NEAR, FAR, 4) * strip.height:
         k = int(np.clip(np.searchsorted(strip.frame.s, here + ahead), 0, len(strip.frame.s) - 1))
         along = strip.frame.along[k]
-        left = lateral * strip.height * np.array([-along[1], along[0]])
+        left = lateral * strip.height * left_of(along)
         out += [strip.frame.line[k, :2] + left, strip.frame.line[k, :2] - left]
     xy = np.array(out)
     return np.column_stack([xy, strip.z(xy)])

@@ -26,7 +26,7 @@ from alpasim_plugin.core.limits import BODY_M
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
 from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
-from alpasim_plugin.gaussians.fit.lens import Lens
+from alpasim_plugin.gaussians.fit.lens import FROM_CORNER, Lens
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 from scenarios.recorded import actors_of_track, checked_trajectory
 
@@ -37,7 +37,6 @@ EGO, BOXES, CAMERA = "ego_state_se3", "box_detections_se3", "camera."
 DO_THIS = "convert the log again with py123d 0.1 or later"
 FRONT = ("pcam_f0", "pcam_stereo_l")  # the first that is there is driven by
 SPARE = "pcam_stereo_r"  # shows what the left one shows: kept for measuring
-FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # intrinsics count pixel centres
 LABELS = {
     "b": "bus",
     "c": "car",
@@ -87,7 +86,7 @@ def read_py123d(folder: Path) -> SourceDrive:
         )
     notes: list[str] = []
     keys = sorted(path.stem for path in folder.glob("*.arrow"))
-    cameras: dict[str, list[PosedPhotograph]] = {}
+    cameras = {}
     for key in (key for key in keys if key.startswith(CAMERA)):
         photographs = _camera(folder, key, ego, notes)
         if photographs:

@@ -87,11 +87,8 @@ def _covered(graph: SceneGraph, view: PosedView, lateral_m: float) -> float:
     shift = np.eye(4)
     pose = inverse(view.camera.T_camera_world)
     shift[:3, 3] = -lateral_m * pose[:3, 0]  # the camera's own left
-    camera = type(view.camera).from_pose(
-        view.camera.width, view.camera.height, view.camera.K, shift @ pose
-    )
-    alpha = graph.render(camera, {}).alpha
-    return float((alpha[camera.height // 2 :] > OPAQUE).mean())
+    camera = replace(view.camera, T_camera_world=inverse(shift @ pose))
+    return float((graph.render(camera, {}).alpha[camera.height // 2 :] > OPAQUE).mean())
 
 
 def write_page(

@@ -179,7 +179,7 @@ def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
 
 
 def _rigid(rows: Any) -> F64:
-    T = np.vstack([np.asarray(rows, dtype=np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
+    T = np.vstack([np.asarray(rows, np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
     require_rigid(T)
     return T
 
@@ -204,12 +204,11 @@ def _covered(cloud: GaussianCloud, drive: SourceDrive) -> float:
 
 def _surface(cloud: GaussianCloud) -> Points:
     """Return the centres of opaque Gaussians as points of surfaces, in the model's frame."""
-    opaque = np.flatnonzero(np.asarray(cloud.opacities) > OPAQUE)
-    chosen = stream("splat", 0, "surface").permutation(opaque)[:MAX_POINTS]
-    spread = SPREAD * np.asarray(cloud.scales, dtype=np.float64)[chosen].mean(axis=1)
-    rgb = np.clip(0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[chosen, 0], 0, 1)
-    means = np.asarray(cloud.means, dtype=np.float64)[chosen]
-    return Points(means, rgb, np.eye(3) * (spread**2 / 3)[:, None, None])
+    opaque = np.flatnonzero(cloud.opacities > OPAQUE)
+    chosen = cloud.take(stream("splat", 0, "surface").permutation(opaque)[:MAX_POINTS])
+    spread = SPREAD * chosen.scales.astype(np.float64).mean(axis=1)
+    rgb = np.clip(0.5 + C0 * chosen.sh[:, 0].astype(np.float64), 0, 1)
+    return Points(chosen.means.astype(np.float64), rgb, np.eye(3) * (spread**2 / 3)[:, None, None])
 
 
 def _check_frame(file: Path, placed: PlacedDrive) -> None:
@@ -226,8 +225,7 @@ def _check_frame(file: Path, placed: PlacedDrive) -> None:
             f"{file}: {100 * share:.0f} % of the poses lie over Gaussians of the model",
             "Give the poses in the model's own frame and unit: those that it was trained with.",
         )
-    poses = placed.poses[next(iter(placed.poses))]
-    mean = poses[:, :3, :3].mean(axis=0)
+    mean = placed.poses[next(iter(placed.poses))][:, :3, :3].mean(axis=0)
     roll = float(np.degrees(np.arctan2(mean[2, 0], -mean[2, 1])))
     if abs(roll) > MOST_ROLL_DEG:
         raise InputError(

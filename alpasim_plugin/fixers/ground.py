@@ -82,7 +82,7 @@ def carry(
 def _warp_all(
     recorded_images: Sequence[RecordedImage], target: WarpTarget, free_share: float, threads: int
 ) -> list[U8]:
-    out: dict[int, U8] = {}
+    out = {}
     todo = iter(range(len(recorded_images)))  # shared: each thread takes the next
 
     def work() -> None:

@@ -42,8 +42,7 @@ def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedG
         InputError: Weights that are missing or do not fit.
         InfrastructureError: The device is not here.
     """
-    name = require_device(device)
-    return _load(settings.model_copy(update={"keep_render": True}), name)
+    return _load(settings.model_copy(update={"keep_render": True}), require_device(device))
 
 
 @lru_cache(maxsize=4)

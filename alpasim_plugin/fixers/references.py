@@ -63,7 +63,7 @@ class ReferenceIndex:
         self.recorded = tuple(recorded)
         T = np.array([frame.T_world_camera for frame in recorded]).reshape(-1, 4, 4)
         self._centres, self._axes = T[:, :3, 3], T[:, :3, 2]
-        self._t_us: I64 = np.array([frame.t_us for frame in recorded], dtype=np.int64)
+        self._t_us: I64 = np.array([frame.t_us for frame in recorded], np.int64)
         self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
 
     def choose(

@@ -137,10 +137,29 @@ def place_boxes(
     """
     names = [name for name in sorted(actors) if name in boxes]
     T_box_world = inverse(np.array([actors[name] for name in names]).reshape(-1, 4, 4))
-    present = [boxes[name] for name in names]
-    lengths = [(box.length_m, box.width_m, box.height_m) for box in present]
-    sizes = np.array(lengths).reshape(-1, 3)
-    seen = see_boxes(K, T_world_camera, T_box_world, sizes, shape)
+    sizes = np.array([boxes[name].size_m for name in names]).reshape(-1, 3)
+    T_box_camera = T_box_world @ T_world_camera
+    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array(
+        [np.negative(AROUND_M), AROUND_M]
+    )
+    walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
+    corners = walls[
+        :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
+    ]  # (A, 8, 3)
+    project = K @ inverse(T_box_camera)[:, :3]
+    shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
+    behind = (shown[..., 2] <= 0).all(axis=1, keepdims=True)
+    around = (shown[..., 2] <= NEAREST_M).any(
+        axis=1, keepdims=True
+    )  # some corners lie behind the camera, and the box may reach anywhere
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u_v = shown[..., :2] / shown[..., 2:]
+    whole = np.array(shape[::-1])
+    first = np.where(around, 0, np.clip(np.floor(u_v.min(axis=1)), 0, whole))
+    last = np.where(behind, 0, np.where(around, whole, np.clip(np.ceil(u_v.max(axis=1)), 0, whole)))
+    pixels = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1).astype(np.int64)
+    ray = np.ascontiguousarray(T_box_camera[:, :3, :3] @ np.linalg.inv(K))
+    seen = SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
     return PlacedBoxes(names, seen)
 
 
@@ -226,7 +245,7 @@ def _coordinates_on_box(
 
 def on_boxes(shape: tuple[int, int], seen: SeenBoxes) -> Bool:
     """Return the pixels of a camera of ``shape`` rows and columns whose ray meets a box."""
-    out: Bool = np.zeros(shape, dtype=bool)
+    out: Bool = np.zeros(shape, bool)
     for ray, eye, walls, pixels in zip(*seen, strict=True):
         _add_box(ray, eye, walls, pixels, out[slice(*pixels[:2]), slice(*pixels[2:])])
     return out
@@ -239,38 +258,6 @@ class SeenBoxes(NamedTuple):
     eye: F64  # (A, 3) the camera in the box's axes
     walls: F64  # (A, 2, 3) least and greatest coordinates
     pixels: I64  # (A, 4) first row, last, first column, last; the last ones are not included
-
-
-def see_boxes(
-    K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]
-) -> SeenBoxes:
-    """Return where a camera of ``shape`` rows and columns may see boxes ``(A, 3)``."""
-    if not len(sizes):
-        return SeenBoxes(
-            np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64)
-        )
-    T_box_camera = T_box_world @ T_world_camera
-    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array(
-        [np.negative(AROUND_M), AROUND_M]
-    )
-    walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
-    corners = walls[
-        :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
-    ]  # (A, 8, 3)
-    project = K @ inverse(T_box_camera)[:, :3]
-    shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
-    behind = (shown[..., 2] <= 0).all(axis=1, keepdims=True)
-    around = (shown[..., 2] <= NEAREST_M).any(
-        axis=1, keepdims=True
-    )  # some corners lie behind the camera, and the box may reach anywhere
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u_v = shown[..., :2] / shown[..., 2:]
-    whole = np.array(shape[::-1])
-    first = np.where(around, 0, np.clip(np.floor(u_v.min(axis=1)), 0, whole))
-    last = np.where(behind, 0, np.where(around, whole, np.clip(np.ceil(u_v.max(axis=1)), 0, whole)))
-    pixels = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1).astype(np.int64)
-    ray = np.ascontiguousarray(T_box_camera[:, :3, :3] @ np.linalg.inv(K))
-    return SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
 
 
 @float_kernel

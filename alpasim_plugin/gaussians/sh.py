@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, FloatArray
 
 SH_SIZES = (1, 4, 9, 16)  # (degree + 1)^2
 
@@ -62,12 +62,12 @@ def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
         >>> sh_basis([0.0, 0.0, 1.0], 4).round(4).tolist()
         [0.2821, -0.0, 0.4886, -0.0]
     """
-    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     terms = (np.full_like(x, C0), *sh_terms(x, y, z))
     return np.stack(terms[:size], axis=-1)
 
 
-def sh_colours(sh: npt.NDArray[np.floating], directions: npt.ArrayLike) -> F64:
+def sh_colours(sh: FloatArray, directions: npt.ArrayLike) -> F64:
     """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` seen along unit directions ``(N, 3)``:
     clamped at 0 below, not above.
     """
@@ -77,7 +77,7 @@ def sh_colours(sh: npt.NDArray[np.floating], directions: npt.ArrayLike) -> F64:
 
 def dc_from_rgb(rgb: npt.ArrayLike) -> F64:
     """Return the constant coefficients that show a colour from every side."""
-    return (np.asarray(rgb, dtype=np.float64) - 0.5) / C0
+    return (np.asarray(rgb, np.float64) - 0.5) / C0
 
 
 @lru_cache(maxsize=1)
@@ -109,7 +109,7 @@ def sh_rotation(rotation: F64, degree: int) -> F64:
     return inverses[degree] @ turned
 
 
-def rotate_sh(sh: npt.NDArray[np.floating], rotation: F64) -> npt.NDArray[np.floating]:
+def rotate_sh(sh: FloatArray, rotation: F64) -> FloatArray:
     """Return coefficients ``(N, K, 3)`` of the same objects after turning them by ``rotation``
     ``(3, 3)``; type kept.
     """

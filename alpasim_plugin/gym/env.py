@@ -71,8 +71,7 @@ class Controls:
         )
         times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US)
         step_s = PREDICTED_STEP_US * 1e-6
-        state = replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)
-        states = [state]
+        states = [replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)]
         for _ in times[1:]:
             states.append(step(states[-1], self.controller.command, step_s, self._vehicle, step_s))
         rows = np.array([(one.x_m, one.y_m, one.yaw_rad) for one in states])
@@ -104,8 +103,7 @@ class Trajectories:
     def __init__(self, vehicle: Vehicle, horizon_us: int, step_us: int) -> None:
         n = horizon_us // step_us
         low = np.tile([-BACKWARD_M, -LATERAL_M, -np.pi], (n, 1))
-        high = np.tile([FORWARD_M, LATERAL_M, np.pi], (n, 1))
-        self.space = Box(low, high, dtype=np.float64)
+        self.space = Box(low, np.tile([FORWARD_M, LATERAL_M, np.pi], (n, 1)), dtype=np.float64)
         self.controller = make_controller("bicycle", vehicle)
         self._after_us = step_us * np.arange(n + 1)
 

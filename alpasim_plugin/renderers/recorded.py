@@ -70,8 +70,7 @@ def built_recording(
     def read(number: int) -> tuple[U8, F32]:
         """Return the built scene's image, and the model's depth from the believed pose."""
         true, believed, actors = shots[number]
-        image = scene.render(true, actors, 1).to_uint8()
-        return image, model(believed, actors).surface().depth
+        return scene.render(true, actors, 1).to_uint8(), model(believed, actors).surface().depth
 
     frames = []
     for t_us in times:
@@ -160,7 +159,7 @@ def photograph_image(one: Photograph, camera: PinholeCamera) -> U8:
     rgb = read_image(Path(one.path))[..., ::-1]
     size = camera.width, camera.height
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(small, dtype=np.uint8)
+    return np.ascontiguousarray(small, np.uint8)
 
 
 def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:

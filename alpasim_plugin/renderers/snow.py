@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F32, F64, Scenario
+from alpasim_plugin.core.types import F32, Scenario
 from alpasim_plugin.renderers.view import View
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.path import polyline_path
@@ -45,24 +45,20 @@ class SnowCover:
         is_seen = (depth_m.max(axis=1) > NEAREST_M) & (depth_m.min(axis=1) < SIGHT_M)
         cover: F32 = np.full(view.ground.shape, BESIDE, np.float32)
         for quad, share in zip(local[is_seen], self.shares[is_seen].tolist(), strict=True):
-            projected = _in_front(quad) @ view.K.T
+            # It is cut at the plane `NEAREST_M` before the camera.
+            following = np.roll(quad, -1, axis=0)
+            is_front = quad[:, 2] > NEAREST_M
+            kept = []
+            for first, second, crosses in zip(
+                quad, following, is_front != np.roll(is_front, -1), strict=True
+            ):
+                if first[2] > NEAREST_M:
+                    kept.append(first)
+                if crosses:
+                    reach = (NEAREST_M - first[2]) / (second[2] - first[2])
+                    kept.append(first + reach * (second - first))
+            projected = np.array(kept) @ view.K.T
             pixels = projected[:, :2] / projected[:, 2:] - 0.5
             corners = np.rint(16 * np.clip(pixels, -1e5, 1e5)).astype(np.int32)
             cv2.fillConvexPoly(cover, corners, share, cv2.LINE_8, SUBPIXEL_BITS)
         return view.ground * cv2.GaussianBlur(cover, (0, 0), SOFT_WIDTHS * cover.shape[1])
-
-
-def _in_front(corners: F64) -> F64:
-    """Cut a polygon ``(N, 3)`` of camera coordinates at the plane `NEAREST_M` before the camera."""
-    following = np.roll(corners, -1, axis=0)
-    is_front = corners[:, 2] > NEAREST_M
-    kept = []
-    for first, second, crosses in zip(
-        corners, following, is_front != np.roll(is_front, -1), strict=True
-    ):
-        if first[2] > NEAREST_M:
-            kept.append(first)
-        if crosses:
-            share = (NEAREST_M - first[2]) / (second[2] - first[2])
-            kept.append(first + share * (second - first))
-    return np.array(kept)

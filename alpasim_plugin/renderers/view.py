@@ -85,7 +85,7 @@ def view_of(
     limit_m = GROUND_M + GROUND_PER_M * distance_m[is_low]
     share = np.clip(2 - above_m / limit_m, 0, 1)
     for pose, box in boxes:
-        reach = BOX_M + np.array([box.length_m, box.width_m, box.height_m]) / 2
+        reach = BOX_M + np.array(box.size_m) / 2
         share[(np.abs((low - pose[:3, 3]) @ pose[:3, :3]) < reach).all(axis=1)] = 0
     belongs = np.zeros(depth.shape, np.float32)
     belongs[is_low] = share

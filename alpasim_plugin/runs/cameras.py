@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -16,7 +16,6 @@ from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,
-    Actor,
     CameraSpec,
     RenderRequest,
     RolloutLog,
@@ -25,6 +24,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
     read_only,
 )
+from alpasim_plugin.gaussians.scene.log_views import actors_at
 from alpasim_plugin.runs.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
 
 
@@ -207,7 +207,7 @@ class CameraRig:
 
 def recorded_requests(scenario: Scenario, t_us: int) -> list[RenderRequest]:
     """Return a request for each camera of a scenario at an instant of its recorded path."""
-    poses = _poses_of(scenario.actors, t_us)
+    poses = actors_at(scenario.actors, t_us)
     T_world_rig = interpolate(scenario.ego_log, t_us)
     return [
         RenderRequest(t_us, camera, np.stack([T_world_rig @ camera.T_rig_camera] * 2), poses)
@@ -221,16 +221,7 @@ def logged_request(log: RolloutLog, camera: CameraSpec, t_us: int) -> RenderRequ
     """
     shutter_us = [max(t_us - camera.shutter_us, int(log.ego.t_us[0])), t_us]
     T_world_rig = interpolate(log.ego, shutter_us) @ inverse(log.T_rig_box)
-    shown = drawn(_poses_of(log.actors.values(), t_us))
-    before = drawn(_poses_of(log.actors.values(), t_us - log.control_us))
+    shown = drawn(actors_at(log.actors.values(), t_us))
+    before = drawn(actors_at(log.actors.values(), t_us - log.control_us))
     exposure = rolling_exposure(camera, before, shown, log.control_us)
     return RenderRequest(t_us, camera, T_world_rig @ camera.T_rig_camera, shown, exposure=exposure)
-
-
-def _poses_of(actors: Iterable[Actor], t_us: int) -> dict[str, F64]:
-    """Return ``T_world_box`` of the actors whose tracks cover an instant, by id."""
-    return {
-        actor.actor_id: interpolate(actor.track, t_us)
-        for actor in actors
-        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
-    }

@@ -361,10 +361,9 @@ def _transform(t_us: int, parent: str, child: str, xyz: F64, quat: F64) -> Item:
 
 
 def _cube(box: Box, track: Trajectory, step: int, color: Rgb, alpha: float = 1.0) -> Message:
-    size_m = (box.length_m, box.width_m, box.height_m)
     return {
         "pose": _pose(track.xyz[step], track.quat[step]),
-        "size": _members("xyz", size_m),
+        "size": _members("xyz", box.size_m),
         "color": _members("rgba", (*color, alpha)),
     }
 

@@ -13,7 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
+from alpasim_plugin.core.geometry import (
+    direction_of,
+    interpolate,
+    se2,
+    se3,
+    slerp,
+    wrap_angle,
+    yaw_of,
+)
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -115,7 +123,7 @@ class Actors:
                 velocity,
             )
             yaw = yaw_of(ego.T_world_rig)
-            direction = np.array([np.cos(yaw), np.sin(yaw)])
+            direction = direction_of(yaw)
             centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
             own = bodies_from(
                 centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
@@ -157,7 +165,7 @@ class Actors:
             ).T
             boxes = [driver.actor.box for driver, _ in driving]
             xyz, yaws = lines.at(line, s_m, offset_m)
-            directions = np.column_stack([np.cos(yaws), np.sin(yaws)])
+            directions = direction_of(yaws)
             moving = bodies_from(xyz[:, :2], yaws, boxes, speed_mps[:, None] * directions)
             everybody = concatenate([others, moving])
             leaders = find_leaders(
@@ -280,7 +288,13 @@ class _Driver:
         self.actor, self.ground = actor, ground
         self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
         self.params = IdmParams(**({} if self.act else actor.behaviour.params))
-        self.path = _driving_line(actor, index)
+        line = thinned(actor.track.xyz, LINE_STEP_M)
+        self.path: Path | None = None
+        if len(line) > 1 and np.hypot(*(line[-1, :2] - line[0, :2])) >= MIN_PATH_M:
+            path = polyline_path(line)
+            end, heading = path.at(path.length_m)
+            ahead = _lanes_ahead(index, end, float(heading)) if index is not None else None
+            self.path = path if ahead is None else polyline_path(np.concatenate([line, ahead]))
         self.lights: tuple[LightAhead, ...] = ()
         self.give_way: tuple[LightAhead, ...] = ()
         self.wanted_mps: F64 | None = None
@@ -302,8 +316,7 @@ class _Driver:
             return
         at = max(from_us, first)
         lo, hi = max(first, at - SPEED_SPAN_US), min(last, at + SPEED_SPAN_US)
-        poses = interpolate(self.actor.track, [at, lo, hi])
-        s, d = self.path.project(poses[:, :2, 3])
+        s, d = self.path.project(interpolate(self.actor.track, [at, lo, hi])[:, :2, 3])
         speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
         self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
 
@@ -376,19 +389,6 @@ class _Driver:
         T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))
         T[:3, 3] += self.actor.box.height_m / 2 * T[:3, 2]
         return T
-
-
-def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
-    """Return the line of a track, thinned where it stands and extended along the lanes; None for a
-    track that goes nowhere.
-    """
-    line = thinned(actor.track.xyz, LINE_STEP_M)
-    if len(line) < 2 or np.hypot(*(line[-1, :2] - line[0, :2])) < MIN_PATH_M:
-        return None
-    path = polyline_path(line)
-    end, heading = path.at(path.length_m)
-    ahead = _lanes_ahead(index, end, float(heading)) if index is not None else None
-    return path if ahead is None else polyline_path(np.concatenate([line, ahead]))
 
 
 def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:

@@ -60,17 +60,12 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     means = sums / count[:, None] + xyz[0]
     xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
     nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
-    z = _interpolate(means, nodes)
+    z = means[scipy.spatial.KDTree(means[:, :2]).query(nodes)[1], 2]
+    local = means[:, :2] - means[0, :2]
+    if len(means) > 2 and np.linalg.matrix_rank(local, tol=1e-6) > 1:  # not a line of points
+        inside = scipy.interpolate.LinearNDInterpolator(local, means[:, 2])(nodes - means[0, :2])
+        z = np.where(np.isnan(inside), z, inside)
     return HeightField(float(low[0]), float(low[1]), float(cell_m), z.reshape(ny, nx))
-
-
-def _interpolate(samples: F64, nodes: F64) -> F64:
-    nearest = samples[scipy.spatial.KDTree(samples[:, :2]).query(nodes)[1], 2]
-    local = samples[:, :2] - samples[0, :2]
-    if len(samples) < 3 or np.linalg.matrix_rank(local, tol=1e-6) < 2:
-        return nearest  # a line of points spans no triangle
-    z = scipy.interpolate.LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
-    return np.where(np.isnan(z), nearest, z)
 
 
 def height_at(field: HeightField, xy: F64) -> F64:

@@ -55,8 +55,7 @@ def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmP
         >>> round(idm_acceleration(13.9, float("inf"), 0.0, IdmParams()), 6)
         0.0
     """
-    v0 = max(p.desired_speed_mps, 0.1)
-    free = 1.0 - (speed_mps / v0) ** 4
+    free = 1.0 - (speed_mps / max(p.desired_speed_mps, 0.1)) ** 4
     interaction = (
         0.0
         if math.isinf(gap_m)
@@ -171,7 +170,7 @@ def find_leader(
     """Return the leader of one driver on the only line of ``line``; see `find_leaders`."""
     driver = (np.array([front_s_m]), np.array([half_width_m]))
     nobody = np.array([-1])
-    zero = np.zeros(1, dtype=np.int64)
+    zero = np.zeros(1, np.int64)
     return find_leaders(line, zero, *driver, bodies, np.array([horizon_m]), nobody, margin_m)[0]
 
 

@@ -1,7 +1,7 @@
-"""Which lines of a map are painted on the road: one rule, which the built world, the semantic map
+"""Which lines of a map are lane markings: one rule, which the built world, the semantic map
 and the learned metrics share.
 
-A line is painted where the map says so: its marking lines, and the edges of lanes whose markings
+A line is a lane marking where the map says so: its marking lines, and the edges of lanes whose markings
 it knows. A line that nobody has seen is not drawn. Where the road itself is built, its lane
 markings are a choice, and `with_default_markings` makes it before anything is drawn.
 """
@@ -80,7 +80,7 @@ class _Edges:
 
 
 def marking_lines(lane_map: LaneMap) -> list[tuple[F64, LaneMarkType]]:
-    """Return what is painted along lanes, each place once.
+    """Return the lane markings along lanes, each place once.
 
     Returns:
         Lines ``(N, 3)``, metres, world, with their kind of line, which is neither ``none`` nor
@@ -105,7 +105,7 @@ def with_default_markings(lane_map: LaneMap) -> LaneMap:
     """Return a map whose unknown lane markings are chosen, for a road that is built from it.
 
     An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes
-    a double yellow one, an outer edge a solid white line; inside intersections nothing is painted.
+    a double yellow one, an outer edge a solid white line; inside intersections there is none.
     In maps with marking lines of their own, lane edges of unknown markings stay as they are, and
     unknown marking lines are solid white.
     """

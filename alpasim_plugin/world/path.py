@@ -12,7 +12,7 @@ import numpy.typing as npt
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.geometry import arc_lengths, direction_of
 from alpasim_plugin.core.types import F64, I64, Bool
 
 CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
@@ -78,13 +78,13 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
         ``(N, 3)``: x, y, heading; first and last points are ``p0`` and ``p1`` exactly.
     """
     before, after = _leads(p0, yaw0, p1, yaw1)
-    q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
-    q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
+    q0 = p0[:2] + before * direction_of(yaw0)
+    q1 = p1[:2] - after * direction_of(yaw1)
     chord = float(np.hypot(q1[0] - q0[0], q1[1] - q0[1]))
     n = max(8, int(np.ceil(1.2 * chord / CONNECTOR_STEP_M)))
     t = np.linspace(0.0, 1.0, n + 1)
     still = np.zeros(2)
-    directions = [np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (yaw0, yaw1)]
+    directions = direction_of([yaw0, yaw1])
     least_peak = np.inf
     for tangent_m in chord * np.linspace(0.8, 2.4, 33):
         ends = zip((q0[:2], q1[:2]), directions, strict=True)
@@ -109,7 +109,7 @@ def _leads(p0: F64, yaw0: float, p1: F64, yaw1: float) -> tuple[float, float]:
     """Return the straights before and after a turn that make what is left of it as long on one side
     as on the other.
     """
-    d0, d1 = np.array([np.cos(yaw0), np.sin(yaw0)]), np.array([np.cos(yaw1), np.sin(yaw1)])
+    d0, d1 = direction_of([yaw0, yaw1])
     cross = float(d0[0] * d1[1] - d0[1] * d1[0])
     if abs(cross) < 0.1:
         return 0.0, 0.0
@@ -207,7 +207,7 @@ class Lines:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        counts = np.array([len(path.s) for path in paths], dtype=np.int64)
+        counts = np.array([len(path.s) for path in paths], np.int64)
         self.end = np.cumsum(counts)
         self.begin = self.end - counts
         self.length_m = np.array([path.length_m for path in paths])
@@ -287,7 +287,7 @@ def polyline_path(xyz: F64) -> Path:
     Raises:
         InputError: Fewer than two distinct points.
     """
-    line = np.asarray(xyz, dtype=np.float64)
+    line = np.asarray(xyz, np.float64)
     if line.shape[1] == 2:
         line = np.column_stack([line, np.zeros(len(line))])
     line = line[

@@ -32,7 +32,7 @@ class Profile:
     shoulder_m: float = 0.0  # paved strip outside the outer lanes
     parking_m: float = 0.0  # parking strip outside the outer lanes, instead of the shoulder
     speed_limit_mps: float | None = None
-    centre_paint: LaneMarkType = "double_yellow"
+    centre_mark_type: LaneMarkType = "double_yellow"
     lane_mark_type: LaneMarkType = "dashed_white"
     edge_mark_type: LaneMarkType = "solid_white"
 
@@ -278,7 +278,7 @@ def _lane(
     """
     outermost = k + 1 == (profile.forward if side == "f" else profile.backward)
     is_divided = profile.backward == 0 or profile.median_m > 0
-    innermost_type = "solid_yellow" if is_divided else profile.centre_paint
+    innermost_type = "solid_yellow" if is_divided else profile.centre_mark_type
     return Lane(
         f"{name}_{side}{k}",
         lines[f"{side}c{k}"],

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import wrap_angle
+from alpasim_plugin.core.geometry import direction_of, wrap_angle
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking
 from alpasim_plugin.world.path import connect, offset_line, sample_clothoid
 from alpasim_plugin.world.road_strip import (
@@ -80,7 +80,7 @@ def _grow_intersection(
         + element.corner_radius_m
     )
     x, y, yaw = tip.pose
-    centre = np.array([x + reach * np.cos(yaw), y + reach * np.sin(yaw)])
+    centre = np.array([x, y]) + reach * direction_of(yaw)
     back = replace(profile, forward=profile.backward, backward=profile.forward)
     arriving = tip.forward[: profile.forward]
     arms = [Arm("entry", yaw + np.pi, back, _outward(tip.joint), tip.backward, arriving)]
@@ -88,7 +88,7 @@ def _grow_intersection(
         if turn not in element.arms:
             continue
         heading = yaw + _ANGLE[turn]
-        at = centre + reach * np.array([np.cos(heading), np.sin(heading)])
+        at = centre + reach * direction_of(heading)
         start = (float(at[0]), float(at[1]), float(heading))
         if turn == element.turn:
             tip.pose = start
@@ -103,8 +103,8 @@ def _grow_intersection(
             arms.append(
                 Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward)
             )
-    forward: dict[int, tuple[str, int]] = {}
-    backward: dict[int, str] = {}
+    forward = {}
+    backward = {}
     for a in arms:
         for b in arms:
             for i, j in _movements(a, b):
@@ -180,7 +180,7 @@ def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
 
 def _mark_type(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list[str]) -> None:
     for arm in arms:
-        outward = np.array([np.cos(arm.heading_rad), np.sin(arm.heading_rad), 0.0])
+        outward = np.array([*direction_of(arm.heading_rad), 0.0])
         left = arm.joint["left"]
         right = arm.joint["right"]
         middle = arm.joint["b0"]

@@ -83,7 +83,7 @@ class LaneIndex:
         if not self._kd:
             return ()
         hits = self._kd[len(point)].query_ball_point(point, radius_m)
-        return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, dtype=np.int64)]))
+        return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, np.int64)]))
 
     def heading_rad(self, lane_id: str, point: F64) -> float:
         """Return the driving direction of a lane at the place nearest to the point, in plan
@@ -207,8 +207,7 @@ def route_from_log(
         or abs(float(wrap_angle(index.heading_rad(ids[-1], end) - heading))) > MAX_HEADING_ERROR_RAD
     ):
         return Route(driven, ids)
-    s = arc_lengths(ahead.xyz)
-    fade = np.clip(1 - s / BLEND_M, 0.0, 1.0)
+    fade = np.clip(1 - arc_lengths(ahead.xyz) / BLEND_M, 0.0, 1.0)
     fade = fade * fade * (3 - 2 * fade)  # smooth at both ends
     tail = ahead.xyz + fade[:, None] * (end - ahead.xyz[0])
     if np.linalg.norm(driven[0] - driven[-1]) == 0 and len(driven) == 2:
@@ -265,7 +264,7 @@ def _local_costs(
     heading error.
     """
     candidates = inside or index.within(point, MATCH_RADIUS_M)
-    costs: dict[str, float] = {}
+    costs = {}
     for lane_id in candidates:
         error = abs(float(wrap_angle(index.heading_rad(lane_id, point) - heading_rad)))
         if error < MAX_HEADING_ERROR_RAD:

@@ -44,7 +44,6 @@ class Walker:
         inside = (ahead_m > -half_m) & (ahead_m < covered_m)
         inside &= lateral_m < vehicle.box.width_m / 2 + reach_m
         wanted = 0.0 if inside.any() and not inside[0] else 1.0
-        dt_s = (to_us - from_us) * 1e-6
-        step = CHANGE_PER_S * dt_s
+        step = CHANGE_PER_S * ((to_us - from_us) * 1e-6)
         self.rate += float(np.clip(wanted - self.rate, -step, step))
         self.lag_us += (1.0 - self.rate) * (to_us - from_us)

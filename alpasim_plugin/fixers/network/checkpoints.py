@@ -99,7 +99,7 @@ def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     keys = {key.removeprefix(WRAPPER): value for key, value in tensors.items()}
     used = [prefix for prefix in (OWN, AVERAGED) if any(key.startswith(prefix) for key in keys)]
     prefix = used[0] if used else ""
-    out: StateDict = {}
+    out = {}
     for key, value in keys.items():
         plain = key.removeprefix(prefix)
         for infix in INFIXES:

@@ -206,25 +206,6 @@ class Repaired(NamedTuple):
     heads: BlendHeads | None  # None without references
 
 
-def gather_cells(
-    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Put what the network reads side by side, as cells of pixels; arguments as in
-    `PixelGenerator.forward`, result in float32.
-
-    Returns:
-        ``(B, H / 4, W / 4, 16 * IMAGES + hidden)``, per cell the `cells` of render, 2 opacity - 1,
-        map, last output, last render and source minus render, then the recurrent channels; and
-        ``(B, H / 2, W / 2, 4 * DETAIL_IMAGES)``, those of render, 2 opacity - 1 and last output.
-    """
-    cover = 2 * opacity - 1
-    images = render, cover, sdmap, state.output, state.render, source - render
-    coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
-    return coarse, torch.cat(
-        [cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1
-    )
-
-
 TORCH = Operations(gather_references, blend, smaller, larger, dense_source)
 
 
@@ -350,9 +331,11 @@ class PixelGenerator(nn.Module):
         past = state._replace(
             output=smaller(state.output, scale), render=smaller(state.render, scale)
         )
-        coarse, fine = gather_cells(
-            shown, smaller(opacity, scale), smaller(sdmap, scale), past, noised
-        )
+        cover = 2 * smaller(opacity, scale) - 1
+        images = shown, cover, smaller(sdmap, scale), past.output, past.render, noised - shown
+        coarse = torch.cat([*(cells(image, CELL) for image in images), past.hidden], dim=-1)
+        details = shown, cover, past.output
+        fine = torch.cat([cells(image, DETAIL) for image in details], dim=-1)
         stem, detail = self.stem(coarse.to(dtype)), self.read(fine.to(dtype))
         seen = None
         if self.blend is not None and references is not None:

@@ -1,7 +1,7 @@
 """The layers of the semantic map, and their conversion to arrays: straight segments with width and
 colour, and flat triangles.
 
-What is painted is the rule of `world.markings`: marking lines and lane edges of a
+Which lines are lane markings is the rule of `world.markings`: marking lines and lane edges of a
 known kind, each once; unknown lane markings are not drawn.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import left_of, resample
 from alpasim_plugin.core.types import F64, Actor, Bool, Box, LaneMap, LaneMarkType
 from alpasim_plugin.fixers.semantic_map.style import (
     COLOURS,
@@ -107,11 +108,11 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
         InputError: A coordinate that is not finite, an area without three corners, or a pose that
             is not rigid.
     """
-    painted = marking_lines(lane_map)
+    markings = marking_lines(lane_map)
     lines = [("road_boundary", LINE_PX, line) for line in lane_map.road_edges]
     lines += [("stop_line", LINE_PX, line) for line in lane_map.stop_lines]
     lines += [("pole", POLE_PX, _pole(line)) for line in lane_map.poles]
-    outlines = [("lane line", line) for line, _ in painted]
+    outlines = [("lane line", line) for line, _ in markings]
     outlines += [(name, line) for name, _, line in lines]
     outlines += [("crosswalk", ring) for ring in lane_map.crosswalks]
     for name, outline in outlines:
@@ -133,33 +134,31 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     origin = np.zeros(3)
     if len(everywhere):  # in whole metres, so that subtracting it loses nothing
         origin = np.round((everywhere.min(axis=0) + everywhere.max(axis=0)) / 2)
-    pieces = [piece for line, mark_type in painted for piece in _painted(line - origin, mark_type)]
+    pieces = [
+        piece for line, mark_type in markings for piece in _marking_pieces(line - origin, mark_type)
+    ]
     pieces += [(name, width_px, line - origin) for name, width_px, line in lines]
     rings = [triangulate("crosswalk", ring - origin) for ring in lane_map.crosswalks]
-    signs = [box_corners(pose, box, origin)[TRIANGLES] for pose, box in lane_map.signs]
+    signs = [
+        ((CORNERS * np.array(box.size_m)) @ pose[:3, :3].T + (pose[:3, 3] - origin))[TRIANGLES]
+        for pose, box in lane_map.signs
+    ]
     on_ground = np.concatenate([np.zeros((0, 3, 3)), *rings])
     triangles = np.concatenate([on_ground, *signs])
     style = np.empty((len(triangles), 7))
     style[: len(on_ground)] = (CROSSWALK_BIAS_M, *COLOURS["crosswalk"], *COLOURS["crosswalk"])
     style[len(on_ground) :] = (0.0, *COLOURS["sign"], *COLOURS["sign"])
-    is_closed = np.zeros(len(triangles), dtype=bool)
+    is_closed = np.zeros(len(triangles), bool)
     filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
     return PreparedMap(origin, _segments(pieces), filled)
-
-
-def box_corners(pose: F64, box: Box, origin: F64) -> F64:
-    """Return the eight corners ``(8, 3)`` of a box relative to ``origin``."""
-    sizes = np.array([box.length_m, box.width_m, box.height_m])
-    return (CORNERS * sizes) @ pose[:3, :3].T + (pose[:3, 3] - origin)
 
 
 def require_box(name: str, pose: F64, box: Box) -> None:
     """Raise `InputError` unless a box has a rigid pose and finite sizes that are not negative."""
     require_rigid(pose, name)
-    sizes = (box.length_m, box.width_m, box.height_m)
-    if not np.isfinite(sizes).all() or min(sizes) < 0:
+    if not np.isfinite(box.size_m).all() or min(box.size_m) < 0:
         raise InputError(
-            f"{name}: a box of {sizes} m", "give finite sizes, length, width and height"
+            f"{name}: a box of {box.size_m} m", "give finite sizes, length, width and height"
         )
 
 
@@ -170,7 +169,7 @@ def _pole(line: F64) -> F64:
     return line
 
 
-def _painted(line: F64, mark_type: LaneMarkType) -> list[Polyline]:
+def _marking_pieces(line: F64, mark_type: LaneMarkType) -> list[Polyline]:
     """Return what is drawn of a lane line: two lines for a double one, the dashes of a dashed one."""
     pattern, _, colour = mark_type.partition("_")
     pieces = [line]
@@ -196,7 +195,7 @@ def cut_dashes(line: F64, dash_m: float, gap_m: float) -> list[F64]:
     for start in np.arange(np.ceil(s[-1] / (dash_m + gap_m))) * (dash_m + gap_m):
         end = min(start + dash_m, s[-1])
         inner = np.concatenate([[start], s[(s > start) & (s < end)], [end]])
-        dashes.append(np.stack([np.interp(inner, s, line[:, k]) for k in range(3)], axis=1))
+        dashes.append(resample(line, inner, s))
     return dashes
 
 
@@ -209,7 +208,7 @@ def _offset_left(line: F64, left_m: float) -> F64:
         return line
     line = line[np.concatenate([[True], keep])]
     direction = step[keep] / length[keep, None]
-    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    normal = left_of(direction)
     both = np.concatenate([normal[:1], normal[:-1] + normal[1:], normal[-1:]])
     both /= np.maximum(np.linalg.norm(both, axis=1), 1e-9)[:, None]
     cosine = np.maximum(

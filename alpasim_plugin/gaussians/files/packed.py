@@ -22,6 +22,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.reading.files import parsing, some_of, unzstd
+from alpasim_plugin.core.types import F64, I64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays, quat_multiply
 from alpasim_plugin.gaussians.constants import EPS2D_PX2
 from alpasim_plugin.gaussians.files.ply import (
@@ -59,7 +60,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
     chunk = np.arange(len(rows)) // CHUNK
     bounds = {name: chunk_rows[name].astype(np.float64) for name in chunk_rows.dtype.names or ()}
 
-    def spread(fractions: NDArray[np.float64], names: tuple[str, ...]) -> NDArray[np.float64]:
+    def spread(fractions: F64, names: tuple[str, ...]) -> F64:
         low = np.stack([bounds[f"min_{name}"] for name in names], axis=1)[chunk]
         high = np.stack([bounds[f"max_{name}"] for name in names], axis=1)[chunk]
         return low * (1 - fractions) + high * fractions
@@ -82,7 +83,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
     )
 
 
-def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+def unpack_rotation(packed: NDArray[np.uint32]) -> F64:
     """Return unit quaternions ``(N, 4)`` wxyz from 2 + 3 x 10 bits.
 
     The top two bits say which of w, x, y, z is the largest and left out; the others follow in order
@@ -90,11 +91,10 @@ def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     """
     fractions = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
     others = (fractions - 0.5) * np.sqrt(2.0)
-    largest = (packed >> 30).astype(np.intp)
-    return with_largest(others, largest)
+    return with_largest(others, (packed >> 30).astype(np.int64))
 
 
-def with_largest(others: NDArray[np.float64], largest: NDArray[np.intp]) -> NDArray[np.float64]:
+def with_largest(others: F64, largest: I64) -> F64:
     """Return unit quaternions ``(N, 4)`` of three components each ``(N, 3)``, in order, and the
     place ``(N,)`` of the largest one, which was left out.
     """
@@ -107,7 +107,7 @@ def with_largest(others: NDArray[np.float64], largest: NDArray[np.intp]) -> NDAr
     return quats
 
 
-def _unpack_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+def _unpack_11_10_11(packed: NDArray[np.uint32]) -> F64:
     """Return fractions ``(N, 3)`` in 0..1."""
     return np.stack(
         [(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0],
@@ -115,7 +115,7 @@ def _unpack_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     )
 
 
-def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
+def _read_sh(header: PlyHeader, n: int) -> F64:
     """Return the higher bands ``(N, K - 1, 3)``: bytes at the centres of 256 bins over -4..4,
     channel-major as in a plain PLY.
     """
@@ -254,7 +254,7 @@ def read_spz(path: Path | str) -> GaussianArrays:
         at, streams = table + 16 * data[15], []
         for i, need in enumerate(header.stream_bytes):
             if need == 0:
-                streams.append(np.zeros(0, dtype=np.uint8))
+                streams.append(np.zeros(0, np.uint8))
                 continue
             packed = struct.unpack_from("<Q", data, table + 16 * i)[0]
             plain = unzstd(data[at : at + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN)
@@ -295,7 +295,7 @@ def _in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
     """Return Gaussians in the axes of a 3DGS PLY: a left-handed system is mirrored along x, then all
     is turned.
     """
-    M = np.array([DIRECTIONS[letter] for letter in system], dtype=np.float64).T
+    M = np.array([DIRECTIONS[letter] for letter in system], np.float64).T
     means, quats, sh = arrays.means, arrays.quats, arrays.sh
     if np.linalg.det(M) < 0:
         M = M * [-1, 1, 1]
@@ -313,7 +313,7 @@ def _in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
     )
 
 
-def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+def unpack_smallest_three(packed: U8) -> F64:
     """Return unit quaternions ``(N, 4)`` wxyz from the 4 bytes of versions 3 and 4.
 
     Little-endian word: top two bits name the largest of x, y, z, w, which is left out; the others
@@ -321,14 +321,14 @@ def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     / sqrt(2)``.
     """
     words = np.ascontiguousarray(packed).view("<u4").reshape(-1)
-    largest = (words >> 30).astype(np.intp)
+    largest = (words >> 30).astype(np.int64)
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     magnitude = (fields & 511) / 511.0 * np.sqrt(0.5)
     others = np.where(fields & 512, -magnitude, magnitude)
     return with_largest(others, largest)[:, [3, 0, 1, 2]]
 
 
-def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]]) -> GaussianArrays:
+def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
     n, k = header.count, (header.sh_degree + 1) ** 2
     positions, alphas, colours, scales, rotations, harmonics = streams
     parts = positions.reshape(n, 3, 3).astype(np.int32)
@@ -352,7 +352,7 @@ def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]]) -> GaussianArra
     )
 
 
-def _unpack_xyz(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _unpack_xyz(packed: U8) -> F64:
     """Return quaternions ``(N, 4)`` wxyz from the three bytes of version 2; w is what is left to
     length 1.
     """
@@ -367,8 +367,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
     """
     stream = zlib.decompressobj(wbits=31)
     head = stream.decompress(data, 16)
-    header = _parse_header(path, head)
-    size = sum(header.stream_bytes) + MOST_EXTENDED
+    size = sum(_parse_header(path, head).stream_bytes) + MOST_EXTENDED
     return head + stream.decompress(stream.unconsumed_tail, size)
 
 

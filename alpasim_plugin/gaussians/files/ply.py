@@ -22,7 +22,7 @@ from alpasim_plugin.core.atomic import atomic_file, write_bytes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading.files import open_regular, parsing, read_bytes, some_of
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, U8, FloatArray
 from alpasim_plugin.gaussians.cloud import (
     GaussianArrays,
     GaussianCloud,
@@ -80,7 +80,15 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     header = read_ply_header(path)
     chosen = header.element(element) if element is not None else _only_gaussian_element(header)
     n_rest = _check_properties(header, chosen)
-    _check_elements(header)
+    for beside in header.elements:  # refuse what may change what is drawn
+        linear = beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]
+        known = beside.name.startswith("vertex") or beside.name in _BESIDE
+        if linear or (beside.count and not known):
+            found = "linear colours" if linear else f"{beside.count} rows of unknown meaning"
+            raise InputError(
+                f"{header.path}, element {beside.name!r}: {found}",
+                "export a plain 3DGS model, with colours in sRGB",
+            )
     rows = read_ply_element(header, chosen.name)
     notes = stated_in(header)
     flat = "scale_2" not in chosen.properties
@@ -108,7 +116,7 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     )
 
 
-def smoothed(scales: F64, opacities: F64, width: NDArray[np.floating]) -> tuple[F64, F64]:
+def smoothed(scales: F64, opacities: F64, width: FloatArray) -> tuple[F64, F64]:
     """Return scales ``(N, 3)`` and opacities ``(N,)`` under the 3D smoothing filter of widths ``(N,
     1)``, metres.
 
@@ -169,9 +177,9 @@ def _header(count: int, properties: Sequence[str], comments: Sequence[str] = ())
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def write_points(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> None:
+def write_points(path: Path, xyz: F64, rgb: U8) -> None:
     """Write points ``(N, 3)`` with colours ``(N, 3)`` as a binary PLY."""
-    rows = np.empty(len(xyz), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows = np.empty(len(xyz), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = xyz, rgb
     words = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in COLOURS)]
     write_bytes(path, _header(len(rows), words) + rows.tobytes())
@@ -182,8 +190,8 @@ def ply_rows(cloud: GaussianCloud) -> NDArray[np.void]:
     n, k = cloud.sh.shape[:2]
     rest = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
     with np.errstate(divide="ignore"):
-        log_scales = np.log(np.asarray(cloud.scales, dtype=np.float64))
-    groups: list[tuple[Sequence[str], NDArray[np.floating]]] = [
+        log_scales = np.log(np.asarray(cloud.scales, np.float64))
+    groups: list[tuple[Sequence[str], FloatArray]] = [
         (("x", "y", "z"), np.asarray(cloud.means)),
         (("nx", "ny", "nz"), np.zeros((n, 3))),
         ([f"f_dc_{i}" for i in range(3)], np.asarray(cloud.sh)[:, 0, :]),
@@ -254,20 +262,7 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
     return per_channel
 
 
-def _check_elements(header: PlyHeader) -> None:
-    """Refuse elements that may change what is drawn."""
-    for element in header.elements:
-        linear = element.name == "color_space" and read_ply_element(header, element.name)[0][0]
-        known = element.name.startswith("vertex") or element.name in _BESIDE
-        if linear or (element.count and not known):
-            found = "linear colours" if linear else f"{element.count} rows of unknown meaning"
-            raise InputError(
-                f"{header.path}, element {element.name!r}: {found}",
-                "export a plain 3DGS model, with colours in sRGB",
-            )
-
-
-def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floating]:
+def _columns(rows: NDArray[np.void], names: Sequence[str]) -> FloatArray:
     """Return ``(N, len(names))`` of float32, or float64 where the file has doubles."""
     doubles = any(rows.dtype[name].itemsize > 4 for name in names)
     return np.stack(
@@ -275,7 +270,7 @@ def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floatin
     )
 
 
-def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating]:
+def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> FloatArray:
     """Return ``(N, 1 + n_rest, 3)``; the file is channel-major, memory is basis-major."""
     dc = _columns(rows, [f"f_dc_{i}" for i in range(3)])
     if not n_rest:
@@ -363,7 +358,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     path = Path(path)
     lines, body_offset = _header_lines(path)
     form = ""
-    comments: list[str] = []
+    comments = []
     found: list[tuple[str, int, list[tuple[str, str] | None]]] = []
     for number, line in enumerate(lines, start=1):
         match line.split():
@@ -423,8 +418,7 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
     if header.text is not None:
         return _text_rows(header, element, element.dtype, header.text, element.offset)
     have = header.path.stat().st_size - element.offset
-    need = element.count * element.dtype.itemsize
-    if need > have:
+    if element.count * element.dtype.itemsize > have:
         rows = max(have, 0) // element.dtype.itemsize
         raise InputError(
             f"{header.path}, element {name!r}: the header announces {element.count} rows of {element.dtype.itemsize} bytes, the file ends after {rows}",

@@ -128,7 +128,7 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     sh = np.concatenate([constant[:, None], rest], axis=1)
     pixels = plane(meta["quats"]["files"][0], n)
     three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
-    quats = with_largest(three, np.clip(pixels[:, 3].astype(np.intp) - 252, 0, 3))
+    quats = with_largest(three, np.clip(pixels[:, 3].astype(np.int64) - 252, 0, 3))
     antialiased = document.get("antialias") or model == "antialiased"
     antialias_px2 = EPS2D_PX2 if antialiased else 0.0
     opacities = colour[:, 3] / 255.0
@@ -166,7 +166,7 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -> F64:
     """Return the higher harmonics ``(N, K, 3)``."""
     count, bands = int(facts["count"]), int(facts["bands"])
-    coefficients, codebook = BANDS[bands], np.array(facts["codebook"], dtype=np.float64)
+    coefficients, codebook = BANDS[bands], np.array(facts["codebook"], np.float64)
     rows = -(-count // PALETTE_WIDTH)
     centroids = plane(facts["files"][0], rows * PALETTE_WIDTH * coefficients)[:, :3]
     palette = codebook[centroids].reshape(rows * PALETTE_WIDTH, coefficients, 3)

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from alpasim_plugin.core.types import F32, F64, U8, Bool
+from alpasim_plugin.core.types import F32, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -199,30 +199,23 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
     confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
-            ok, looked = _confirms(views[i + gap].camera, maps[i + gap], local, camera)
-            confirmed |= ok
-            asked |= looked
+            other = views[i + gap].camera
+            T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
+            p = local @ T[:3, :3].T + T[:3, 3]
+            ahead = np.maximum(p[:, 2], 1e-3)
+            x = np.floor((p[:, 0] / ahead * other.fx + other.cx) / STRIDE).astype(np.int64)
+            y = np.floor((p[:, 1] / ahead * other.fy + other.cy) / STRIDE).astype(np.int64)
+            small = maps[i + gap][::STRIDE, ::STRIDE]
+            inside = (
+                (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
+            )
+            found = np.zeros(len(ahead))
+            found[inside] = small[y[inside], x[inside]]
+            confirmed |= (found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])
+            asked |= found > 0
     keep = np.zeros(depth.shape, bool)
     keep[rows, columns] = confirmed | ~asked
     return np.where(keep, depth, 0)
-
-
-def _confirms(
-    other: PinholeCamera, depth: F32, local: F64, camera: PinholeCamera
-) -> tuple[Bool, Bool]:
-    """Return which points ``(N, 3)`` of a camera another one's depth map confirms, and which it
-    knows anything of.
-    """
-    T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
-    p = local @ T[:3, :3].T + T[:3, 3]
-    z = np.maximum(p[:, 2], 1e-3)
-    x = np.floor((p[:, 0] / z * other.fx + other.cx) / STRIDE).astype(np.int64)
-    y = np.floor((p[:, 1] / z * other.fy + other.cy) / STRIDE).astype(np.int64)
-    small = depth[::STRIDE, ::STRIDE]
-    inside = (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
-    found = np.zeros(len(z))
-    found[inside] = small[y[inside], x[inside]]
-    return (found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2]), found > 0
 
 
 I32 = npt.NDArray[np.int32]
@@ -287,8 +280,7 @@ def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
     """
     out = np.zeros(label.shape, np.uint8)
     for i in set(np.unique(label)) - {0}:
-        colours = view.rgb[label == i].astype(np.float32)
-        middle = np.median(colours, axis=0)
+        middle = np.median(view.rgb[label == i].astype(np.float32), axis=0)
         if np.abs(middle - usual).max() < COLOUR_LEVELS:
             out |= (
                 (label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)

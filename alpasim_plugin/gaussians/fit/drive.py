@@ -194,29 +194,23 @@ def _start(
                 "give points (structure from motion or LiDAR), or photographs that overlap, in order along the way, with their own poses",
             )
         return points
-    more = [_unmeasured(view, guess) for view, guess in zip(views, guesses, strict=True)]
+    more = []
+    for view, guess in zip(views, guesses, strict=True):
+        assert view.depth is not None
+        near = (
+            cv2.dilate((view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, np.uint8))
+            > 0
+        )
+        free = ~near & (True if view.sky is None else ~view.sky)
+        depth = np.zeros_like(view.depth)
+        if guess is not None:
+            depth = np.where(free, guess, 0).astype(np.float32)
+        more.append(replace(view, depth=depth))
     return GaussianCloud.concatenate(
         [
             start_from_maps(views, more, recipe.points, scene_id, recipe.seed, recipe.start_size),
             *given,
         ]
-    )
-
-
-def _unmeasured(view: PosedView, guess: F32 | None) -> PosedView:
-    """Return a view whose depth is the guess where nothing was measured near by and there is no
-    sky.
-    """
-    assert view.depth is not None
-    near = (
-        cv2.dilate((view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, np.uint8)) > 0
-    )
-    free = ~near & (True if view.sky is None else ~view.sky)
-    return replace(
-        view,
-        depth=np.zeros_like(view.depth)
-        if guess is None
-        else np.where(free, guess, 0).astype(np.float32),
     )
 
 

@@ -24,7 +24,7 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 FISHEYE_HALF_VIEW_RAD = np.radians(
     50.0
 )  # of a fisheye's pinhole image, from its middle to a side: beyond, pixels are only stretched
-_FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
+FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,24 +72,16 @@ class Lens:
         if not self.bends:
             return self.K
         if self.model == "fisheye":
-            middle = np.array([[[self.K[0, 2] - 0.5, self.K[1, 2] - 0.5]]])
-            ends = [
-                (0.0, middle[0, 0, 1]),
-                (self.width - 1.0, middle[0, 0, 1]),
-                (middle[0, 0, 0], 0.0),
-                (middle[0, 0, 0], self.height - 1.0),
-            ]
+            # A pinhole with the lens's middle whose sides look at most `FISHEYE_HALF_VIEW_RAD` apart
+            # and stay in the photograph.
+            x, y = self.K[:2, 2] - 0.5
+            ends = [(0.0, y), (self.width - 1.0, y), (x, 0.0), (x, self.height - 1.0)]
             seen = cv2.fisheye.undistortPoints(
-                np.array([ends]), self.K - _FROM_CORNER, self.distortion
+                np.array([ends]), self.K - FROM_CORNER, self.distortion
             )[0]  # tangents
             most = np.tan(FISHEYE_HALF_VIEW_RAD)
             sides = np.minimum(np.where(np.isfinite(seen), np.abs(seen), most), most)
-            half = np.array(
-                [
-                    min(self.K[0, 2], self.width - self.K[0, 2]),
-                    min(self.K[1, 2], self.height - self.K[1, 2]),
-                ]
-            )
+            half = np.minimum(self.K[:2, 2], [self.width, self.height] - self.K[:2, 2])
             focal = float(
                 max(
                     half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1])
@@ -99,19 +91,19 @@ class Lens:
                 [[focal, 0.0, self.K[0, 2]], [0.0, focal, self.K[1, 2]], [0.0, 0.0, 1.0]]
             )
         whole, _ = cv2.getOptimalNewCameraMatrix(
-            self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0
+            self.K - FROM_CORNER, self.distortion, (self.width, self.height), 0.0
         )
-        return whole + _FROM_CORNER
+        return whole + FROM_CORNER
 
     def straightened(self, image: U8) -> U8:
         """Return an image ``(H, W[, 3])`` freed of the distortion."""
         if not self.bends:
             return image
         x, y = (cv2.fisheye if self.model == "fisheye" else cv2).initUndistortRectifyMap(
-            self.K - _FROM_CORNER,
+            self.K - FROM_CORNER,
             self.distortion,
             np.eye(3),
-            self.straight_K() - _FROM_CORNER,
+            self.straight_K() - FROM_CORNER,
             (self.width, self.height),
             cv2.CV_32FC1,
         )

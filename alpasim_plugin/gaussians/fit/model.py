@@ -101,7 +101,7 @@ class SplatModel:
     def motion(self, poses: Mapping[str, F64]) -> Motion:
         """Turn a view's actor poses ``T_world_box`` into tensors."""
         m, size = len(self.actors) + 1, 1 + self.params["sh_rest"].shape[1]
-        present, T = np.zeros(m, dtype=bool), np.tile(np.eye(4), (m, 1, 1))
+        present, T = np.zeros(m, bool), np.tile(np.eye(4), (m, 1, 1))
         quat, harmonics = np.tile(np.eye(4), (m, 1, 1)), np.tile(np.eye(size), (m, 1, 1))
         present[0] = True
         for i, name in enumerate(self.actors, start=1):

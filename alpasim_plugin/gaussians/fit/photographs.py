@@ -240,7 +240,7 @@ def resized(view: PosedView, width: int) -> PosedView:
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
     return PosedView(
         PinholeCamera(width, height, K, camera.T_camera_world),
-        np.asarray(rgb, dtype=np.uint8),
+        np.asarray(rgb, np.uint8),
         view.name,
     )
 
@@ -290,7 +290,7 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
                 [0, frame.get("fl_y", frame["fl_x"]), frame["cy"]],
                 [0, 0, 1],
             ],
-            dtype=np.float64,
+            np.float64,
         )
         distortion = np.array(
             [float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0]
@@ -311,7 +311,7 @@ def rigid_pose(value: Any, where: str) -> F64:
         InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or
             left-handed.
     """
-    T = np.asarray(as_shape(list[list[float]], value, where), dtype=np.float64)
+    T = np.asarray(as_shape(list[list[float]], value, where), np.float64)
     if T.shape == (3, 4):
         T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4) or not np.isfinite(T).all():

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
-import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.devices import is_on_host, upload
 from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, gaussian_blur
+from alpasim_plugin.core.types import U8
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +35,8 @@ class Comparison:
     """
 
     name: str
-    shown: npt.NDArray[np.uint8]
-    truth: npt.NDArray[np.uint8]
+    shown: U8
+    truth: U8
     psnr_db: float
     ssim: float
 

@@ -122,29 +122,16 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
     total, weight = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
     for view in views:
         if view.sky is not None:
-            assert view.sky is not None
             rows, columns = np.nonzero(
                 cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
             )
             camera = view.camera
-            local = np.stack(
-                [
-                    (columns + 0.5 - camera.cx) / camera.fx,
-                    (rows + 0.5 - camera.cy) / camera.fy,
-                    np.ones(len(rows)),
-                ],
-                axis=1,
-            )
+            local = camera.unprojected(rows, columns, np.ones(len(rows)))
             x, y, z = (local @ camera.T_camera_world[:3, :3]).T
             column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
-            row = (
-                np.rint(
-                    (HIGH_RAD - np.arctan2(z, np.hypot(x, y)))
-                    * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
-                )
-                .astype(np.int64)
-                .clip(0, HEIGHT - 1)
-            )
+            below = HIGH_RAD - np.arctan2(z, np.hypot(x, y))
+            row = np.rint(below * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))).astype(np.int64)
+            row = row.clip(0, HEIGHT - 1)
             np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
             np.add.at(weight, (row, column), 1.0)
     if not weight.any():
@@ -173,4 +160,4 @@ def _spread(image: F32, known: F32) -> F32:
         np.where(area[..., None] > 0, mean, 0).astype(np.float32), (area > 0).astype(np.float32)
     )
     filled = cv2.resize(coarse, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.where(known[..., None] > 0, image, filled), dtype=np.float32)
+    return np.asarray(np.where(known[..., None] > 0, image, filled), np.float32)

@@ -88,11 +88,11 @@ def start_from_depth(
         points, rgb = _sample(
             view, DENSER * share, stream(scene_id, seed, f"fit.start.view.{view.name}")
         )
-        free = np.ones(len(points), dtype=bool)
+        free = np.ones(len(points), bool)
         for actor_id in sorted(set(view.actors) & set(boxes)):
             local = transform_points(inverse(view.actors[actor_id]), points)
             box = boxes[actor_id]
-            half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
+            half = np.array(box.size_m) / 2 + BOX_MARGIN_M
             above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
             mine = free & (np.all(np.abs(local) <= half, axis=1) & above_ground)
             owned[actor_id].append((local[mine], rgb[mine]))
@@ -155,7 +155,7 @@ def start_in_boxes(
     """
     clouds = {}
     for name, box in boxes.items():
-        half = np.array([box.length_m, box.width_m, box.height_m]) / 2
+        half = np.array(box.size_m) / 2
         points = stream(scene_id, seed, f"fit.start.{name}").uniform(-half, half, (count, 3))
         clouds[name] = cloud_from_points(points, np.full((count, 3), 0.5))
     return clouds

@@ -96,7 +96,7 @@ def follow(views: Sequence[PosedView]) -> Tracks:
         points = np.concatenate([points, fresh])
         ids = np.concatenate([ids, count + np.arange(len(fresh))])
         count += len(fresh)
-        rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
+        rows.append((np.full(len(ids), i, np.int64), ids, points.astype(np.float64) + 0.5))
         if i + 1 < len(views) and len(points):
             b = greys[i + 1]
             options = {"winSize": WINDOW, "maxLevel": 4}
@@ -115,7 +115,7 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
     all_ = Tracks(view[order], point[order], at[order], count)
-    return all_.only(np.ones(len(order), dtype=bool))
+    return all_.only(np.ones(len(order), bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +155,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     for _ in range(ROUNDS):
         e, slope, _ = residuals(xyz, tracks, R, t, K)
         J = slope @ R[tracks.view]
-        w = huber(e)
-        JT = J.transpose(0, 2, 1) * w[:, None, None]
+        JT = J.transpose(0, 2, 1) * huber(e)[:, None, None]
         H, g = (
             summed(values, tracks.point, tracks.count)
             for values in (JT @ J, (JT @ e[..., None])[..., 0])
@@ -308,23 +307,18 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     pull_poses += prior * np.concatenate([turn, moved], axis=1)
     between = weighted_pose @ by_point  # (M, 6, 3)
     inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
-    H, g = _reduced(of_poses, pull_poses, between, inverse, pull_points, view, point)
+    # The normal equations of the poses alone.
+    order = np.argsort(view, kind="stable")
+    starts = np.searchsorted(view[order], np.arange(views + 1))
+    blocks = scipy.sparse.bsr_matrix(
+        (between[order], point[order], starts), shape=(6 * views, 3 * points)
+    )
+    numbers = np.arange(points + 1)
+    middle = scipy.sparse.bsr_matrix((inverse, numbers[:-1], numbers), shape=(3 * points,) * 2)
+    H = -(blocks @ middle @ blocks.T).toarray()
+    for i in range(views):
+        H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += of_poses[i]
+    g = pull_poses.ravel() - blocks @ (middle @ pull_points.ravel())
     step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
     back = summed(np.einsum("nij,ni->nj", between, step[view]), point, points)
     return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), np.float64)
-
-
-def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:
-    """Return the normal equations of the poses alone, ``(6V, 6V)`` and ``(6V,)``."""
-    views, n = len(U), len(inverse)
-    order = np.argsort(v, kind="stable")
-    starts = np.searchsorted(v[order], np.arange(views + 1))
-    blocks = scipy.sparse.bsr_matrix((W[order], p[order], starts), shape=(6 * views, 3 * n))
-    middle = scipy.sparse.bsr_matrix(
-        (inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n)
-    )
-    H = -(blocks @ middle @ blocks.T).toarray()
-    for i in range(views):
-        H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += U[i]
-    g = ga.ravel() - blocks @ (middle @ gb.ravel())
-    return H, g

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import F32, F64, Bool, Scenario
+from alpasim_plugin.core.types import F32, F64, U8, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
@@ -35,7 +34,7 @@ class PosedView:
     """
 
     camera: PinholeCamera
-    rgb: npt.NDArray[np.uint8]
+    rgb: U8
     name: str = "view"
     sky: Bool | None = None
     mask: Bool | None = None
@@ -130,9 +129,7 @@ def halved(view: PosedView) -> PosedView:
         return (
             None
             if flags is None
-            else np.asarray(
-                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
-            )
+            else np.asarray(flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), np.bool_)
         )
 
     depth = (

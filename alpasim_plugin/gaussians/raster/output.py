@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, Bool, Frame
+from alpasim_plugin.core.types import F32, U8, Bool, FloatArray, Frame
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
 OPAQUE = 0.5  # opacity from which a pixel shows a surface
-Background = tuple[float, float, float] | npt.NDArray[np.floating]
+Background = tuple[float, float, float] | FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +87,7 @@ class RasterOutput:
         shown = np.clip(self.rgb * gain, 0.0, 1.0)
         return replace(self, rgb=np.asarray(shown, np.float32))
 
-    def to_uint8(self) -> npt.NDArray[np.uint8]:
+    def to_uint8(self) -> U8:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""
         return (self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
@@ -99,7 +98,7 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
     Raises:
         InputError: Neither three finite numbers nor an image of the camera's size.
     """
-    value = np.asarray(background, dtype=np.float32)
+    value = np.asarray(background, np.float32)
     if value.shape == (3,):
         value = value.reshape(1, 1, 3)
     elif value.shape != (camera.height, camera.width, 3):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
@@ -19,8 +19,7 @@ from alpasim_plugin.gaussians.constants import (
     GEO_SIZE,
 )
 
-Node = tuple["PreparedCloud", npt.NDArray[np.floating] | None]
-F32 = npt.NDArray[np.float32]
+Node = tuple["PreparedCloud", FloatArray | None]
 _LANES = 16
 
 
@@ -44,10 +43,10 @@ class PreparedCloud:
     means: F64
     geometry: F32
     sh: F32
-    index: npt.NDArray[np.int64]
+    index: I64
     antialias_px2: float
 
-    def arrays(self) -> tuple[F64, F32, F32, int, npt.NDArray[np.int64]]:
+    def arrays(self) -> tuple[F64, F32, F32, int, I64]:
         """Return what `project_part` reads of it."""
         return self.means, self.geometry, self.sh, self.sh_size, self.index
 
@@ -86,7 +85,7 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     )
 
 
-def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[Any]:
+def _in_lanes(columns: FloatArray, fill: float) -> npt.NDArray[Any]:
     """Turn ``(N, C)`` into groups of C x 16 lanes, flat."""
     n, width = columns.shape
     padded = np.full((n + (-n % _LANES), width), fill, columns.dtype)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.places import require_kernels
-from alpasim_plugin.core.types import F32, F64, I64
+from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
 from alpasim_plugin.gaussians.constants import (
@@ -189,7 +189,7 @@ def composite(
 
 
 def node_poses(
-    T_world_nodes: Sequence[npt.NDArray[np.floating] | None],
+    T_world_nodes: Sequence[FloatArray | None],
     camera: PinholeCamera,
     near_m: float,
 ) -> F64:
@@ -204,7 +204,7 @@ def node_poses(
     Raises:
         InputError: A transform is not rigid.
     """
-    given = [_IDENTITY, *(np.asarray(T, dtype=np.float64) for T in T_world_nodes if T is not None)]
+    given = [_IDENTITY, *(np.asarray(T, np.float64) for T in T_world_nodes if T is not None)]
     shaped = all(T.shape == (4, 4) for T in given)
     if not shaped or not all_rigid(np.array(given)):
         for T in (
@@ -219,7 +219,7 @@ def node_poses(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
     )
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
-    moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
+    moved = np.array([T is not None for T in T_world_nodes], bool)
     return placed[
         np.where(moved, np.cumsum(moved), 0)
     ]  # all that stand in the world share the first

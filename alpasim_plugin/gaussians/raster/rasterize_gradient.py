@@ -175,7 +175,13 @@ def rasterize_gradient(
     if uv.requires_grad:
         uv.retain_grad()
     log_opacity = torch.nn.functional.logsigmoid(seen.logit_opacities)
-    projected = (uv, m, n, log_opacity, _colours(seen.sh, local, camera), local[2])
+    world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
+    terms = sh_terms(*(world * _dot(world, world).rsqrt()))
+    constant, *higher = seen.sh.unbind(1)
+    colour = 0.5 + C0 * constant
+    for term, coefficients in zip(terms, higher, strict=False):
+        colour = colour + term[:, None] * coefficients
+    projected = (uv, m, n, log_opacity, colour.clamp(min=0), local[2])
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
         records = _records(*projected, scale)
@@ -298,17 +304,6 @@ def _ellipses(
     return uv, turned(j) * scales, turned(k) * scales
 
 
-def _colours(sh: Tensor, local: Tensor, camera: PinholeCamera) -> Tensor:
-    """Return colours ``(N, 3)`` from the camera's side, clamped at 0 below."""
-    world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
-    terms = sh_terms(*(world * _dot(world, world).rsqrt()))
-    constant, *higher = sh.unbind(1)
-    colour = 0.5 + C0 * constant
-    for term, coefficients in zip(terms, higher, strict=False):
-        colour = colour + term[:, None] * coefficients
-    return colour.clamp(min=0)
-
-
 def _covariance(m: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return C11, C12, C22 and the determinant of the screen covariance ``(M,)``.
 
@@ -317,11 +312,6 @@ def _covariance(m: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     c11, c12, c22 = _dot(m, m) + EPS2D_PX2, _dot(m, n), _dot(n, n) + EPS2D_PX2
     minors = _cross(m, n)
     return c11, c12, c22, _dot(minors, minors) + EPS2D_PX2 * (c11 + c22 - EPS2D_PX2)
-
-
-def _extent(log_opacity: Tensor) -> Tensor:
-    """Return the standard deviations ``(M,)`` out to the alpha cut."""
-    return (2 * (log_opacity - np.log(ALPHA_MIN))).clamp(min=0).sqrt().clamp(max=EXTENT_MAX_SIGMA)
 
 
 def _records(
@@ -337,7 +327,7 @@ def _records(
     whitening times a scale.
     """
     c11, c12, c22, det = _covariance(m, n)
-    extent = _extent(log_opacity)
+    extent = (2 * (log_opacity - np.log(ALPHA_MIN))).clamp(min=0).sqrt().clamp(max=EXTENT_MAX_SIGMA)
     radius_x, radius_y = extent * c11.sqrt(), extent * c22.sqrt()
     l11 = scale * (c22 / det).sqrt()
     l12 = -l11 * c12 / c22

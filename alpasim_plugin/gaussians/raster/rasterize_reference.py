@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
@@ -44,7 +43,7 @@ class Projection:
         rgb: ``(M, 3)`` colour from the camera's side, clamped at 0 below.
     """
 
-    index: npt.NDArray[np.intp]
+    index: I64
     uv: F64
     depth: F64
     cov: F64
@@ -180,7 +179,7 @@ def composite_reference(
     colour = np.zeros((height, width, 3))
     depth_sum = np.zeros((height, width))
     transmittance = np.ones((height, width))
-    finished = np.zeros((height, width), dtype=bool)
+    finished = np.zeros((height, width), bool)
     blends = 0
     first = np.clip(np.floor(splats.uv - splats.radii()) - 1, 0, [width, height]).astype(int)
     last = np.clip(np.ceil(splats.uv + splats.radii()) + 1, 0, [width, height]).astype(int)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.devices import require_device, upload
 from alpasim_plugin.core.errors import RendererError
-from alpasim_plugin.core.types import F64
+from alpasim_plugin.core.types import F64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
@@ -227,7 +227,7 @@ class UploadedClouds(TileCompositor):
 
     def draw(
         self,
-        nodes: Sequence[tuple[int, npt.NDArray[np.floating] | None]],
+        nodes: Sequence[tuple[int, FloatArray | None]],
         camera: PinholeCamera,
         background: Background | Tensor = (0.0, 0.0, 0.0),
         near_m: float = NEAR_M,

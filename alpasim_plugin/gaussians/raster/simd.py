@@ -57,8 +57,7 @@ def _vector_of(scalar: Any) -> Any:
 
 
 def _broadcast(builder, value):
-    vector = ir.VectorType(value.type, LANES)
-    undefined = ir.Constant(vector, ir.Undefined)
+    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, value, _I32(0))
     return builder.shuffle_vector(
         first, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES)
@@ -187,8 +186,7 @@ def _function(n_args: int, emit):
     """Return an operation of one or three float vectors; ``emit`` writes its instruction."""
 
     def codegen(context, builder, sig, args):
-        vectors = _in_all_lanes(context, builder, sig.return_type, sig.args, args)
-        return emit(builder, *vectors)
+        return emit(builder, *_in_all_lanes(context, builder, sig.return_type, sig.args, args))
 
     def unary(typingctx, a):
         return a(a), codegen
@@ -236,8 +234,7 @@ def select(typingctx, mask, yes, no):
     """
 
     def codegen(context, builder, sig, args):
-        kinds = sig.args[1:]
-        vectors = _in_all_lanes(context, builder, sig.return_type, kinds, args[1:])
+        vectors = _in_all_lanes(context, builder, sig.return_type, sig.args[1:], args[1:])
         return builder.select(args[0], *vectors)
 
     return (_common((yes, no)) or F32X16)(mask, yes, no), codegen

@@ -89,7 +89,7 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
                 f"{actor.appearance}: no Gaussians", "give a file that shows the actor"
             )
         box = actor.box
-        half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + OUTSIDE_M
+        half = np.array(box.size_m) / 2 + OUTSIDE_M
         if (reach > half).any(axis=1).mean() > SPILL:
             own = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
             raise InputError(
@@ -157,17 +157,22 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
     end = half + 0.02
     if cell_m < CELLS_M[0]:
-        return _plates(
-            [
-                (end, y, z, 0.15, 0.08, HEAD_RGB),
-                (end, -y, z, 0.15, 0.08, HEAD_RGB),
-                (-end, y, z, 0.16, 0.09, TAIL_RGB),
-                (-end, -y, z, 0.16, 0.09, TAIL_RGB),
-                (end, 0.0, 1.05 * plate_z, 0.22, 0.06, PLATE_RGB),
-                (-end, 0.0, plate_z, 0.22, 0.06, PLATE_RGB),
-            ],
-            cell_m,
-        )
+        plates = [
+            (end, y, z, 0.15, 0.08, HEAD_RGB),
+            (end, -y, z, 0.15, 0.08, HEAD_RGB),
+            (-end, y, z, 0.16, 0.09, TAIL_RGB),
+            (-end, -y, z, 0.16, 0.09, TAIL_RGB),
+            (end, 0.0, 1.05 * plate_z, 0.22, 0.06, PLATE_RGB),
+            (-end, 0.0, plate_z, 0.22, 0.06, PLATE_RGB),
+        ]
+        xs, ys, zs, half_width, half_height = np.array([plate[:5] for plate in plates]).T
+        across = np.sign(xs) * half_width
+        corners = [
+            np.column_stack([xs, ys + u * across, zs + v * half_height])
+            for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        ]
+        rgb = np.array([plate[5] for plate in plates])
+        return quad_surfels(np.stack(corners, axis=1), rgb, 0.5 * cell_m)[0]
     parts = [
         _blobs([[end, y, z], [end, -y, z]], (0.02, 0.10, 0.055), HEAD_RGB),
         _blobs([[-end, y, z], [-end, -y, z]], (0.02, 0.11, 0.065), TAIL_RGB),
@@ -183,22 +188,6 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     return GaussianCloud.concatenate(parts)
 
 
-def _plates(
-    plates: list[tuple[float, float, float, float, float, RGB]], cell_m: float
-) -> GaussianCloud:
-    """Draw upright plates that face along x, each by its centre x, y and z, half its width and height,
-    and its colour.
-    """
-    x, y, z, half_width, half_height = np.array([plate[:5] for plate in plates]).T
-    across = np.sign(x) * half_width
-    corners = [
-        np.column_stack([x, y + u * across, z + v * half_height])
-        for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    ]
-    rgb = np.array([plate[5] for plate in plates])
-    return quad_surfels(np.stack(corners, axis=1), rgb, 0.5 * cell_m)[0]
-
-
 def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> GaussianCloud:
     kind, colours = label, {"truck": TRUCK_RGB, "bus": BUS_RGB}.get(label, BODY_RGB)
     if label == "truck" and box.length_m < 6.0 and box.height_m < 2.3:
@@ -209,8 +198,7 @@ def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> Gaus
             kind = "van" if box.height_m > 1.95 else "suv"
     loft = STATIONS[kind]
     corners, rgb, gloss = loft.quads(_drawn(colours, draw[0]), GLASS_RGB)
-    scale = np.array([box.length_m, box.width_m, box.height_m])
-    quads = corners * scale - np.array([0.0, 0.0, box.height_m / 2])
+    quads = corners * box.size_m - np.array([0.0, 0.0, box.height_m / 2])
     cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
     # Light from above: roofs bright, flanks in between, undersides dark.
     shade = (0.80 + 0.24 * normals[:, 2])[owner][:, None, None]
@@ -305,7 +293,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
 
 def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     """Draw a traffic cone where the box is small and slim, else a crate with warning stripes."""
-    length, width, height = box.length_m, box.width_m, box.height_m
+    length, width, height = box.size_m
     if max(length, width) < 1.0:
         n = 8 if cell_m < 0.3 else 4
         up = (np.arange(n) + 0.5) / n

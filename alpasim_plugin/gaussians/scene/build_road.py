@@ -18,10 +18,10 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.detail import halvings
-from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
+from alpasim_plugin.core.geometry import direction_of, left_of
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, FloatArray
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.markings import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
@@ -30,7 +30,8 @@ from alpasim_plugin.gaussians.scene.site import (
     HORIZON_M,
     SHIFT_BITS,
     Site,
-    left_of,
+    cells_at,
+    distance_m,
     to_pixels,
     unit,
 )
@@ -44,7 +45,7 @@ from alpasim_plugin.gaussians.scene.surfels import (
     upright_quats,
 )
 
-PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
+MARKING_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)
 PAVEMENT = (0.55, 0.53, 0.50)
 GRASS = (0.33, 0.40, 0.22)
@@ -106,11 +107,11 @@ def paint_ground(
     tag = f"ground-{cell_m}"
     grain = _noise(site, tag, (rows, columns), cell_m)
 
-    rgb = np.empty((rows, columns, 3), dtype=np.float32)
+    rgb = np.empty((rows, columns, 3), np.float32)
     verge = ~road
     rgb[verge] = _verge(site, off[verge], grain[verge], texture)
     tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
-    rgb[road] = np.array(ASPHALT, dtype=np.float32) * tone[road][:, None]
+    rgb[road] = np.array(ASPHALT, np.float32) * tone[road][:, None]
     # Cells half covered by a thin line would alias along the crisp strokes laid over them.
     thinnest = 0.3 if cell_m < CELL_M else 0.0
     covers = [
@@ -120,24 +121,20 @@ def paint_ground(
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
         on = cover > 0
         worn = cover[on] * (0.95 - 0.12 * texture * np.clip(grain[on], 0, 2))
-        rgb[on] += worn[:, None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb[on])
+        rgb[on] += worn[:, None] * (np.array(MARKING_IMAGE_RGB[colour], np.float32) - rgb[on])
 
-    painted = np.zeros((rows, columns), dtype=bool)
+    marked = np.zeros((rows, columns), bool)
     for colour in (WHITE, YELLOW):
-        painted |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
-    near_paint = np.full_like(edge, 1.0e3)
-    if painted.any():
-        near_paint = cv2.distanceTransform(
-            (~painted).astype(np.uint8), cv2.DIST_L2, 5
-        ) * np.float32(cell_m)
-    feature = np.minimum(edge, near_paint)
+        marked |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
+    near_marking = distance_m(marked, cell_m)
+    feature = np.minimum(edge, near_marking)
     if cell_m < CELL_M:
         cap = np.where(road & (path < 2.5), 0.125, np.where(road & (path < 6.0), 0.25, 0.5))
     else:
         cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
-    trench = (near_paint < TRENCH_M) & (
+    trench = (near_marking < TRENCH_M) & (
         edge > TRENCH_M
     )  # not at the kerb's foot: a gap would open there
     height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
@@ -163,7 +160,7 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
     """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to
     patches of ten metres.
     """
-    total = np.zeros(shape, dtype=np.float32)
+    total = np.zeros(shape, np.float32)
     rng = site.rng(tag)
     for grid_m, weight in ((0.13, 0.6), (0.4, 0.45), (1.2, 0.4), (3.0, 0.4), (12.0, 0.45)):
         step = max(grid_m, cell_m)
@@ -197,7 +194,7 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
     """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and
     cracks near the path.
     """
-    dark = np.zeros(shape, dtype=np.uint8)
+    dark = np.zeros(shape, np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     for lane in site.scenario.lane_map.lanes.values():
         if lane.kind not in ("vehicle", "bus") or lane.is_intersection or len(lane.centre) < 2:
@@ -243,7 +240,7 @@ def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
     for _ in range(max(3, len(path) // 6)):
         start = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, 14))
-        line = start + np.cumsum(0.35 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        line = start + np.cumsum(0.35 * direction_of(heading), axis=0)
         cv2.polylines(
             dark,
             [to_pixels(line, low, cell_m)],
@@ -266,7 +263,7 @@ def _coverage(
     """Return the share ``(H, W)`` of each cell under markings of one colour; strokes thinner than
     ``thinnest_m`` are left out.
     """
-    mask = np.zeros(shape, dtype=np.uint8)
+    mask = np.zeros(shape, np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
     mine = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
@@ -297,7 +294,7 @@ CORRIDOR_M = 9.0  # tiles that come this near to the path get the fine levels
 LIFT_M = 0.02
 STROKE_M = 0.125  # length of the finest cells of lane markings for usual cameras
 MAX_LEVEL = 5  # cells of one image grow up to 2**5 of its pixels
-PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
+MARKING_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 
 
 def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
@@ -308,7 +305,7 @@ def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
     d = site.path_m
     n = round(TILE_M / 0.25)
     h, w = -(-d.shape[0] // n), -(-d.shape[1] // n)
-    padded = np.full((h * n, w * n), np.inf, dtype=np.float32)
+    padded = np.full((h * n, w * n), np.inf, np.float32)
     padded[: d.shape[0], : d.shape[1]] = d
     fine_tiles = padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
     # The fine tiles in cells of the image.
@@ -350,17 +347,13 @@ def _ground_nodes(
             i, j = np.nonzero(leaf)
             size = image.cell_m * (1 << k)
             plan = image.low + np.column_stack([(j + 0.5) * size, (i + 0.5) * size])
-            t = np.floor((plan - site.low) / TILE_M).astype(np.int64)
-            inside = fine_tiles[
-                np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1),
-                np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1),
-            ]
+            inside = cells_at(fine_tiles, plan - site.low, TILE_M)
             keep = (inside == keep_inside) & site.owns(plan)
             parts.append((plan[keep], np.full(keep.sum(), size), averages[k][i, j][keep]))
-        plan, size_m, painted = (np.concatenate(column) for column in zip(*parts, strict=True))
-        above = painted[:, 3]
+        plan, size_m, averaged = (np.concatenate(column) for column in zip(*parts, strict=True))
+        above = averaged[:, 3]
         height_m = np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0))
-        cloud = _flat(site, plan, size_m, painted[:, :3], height_m)
+        cloud = _flat(site, plan, size_m, averaged[:, :3], height_m)
         levels.append((image.cell_m * (1 << floor), cloud, tile_numbers(plan - site.low, tile_m)))
     return nodes_by_tile(name, levels)
 
@@ -390,9 +383,7 @@ def _leaves(level: I64) -> list[Bool]:
     return [*leaves, can[-1]]
 
 
-def _flat(
-    site: Site, plan: F64, size_m: F64, rgb: npt.NDArray[np.floating], above_m: F64
-) -> GaussianCloud:
+def _flat(site: Site, plan: F64, size_m: F64, rgb: FloatArray, above_m: F64) -> GaussianCloud:
     """Lay flat Gaussians on the ground."""
     means, normals = _on_ground(site, plan, above_m)
     quats = upright_quats(normals, site.frame.yaw_rad)
@@ -423,7 +414,7 @@ def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
     wear = 1 - 0.16 * rng.random((len(strokes.start), 1)) * site.scenario.environment.texture
     middle = (strokes.start + strokes.end) / 2
     tile = tile_numbers(middle - site.low, TILE_M)
-    rgb = np.array([PAINT_RGB[WHITE], PAINT_RGB[YELLOW]])[strokes.colour] * wear
+    rgb = np.array([MARKING_RGB[WHITE], MARKING_RGB[YELLOW]])[strokes.colour] * wear
     length = np.linalg.norm(strokes.end - strokes.start, axis=1)
     direction = unit(strokes.end - strokes.start)
     levels = []
@@ -462,7 +453,7 @@ def _stroke_nodes(site: Site, everywhere: Strokes) -> list[SceneNode]:
                 tile[owner],
             )
         )
-    return nodes_by_tile("paint", levels, far_m=140.0, usual_cell_m=STROKE_M)
+    return nodes_by_tile("markings", levels, far_m=140.0, usual_cell_m=STROKE_M)
 
 
 def _surroundings(site: Site) -> list[SceneNode]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from alpasim_plugin.core.detail import halvings
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
@@ -75,7 +75,7 @@ def _spots(site: Site, beyond_m: float, step_m: float, shortest_m: float) -> Roa
 
 def _kerbs(site: Site) -> list[Item]:
     """Place a kerb along the road's edge: a face towards the road and a top."""
-    items: list[Item] = []
+    items = []
     usual_m = USUAL_CELL_M["kerb"]
     finer = [(usual_m / 2**n, 0.5 / 2**n, 2**n + 1) for n in halvings(site.scenario)]
     for cell_m, step, rows in (*finer, (usual_m, 0.5, 1), (0.7, 1.0, 1), (1.6, 2.0, 1)):
@@ -117,7 +117,7 @@ def _kerb_rows(count: int) -> list[tuple[float, float, tuple[float, float], floa
 
 def _rails(site: Site) -> list[Item]:
     """Place a guard rail along a highway."""
-    items: list[Item] = []
+    items = []
     for cell_m, step in ((0.3, 1.0), (0.9, 2.0), (2.0, 4.0)):
         spots = _spots(site, 1.2, step, 8.0)
         if spots is None:
@@ -146,7 +146,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
     if per_100m <= 0:
         return []
     rng = site.rng("trees")
-    spots: list[F64] = []
+    spots = []
     for line in contours(site, TREE_LINE_M[site.highway], 70.0):
         mean = 100.0 / per_100m
         n = int(arc_lengths(line)[-1] / mean)
@@ -167,7 +167,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
     stem = rng.uniform(2.1, 3.0, m)
     leaf = LEAVES[rng.integers(len(LEAVES), size=m)] * rng.uniform(0.85, 1.15, (m, 1))
     foot = site.world(at, 0.0 if site.highway else KERB_M)
-    items: list[Item] = []
+    items = []
     for cell_m, count in ((0.25, 520), (0.36, 170), (0.8, 48), (1.8, 14)):
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
@@ -210,7 +210,7 @@ def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
     for front, away in zip(houses.front, houses.away, strict=True):
         d = at - front.mean(axis=0)
         half = np.linalg.norm(front[1] - front[0]) / 2
-        along = np.array([-away[1], away[0]])
+        along = left_of(away)
         depth = d @ away
         free &= ~((np.abs(d @ along) < half + 0.8) & (depth > -0.9) & (depth < DEPTH_M + 1.0))
     return free
@@ -258,7 +258,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     ends = [top, tip, *[p[1:] for p in mapped]]
     start, end = np.concatenate(starts), np.concatenate(ends)
     owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
-    items: list[Item] = []
+    items = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         poles = rods(start, end, 0.085, POLE_RGB, step)
         links = cell_counts(np.linalg.norm(end - start, axis=1), step)
@@ -298,7 +298,7 @@ def _signs(site: Site) -> list[Item]:
             feet.append(foot)
             tops.append(T[:3, 3])
     plan = site.frame.to_ground(np.array(at))
-    items: list[Item] = []
+    items = []
     usual_m = USUAL_CELL_M["sign"]
     finer = [(usual_m / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
     for cell_m, size in (*finer, (usual_m, 0.15), (0.4, 0.5)):

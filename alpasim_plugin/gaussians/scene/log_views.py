@@ -9,7 +9,7 @@ the small views beyond some 20 m.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,7 +25,7 @@ def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:
     return actors_at(scenario.actors, t_us)
 
 
-def actors_at(actors: Sequence[Actor], t_us: int) -> dict[str, F64]:
+def actors_at(actors: Iterable[Actor], t_us: int) -> dict[str, F64]:
     """Return the poses ``(4, 4)`` of the actors present at a time, by id."""
     return {
         a.actor_id: interpolate(a.track, t_us)
@@ -59,7 +59,7 @@ class SkyMask:
         outermost pixels go on.
         """
         if not self._views:
-            return np.zeros((camera.height, camera.width), dtype=np.float32)
+            return np.zeros((camera.height, camera.width), np.float32)
         T = inverse(camera.T_camera_world)
         R, eye = T[:3, :3], T[:3, 3]
         turned_away = self._axes @ R[:, 2] < 0.5

@@ -1,6 +1,6 @@
 """Lane markings as short strokes, from lane edges, marking lines, crosswalks and stop lines.
 
-Which lines are painted is the rule of `world.markings`.
+Which lines are lane markings is the rule of `world.markings`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample
 from alpasim_plugin.core.types import F64, I64, LaneMarkType
-from alpasim_plugin.gaussians.scene.site import CELL_M, Site, left_of, unit
+from alpasim_plugin.gaussians.scene.site import CELL_M, Site, unit
 from alpasim_plugin.world.markings import marking_lines
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
@@ -39,12 +39,10 @@ def marking_strokes(site: Site) -> Strokes:
     """Return all lane markings near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    painted = [
-        (site.frame.to_ground(line), mark_type) for line, mark_type in marking_lines(lane_map)
-    ]
+    every = [(site.frame.to_ground(line), mark_type) for line, mark_type in marking_lines(lane_map)]
     lines = [
         edge
-        for edge in painted
+        for edge in every
         if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)
     ]
     pieces = [
@@ -57,14 +55,14 @@ def marking_strokes(site: Site) -> Strokes:
             pieces.append(_strokes(line[:-1], line[1:], STOP_LINE_M, WHITE))
     pieces = [p for p in pieces if len(p.start)]
     if not pieces:
-        return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
+        return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
     joined = Strokes(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
     inside = np.all((joined.start > site.low) & (joined.start < high), axis=1)
     return Strokes._make(column[inside] for column in joined)
 
 
 def _with_phase(lines: list[tuple[F64, LaneMarkType]]) -> list[tuple[F64, LaneMarkType, float]]:
-    """Give each line the distance painted before it, so that dashes run on from lane to lane."""
+    """Give each line the length of the markings before it, so that dashes run on from lane to lane."""
     if not lines:
         return []
     tree = scipy.spatial.KDTree([line[0] for line, _ in lines])
@@ -75,7 +73,7 @@ def _with_phase(lines: list[tuple[F64, LaneMarkType]]) -> list[tuple[F64, LaneMa
             if j != i and not has_one_before[j] and lines[j][1] == mark_type:
                 following[i].append(j)
                 has_one_before[j] = True
-    phase: dict[int, float] = {}
+    phase = {}
     # Lines that nothing leads to begin; what is left then runs in a circle.
     for first in sorted(range(len(lines)), key=lambda i: has_one_before[i]):
         waiting = [(first, 0.0)]
@@ -113,8 +111,8 @@ def _line_strokes(line: F64, mark_type: LaneMarkType, phase_m: float) -> Strokes
 def _zebra(ring: F64) -> Strokes:
     """Lay bars across the walking direction of a crosswalk, the long axis of its ring."""
     (cx, cy), (w, h), angle = cv2.minAreaRect(ring.astype(np.float32))
-    axis = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
-    across = np.array([-axis[1], axis[0]])
+    axis = direction_of(np.radians(angle))
+    across = left_of(axis)
     if w < h:
         axis, across, w, h = across, axis, h, w
     n = max(1, int((w - 0.3) / (2 * BAR_M)))

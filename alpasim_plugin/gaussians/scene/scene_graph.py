@@ -26,11 +26,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.detail import halvings_of
 from alpasim_plugin.core.errors import RendererError
-from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import MIP_PX2
@@ -98,7 +97,7 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     }
 
 
-def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000) -> I64:
+def tile_numbers(xy: FloatArray, size_m: float, row: int = 100_000) -> I64:
     """Return the number ``(N,)`` of the square tile in which each point ``(N, 2)`` lies; ``row``
     more from one row of tiles to the next.
     """

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, Bool, Lane, Scenario
@@ -49,14 +49,12 @@ class GroundFrame:
     def to_ground(self, xy: F64) -> F64:
         """Map world points ``(N, 2+)`` to ground coordinates ``(N, 2)``."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        d = np.asarray(xy, dtype=np.float64)[:, :2] - self.origin_xy
+        d = np.asarray(xy, np.float64)[:, :2] - self.origin_xy
         return np.column_stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]])
 
     def to_world(self, plan: F64) -> F64:
         """Map ground coordinates ``(N, 2)`` to world points ``(N, 2)``."""
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        x, y = plan[:, 0], plan[:, 1]
-        return np.column_stack([c * x - s * y, s * x + c * y]) + self.origin_xy
+        return self.turned(plan)[:, :2] + self.origin_xy
 
     def turned(self, plan: F64) -> F64:
         """Turn ground directions ``(N, 2)`` to level world directions ``(N, 3)``."""
@@ -103,9 +101,7 @@ class Site:
 
     def owns(self, plan: F64) -> Bool:
         """Return which ground points ``(N, 2)`` lie in tiles that are built."""
-        ij = np.floor((plan - self.low + HORIZON_M) / TILE_M).astype(np.int64)
-        h, w = self.owned.shape
-        return self.owned[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
+        return cells_at(self.owned, plan - self.low + HORIZON_M, TILE_M)
 
     @property
     def owned_cells(self) -> Bool:
@@ -128,7 +124,7 @@ class Site:
     @cached_property
     def path_m(self) -> F32:
         """Return ``(H, W)`` the distance of each cell to the path."""
-        mask = np.zeros(self.road.shape, dtype=np.uint8)
+        mask = np.zeros(self.road.shape, np.uint8)
         cv2.polylines(mask, [self.pixels(self.path)], False, 1, 1, cv2.LINE_8, SHIFT_BITS)
         return distance_m(mask.astype(bool))
 
@@ -140,9 +136,7 @@ class Site:
         """Return the raster's values ``(N,)`` at ground points ``(N, 2)``; points outside take the
         border's value.
         """
-        ij = np.floor((plan - self.low) / CELL_M).astype(np.int64)
-        h, w = raster.shape
-        return raster[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
+        return cells_at(raster, plan - self.low, CELL_M)
 
     def world(self, plan: F64, above_m: float | F64 = 0.0) -> F64:
         """Return world points ``(N, 3)`` standing ``above_m`` over the ground at ground points
@@ -152,6 +146,15 @@ class Site:
         return np.column_stack([xy, self.height_at(xy) + above_m])
 
 
+def cells_at(raster: npt.NDArray[Any], xy: F64, cell_m: float) -> npt.NDArray[Any]:
+    """Return a raster's values ``(N,)`` at points ``(N, 2)`` relative to its corner; points outside
+    take the border's value.
+    """
+    ij = np.floor(xy / cell_m).astype(np.int64)
+    h, w = raster.shape
+    return raster[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
+
+
 def to_pixels(plan: F64, low: F64, cell_m: float) -> npt.NDArray[np.int32]:
     """Return ground points as fixed-point pixels with `SHIFT_BITS` fractional bits, pixel centres
     at integers.
@@ -159,13 +162,13 @@ def to_pixels(plan: F64, low: F64, cell_m: float) -> npt.NDArray[np.int32]:
     return np.round(((plan - low) / cell_m - 0.5) * (1 << SHIFT_BITS)).astype(np.int32)
 
 
-def distance_m(mask: Bool) -> F32:
+def distance_m(mask: Bool, cell_m: float = CELL_M) -> F32:
     """Return the distance of each cell to the nearest true cell, metres; far away where there is
     none.
     """
     if not mask.any():
-        return np.full(mask.shape, 1.0e3, dtype=np.float32)
-    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M)
+        return np.full(mask.shape, 1.0e3, np.float32)
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(cell_m)
 
 
 def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = None) -> Site:
@@ -200,7 +203,7 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
         plan = frame.to_ground(lane.centre)
         if np.all(plan.max(axis=0) > low) and np.all(plan.min(axis=0) < high):
             near.append(lane)
-    road = np.zeros(shape, dtype=np.uint8)
+    road = np.zeros(shape, np.uint8)
     for ring in (*_lane_rings(near), *scenario.lane_map.drivable_areas):
         if len(ring) >= 3:
             corners = to_pixels(frame.to_ground(ring), low, CELL_M)
@@ -214,7 +217,7 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
     )
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
-    mask = np.zeros(shape, dtype=np.uint8)
+    mask = np.zeros(shape, np.uint8)
     for actor in scenario.actors:
         radius = 0.5 * np.hypot(actor.box.length_m, actor.box.width_m) + 0.5
         points = to_pixels(frame.to_ground(actor.track.xyz), low, CELL_M)
@@ -232,7 +235,7 @@ def _owned_tiles(path: F64, low: F64, high: F64, section: int | None) -> Bool:
     """Return which tiles ``(Ty, Tx)`` of a site, and around it to the horizon, a section owns."""
     count = np.ceil((high - low + 2 * HORIZON_M) / TILE_M).astype(np.int64)
     if section is None:
-        return np.ones(count[::-1], dtype=bool)
+        return np.ones(count[::-1], bool)
     grid = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1])), axis=-1)
     _, nearest = scipy.spatial.KDTree(path).query(low - HORIZON_M + (grid + 0.5) * TILE_M)
     return section_of(nearest) == section
@@ -361,8 +364,7 @@ def _runs(points: F64, keep: Bool) -> list[F64]:
 
 def _road_on_left(site: Site, line: F64) -> F64:
     """Turn a line so that the road lies to its left; which side it is on is voted by all points."""
-    d = np.gradient(line, axis=0)
-    left = left_of(unit(d))
+    left = left_of(unit(np.gradient(line, axis=0)))
     signed = site.off_road_m - site.inside_m
     nearer = site.look_up(signed, line + left) < site.look_up(signed, line - left)
     return line if np.mean(nearer) >= 0.5 else line[::-1].copy()
@@ -372,16 +374,10 @@ def places(line: F64, spacing_m: float, first_m: float = 0.0) -> Roadside:
     """Return places every ``spacing_m`` along a line that has the road on its left."""
     s = np.arange(first_m, float(arc_lengths(line)[-1]), spacing_m)
     xy = resample(line, s)
-    d = resample(line, s + 0.5) - resample(line, s - 0.5)
-    along = unit(d)
+    along = unit(resample(line, s + 0.5) - resample(line, s - 0.5))
     return Roadside(xy, along, -left_of(along))
 
 
 def unit(vectors: F64) -> F64:
     """Return rows ``(N, D)`` of length one; a row of zeros stays."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
-
-
-def left_of(along: F64) -> F64:
-    """Return rows ``(N, 2)`` turned to the left by a right angle."""
-    return np.column_stack([-along[:, 1], along[:, 0]])

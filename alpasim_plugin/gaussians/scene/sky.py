@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.geometry import se2, wrap_angle
-from alpasim_plugin.core.types import F32, F64, I64
+from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
 if TYPE_CHECKING:
@@ -130,8 +129,7 @@ class Sky:
         if camera.rolling is not None:
             a, b, c = camera.rolling.time
             time = np.clip(a * u[None, :] + b * v[:, None] + c, -0.5, 0.5)[..., None]
-            turn = camera.motion(np.eye(4), np.eye(4))[:3]
-            ray = ray - time * np.cross(turn, ray)
+            ray = ray - time * np.cross(camera.motion(np.eye(4), np.eye(4))[:3], ray)
         ray = ray @ camera.T_camera_world[:3, :3]
         elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
@@ -154,7 +152,7 @@ def _corners(height: int, width: int, device: str) -> Tensor:
     return upload(np.stack([u, v, np.ones_like(u)]).astype(np.float64), device)
 
 
-def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
+def _upsample(grid: FloatArray, height: int, width: int) -> F32:
     """Interpolate values at every `STEP_PX`-th pixel corner to pixel centres."""
     rows, columns = grid.shape
     finer = cv2.resize(
@@ -183,7 +181,7 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     ridge = np.radians(1.2) * (
         1 + 0.8 * _periodic_noise(rng, 1, 24, 1) + 0.3 * _periodic_noise(rng, 1, 120, 1)
     )
-    panorama = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
+    panorama = np.empty((HEIGHT, WIDTH, 3), np.float32)
     for first in range(0, HEIGHT, BLOCK):  # a block stays in the processor's cache
         part = slice(first, first + BLOCK)
         image = np.repeat(column[part, None, :], WIDTH, axis=1)
@@ -205,9 +203,7 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     return Sky(panorama)
 
 
-def _periodic_noise(
-    rng: np.random.Generator, rows: int, columns: int, height: int = HEIGHT
-) -> npt.NDArray[np.float64]:
+def _periodic_noise(rng: np.random.Generator, rows: int, columns: int, height: int = HEIGHT) -> F64:
     """Return the first ``height`` rows of smooth noise ``(HEIGHT, WIDTH)`` of about unit spread
     whose left and right edges meet.
     """
