@@ -7,6 +7,7 @@ What cannot be pretended: speed, memory, rounding, and kernels that run at the s
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -30,6 +31,10 @@ VIEWS = {
 }  # fmt: skip
 
 
+# What Triton kernels write: grey everywhere, where they do not compute.
+WRITTEN = {"records", "depths", "boxes", "counts", "tiles", "splats", "image", "levels", "pairs"}
+
+
 @dataclass
 class Traffic:
     """What a device did since `reset`."""
@@ -40,6 +45,7 @@ class Traffic:
     bytes_down: int = 0
     graph: object = None  # that is being captured
     backward: int = 0  # of a tensor of the device, in progress
+    computes: bool = True  # whether its Triton kernels do
 
     def reset(self):
         """Forget everything."""
@@ -252,7 +258,14 @@ class _Launches:
                 raise RuntimeError("a kernel was given a tensor of the host")
             traffic.launches += 1
             with torch.utils._python_dispatch._disable_current_modes():
-                self.kernel[grid](*map(_unwrap, args), **constants)
+                if traffic.computes:
+                    self.kernel[grid](*map(_unwrap, args), **constants)
+                    return
+                for name, value in zip(
+                    inspect.signature(self.kernel.fn).parameters, args, strict=False
+                ):
+                    if name in WRITTEN:
+                        value.held.fill_(0.5)
 
         return launch
 
@@ -269,11 +282,12 @@ class _Kernels:
 
 
 @contextmanager
-def pretended_device(patch):
+def pretended_device(patch, computes=True):
     """Let torch have one CUDA device for a while.
 
     Args:
         patch: pytest's ``monkeypatch``.
+        computes: Whether Triton kernels do; interpreted, they take seconds a frame.
     """
     from alpasim_plugin.fixers import pixel_fixer
     from alpasim_plugin.fixers.semantic_map import tile_kernel
@@ -303,6 +317,7 @@ def pretended_device(patch):
     torch.__future__.set_overwrite_module_params_on_conversion(True)
     pixel_fixer._captured.cache_clear()  # a graph of a test before has another device's tensors
     traffic.reset()
+    traffic.computes = computes
     try:
         with _Functions(), _Dispatch():
             yield traffic
