@@ -193,6 +193,7 @@ def size_lines(plan: RunPlan) -> list[str]:
     """Return how much is drawn for one instant of the scene with the most pixels, where its cameras
     have a megapixel or more.
     """
+    from alpasim_plugin.renderers.reconstruction_key import fit_cpu_s
     from alpasim_plugin.runs.lenses import drawn_pixels
     from scenarios.budget import memory_mb
 
@@ -210,7 +211,9 @@ def size_lines(plan: RunPlan) -> list[str]:
     cost = f"{drawn / PX_PER_S:.1f} CPU seconds"
     if largest.background is None and largest.model is None:
         cost += f" and {memory_mb(largest, drawn) / 1e3:.1f} GB"
-    return [f"{largest.scene_id}: {size}, {by}, {cost} behind clean"]
+    fit_min = fit_cpu_s(largest, pinholes) / 60
+    fitted = f"; {fit_min:.0f} CPU minutes to fit its model once" if fit_min else ""
+    return [f"{largest.scene_id}: {size}, {by}, {cost} behind clean{fitted}"]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

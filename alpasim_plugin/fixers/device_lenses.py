@@ -71,7 +71,9 @@ def _uploaded(side: Lens, device: torch.device) -> tuple[Tensor, Tensor]:
     """
     assert side.resample is not None, "a pinhole that covers a lens"
     place = (2 * side.resample + 1) / np.array(side.cover, np.float32) - 1
-    weight = side.weight
-    if weight is None:
-        weight = np.ones(place.shape[:2]) if side.seen is None else side.seen
-    return upload(place[None], device), upload(weight[..., None], device).float()
+    weight = np.ones(place.shape[:2], np.float32)
+    if side.weight is not None:
+        weight = side.weight
+    elif side.seen is not None:
+        weight = side.seen.astype(np.float32)
+    return upload(place[None], device), upload(weight[..., None], device)

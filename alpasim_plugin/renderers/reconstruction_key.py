@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,9 @@ STEPS_RIG = 2.0
 # street is built finer (`halvings`); one such camera is fitted as one of several. An error of depth
 # moves what a fixer takes from recorded frames by as many more pixels.
 SHARP = 2
+
+
+CPU_S = 9e-7  # of one step of a fit, by point
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,20 @@ def recipe_of(scenario: Scenario, device: str = "cpu") -> ReconstructionRecipe:
         pose_error_m=amount.pose_error_m,
         place=device.partition(":")[0],
     )
+
+
+def fit_cpu_s(scenario: Scenario, pinholes: int) -> float:
+    """Estimate the CPU time of a scenario's fit, 0 where nothing is fitted.
+
+    Args:
+        scenario: Its cameras may have lenses.
+        pinholes: How many draw them.
+    """
+    if scenario.model is not None or scenario.degradation.kind == "none":
+        return 0.0
+    drawn = tuple(islice(cycle(scenario.cameras), pinholes))
+    splat = recipe_of(replace(scenario, cameras=drawn)).splat
+    return CPU_S * splat.steps * splat.points
 
 
 # what it imports decides, with the scene and the recipe, what the model is
