@@ -131,15 +131,15 @@ class RunPlan:
 
     @property
     def command_key(self) -> str:
-        """Give a short digest of the command: names, paths and options, not the content of the
-        parts.
+        """Give a short digest of the command: names, paths and options, in any order, not the
+        content of the parts.
         """
         if self.whole is not None:
             return self.whole.command_key
-        named = [
-            [*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides]
+        named = sorted(
+            digest([*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides])
             for cell in self.cells
-        ]
+        )
         question = [self.question] if self.question else []
         return digest([named, asdict(self.options), *question])[:12]
 

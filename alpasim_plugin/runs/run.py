@@ -327,8 +327,8 @@ def claim(
         raise InputError(
             f"The folder {root} holds another run: its key is {held.get('key')}, this command's "
             f"is {plan.command_key}.",
-            "Choose another --out, or pass --resume to reuse its matching rollouts and replace "
-            "its tables.",
+            "Choose another --out, or, without --vary, pass --resume to reuse its matching "
+            "rollouts and replace its tables.",
         )
     if held and any(damage.file == RUN_INFO for damage in inspect_files(root)):
         noticed(f"damaged: {root / RUN_INFO}: not the content that was written; writing it again")
