@@ -406,6 +406,8 @@ def _scene_facts(scenario: Scenario, ref: ScenarioRef, device: str) -> JsonObjec
         "rates": asdict(scenario.rates),
         "latency": asdict(scenario.latency),
         "degradation": asdict(scenario.degradation),
+        "environment": asdict(scenario.environment),
+        "vehicle": asdict(scenario.vehicle),
         "reconstruction": model_key(scenario, device),
         "notes": list(scenario.notes),
     }

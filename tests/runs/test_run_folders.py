@@ -232,6 +232,7 @@ def test_a_run_folder_is_named_by_what_was_driven_and_a_short_key(tmp_path, monk
     run(folder, plan)
     assert default_folder(plan) == folder
     info = json.loads((folder / "run.json").read_text())
+    assert all(scene["vehicle"]["friction"] is None for scene in info["scenes"].values())
     (folder / "run.json").write_text(json.dumps(info | {"key": "another"}))
     assert default_folder(plan) == Path(f"runs/first-{plan.command_key}")
     assert plan_of((1, 0)).command_key == plan.command_key != plan_of((1, 2)).command_key
