@@ -213,7 +213,8 @@ class BoundarySearch:
             try:
                 self.scenes[values] = self.make([replace(self.ref, overrides=overrides)])
             except InputError as error:
-                self.unreachable[values] = error
+                message = f"--vary {', '.join(more)}: {error.message}"
+                self.unreachable[values] = InputError(message, error.hint)
         return values in self.scenes
 
     def _asked(self, failed: Mapping[Point, bool]) -> list[Point]:
