@@ -27,14 +27,8 @@ LOG_SCALE_LIMIT = 20.0
 
 
 # A camera's numbers, one float32 array.
-CAM_FX = 0
-CAM_FY = 1
-CAM_CX = 2
-CAM_CY = 3
-CAM_SLOPE_LOW_X = 4
-CAM_SLOPE_HIGH_X = 5
-CAM_SLOPE_LOW_Y = 6
-CAM_SLOPE_HIGH_Y = 7
+CAM_FX, CAM_FY, CAM_CX, CAM_CY = range(4)
+CAM_SLOPE_LOW_X, CAM_SLOPE_HIGH_X, CAM_SLOPE_LOW_Y, CAM_SLOPE_HIGH_Y = range(4, 8)
 CAM_WIDTH, CAM_HEIGHT = 8, 9
 # of a rolling shutter: the time of a pixel, in shutters from its middle, as a U + b V + c; and by how
 # many pixels things move while it is open, 0: it does not roll
@@ -61,16 +55,8 @@ GEO_SIZE = 11
 # One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 +
 # t^2 where s = L11 dx + L12 dy and t = L22 dy: a sum of squares, which keeps its precision for
 # needles where the usual quadratic form cancels.
-U, V = 0, 1
-L11 = 2
-L12 = 3
-L22 = 4
-PEAK = 5
-R = 6
-G = 7
-B = 8
-Z = 9
-RADIUS_X, RADIUS_Y = 10, 11  # half sizes of the box around the drawn ellipse, pixels
+# The radii are half sizes of the box around the drawn ellipse, pixels.
+U, V, L11, L12, L22, PEAK, R, G, B, Z, RADIUS_X, RADIUS_Y = range(12)
 # s^2 + t^2 of a 4 x 4 block's centre beyond which no pixel of the block is touched
 BLOCK_REACH = 15
 RECORD = 16  # columns 12 to 14 are empty

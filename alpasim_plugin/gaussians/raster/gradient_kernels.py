@@ -40,13 +40,7 @@ _f = np.float32
 
 # Columns of a block in the backward pass: the above, then the sum S and the gradients of colour,
 # depth sum and alpha.
-_S = 32
-_GR = 48
-_GG = 64
-_GB = 80
-_GD = 96
-_GA = 112
-_BACK = 128
+_S, _GR, _GG, _GB, _GD, _GA, _BACK = range(32, 144, 16)
 # One row per (splat, tile) pair: gradients of colour and depth, then the moments of h: 1, s, t, s
 # s, s t, t t.
 PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_TT = range(10)

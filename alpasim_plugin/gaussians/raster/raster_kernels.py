@@ -54,12 +54,7 @@ P0, P1, P2, P3, P4, P5 = (
 CUT = _f((np.log2(ALPHA_MIN) + 4.0) / 8.0)
 # Columns of a block's state, sixteen pixels each. A finished pixel keeps its transmittance with the
 # sign turned.
-STATE_T = 0
-STATE_R = 16
-STATE_G = 32
-STATE_B = 48
-STATE_D = 64
-STATE = 80
+STATE_T, STATE_R, STATE_G, STATE_B, STATE_D, STATE = range(0, 96, 16)
 # What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen
 # pixels each.
 KEPT_T, KEPT_LAST = 0, 16
