@@ -30,6 +30,10 @@ def load(sd, **options):
     return CosmosCausalDiT.from_state_dict(sd, **options)
 
 
+def assert_equal(back, sd):
+    torch.testing.assert_close(dict(back), sd, rtol=0, atol=0)
+
+
 def changed(key, value):
     """Return small weights with one tensor replaced, or left out (None)."""
     sd = random_weights(SMALL) | {key: value}
@@ -89,7 +93,7 @@ def test_everything_a_training_run_stores_besides_is_tolerated(wrap):
 def test_prefixes_of_wrappers_and_averages_are_stripped(prefix):
     sd = random_weights(SMALL)
     back = load({prefix + key: value for key, value in sd.items()}).state_dict()
-    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert_equal(back, sd)
 
 
 def test_a_network_without_a_map_is_refused():
@@ -124,7 +128,7 @@ def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
             describe("onefixer-2b", f"weights.dit={path}")
     subprocess.run(of_the_page(repo, "glob", folder), cwd=tmp_path, check=True)
     back = load(load_weights(tmp_path / "net.safetensors")).state_dict()
-    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert_equal(back, sd)
 
 
 def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
@@ -134,7 +138,7 @@ def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
         load_weights(folder)
     subprocess.run(of_the_page(repo, "dcp_to_torch", folder), cwd=tmp_path, check=True)
     back = load(load_weights(tmp_path / "net.pt")).state_dict()
-    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert_equal(back, sd)
 
 
 def describe(name, *overrides):
@@ -153,7 +157,7 @@ def test_state_dict_of_the_network_has_the_original_keys():
     sd = random_weights(SMALL)
     back = load(sd).state_dict()
     assert set(back) == set(sd)
-    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert_equal(back, sd)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -197,7 +201,7 @@ def test_safetensors_round_trip_with_digest_and_precision(tmp_path):
     write_safetensors(path, sd, {"made": "test"})
     assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
     back = load_weights(path, sha256=file_sha256(path).upper())
-    assert all(torch.equal(back[key], sd[key]) for key in sd)
+    assert_equal(back, sd)
     with pytest.raises(InputError):
         load_weights(path, sha256="00")
 
@@ -235,7 +239,7 @@ def test_torch_file_of_tensors_loads(tmp_path, name, legacy):
     sd = random_weights(SMALL)
     torch.save({"model": dressed(sd)}, tmp_path / name, _use_new_zipfile_serialization=not legacy)
     back = CosmosCausalDiT.from_state_dict(load_weights(tmp_path / name))
-    assert all(torch.equal(value, sd[key]) for key, value in back.state_dict().items())
+    assert_equal(back.state_dict(), sd)
 
 
 class Trap:

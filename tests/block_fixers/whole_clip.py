@@ -53,7 +53,7 @@ class Clip:
             np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha
             for frame in frames
         ]
-        times = np.array([frame.t_us for frame in frames], dtype=np.int64)
+        times = np.array([frame.t_us for frame in frames], np.int64)
         return cls(
             frames[0].camera,
             times,

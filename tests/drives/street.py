@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import struct
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -85,7 +86,7 @@ class Street:
             t = np.where(
                 ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far
             )
-        best, kind = np.where(t > 0, t, far), np.zeros(len(ray), dtype=int)
+        best, kind = np.where(t > 0, t, far), np.zeros(len(ray), int)
         for side in (1.0, -1.0):
             t = np.where(
                 ray[:, 1] * side > 1e-6,
@@ -139,6 +140,15 @@ def noise(place, cell_m):
 def stations():
     """Return where the photographs are taken."""
     return np.arange(COUNT) * STEP_M
+
+
+@contextmanager
+def edited(folder):
+    """Let a test change the ``transforms.json`` of a folder."""
+    path = folder / "transforms.json"
+    document = json.loads(path.read_text())
+    yield document
+    path.write_text(json.dumps(document))
 
 
 def write_transforms(
@@ -198,7 +208,7 @@ def write_colmap(folder, binary, model="SIMPLE_PINHOLE", bend=()):
     number = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}[model]
     focal = (FOCAL,) if model.startswith("SIMPLE") else (FOCAL, FOCAL)
     p = (*focal, K[0, 2], K[1, 2], *bend)
-    coefficients = np.array([*bend, 0, 0, 0, 0][:4], dtype=float) if bend else None
+    coefficients = np.array([*bend, 0, 0, 0, 0][:4], float) if bend else None
     rows = []
     for i, x in enumerate(stations()):
         T = street.pose(x)

@@ -2,7 +2,6 @@
 is left behind.
 """
 
-import json
 import shutil
 import struct
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives.build import import_drive
-from tests.drives.street import HEIGHT, WIDTH, write_colmap, write_transforms
+from tests.drives.street import HEIGHT, WIDTH, edited, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
 
@@ -174,8 +173,7 @@ def test_a_colmap_model_that_is_cut_off_is_named(tmp_path, name):
 
 def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path, walk):
     folder = Path(shutil.copytree(walk, tmp_path / "walk"))
-    document = json.loads((folder / "transforms.json").read_text())
-    document["frames"] = [frame for _ in range(30) for frame in document["frames"]]
-    (folder / "transforms.json").write_text(json.dumps(document))
+    with edited(folder) as document:
+        document["frames"] = [frame for _ in range(30) for frame in document["frames"]]
     with pytest.raises(InputError):
         import_drive(folder, tmp_path / "out")

@@ -18,7 +18,7 @@ from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.source import Points
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
-from tests.drives.street import COUNT, STEP_M, Street, write_kitti, write_transforms
+from tests.drives.street import COUNT, STEP_M, Street, edited, write_kitti, write_transforms
 
 pytestmark = pytest.mark.slow
 
@@ -38,7 +38,7 @@ def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
     assert (lane.left_mark_type, lane.right_mark_type) == ("none", "none")
     assert scenario.cameras[0].name == "front"
     assert (scenario.cameras[0].width % 16, scenario.cameras[0].height % 16) == (0, 0)
-    assert any("000024.png" in note for note in scenario.notes)
+    assert "000024.png" in str(scenario.notes)
 
 
 def test_the_wheels_stand_on_the_road_that_bows(imported):
@@ -85,11 +85,10 @@ def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path, monk
 @pytest.mark.slow
 def test_scale_without_metres_comes_from_the_cameras_height(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk")
-    document = json.loads((folder / "transforms.json").read_text())
-    for frame in document["frames"]:
-        for row in frame["transform_matrix"][:3]:
-            row[3] *= 0.37
-    (folder / "transforms.json").write_text(json.dumps(document))
+    with edited(folder) as document:
+        for frame in document["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 0.37
     quality = import_drive(folder, tmp_path / "out", camera_height_m=1.5)
     assert quality["scale"] == "scale from the camera's height above the ground, 1.5 m (as given)"
     ego = load_scenario(tmp_path / "out/scenario.yaml").ego_log.xyz
@@ -103,7 +102,7 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(w
     )
     shown = build.shown_photographs(drive, placed)
     assert sum(one.use == "held-out" for one in shown) == 5
-    assert any("photographs taken along a road" in note for note in placed.notes)
+    assert "photographs taken along a road" in str(placed.notes)
 
 
 def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):

@@ -1,7 +1,5 @@
 """Every form of a recorded drive gives the same street: its way, its road and its scale."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from alpasim_plugin.drives.build import _points
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.source import checked
-from tests.drives.street import COUNT, STEP_M, write_colmap, write_transforms
+from tests.drives.street import COUNT, STEP_M, edited, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
 
@@ -96,11 +94,10 @@ def test_the_facts_of_a_real_street(data_set):
 
 def test_times_put_photographs_in_order(tmp_path):
     folder = write_transforms(tmp_path / "a", unit="m")
-    document = json.loads((folder / "transforms.json").read_text())
-    for i, frame in enumerate(document["frames"]):
-        frame["t_us"] = 50_000 * i
-    document["frames"].reverse()
-    (folder / "transforms.json").write_text(json.dumps(document))
+    with edited(folder) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["t_us"] = 50_000 * i
+        document["frames"].reverse()
     drive = read_source(folder)
     assert [one.t_us for one in drive.photographs] == [50_000 * i for i in range(COUNT)]
     assert drive.metric == "the file's word that its unit is the metre"

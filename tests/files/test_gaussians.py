@@ -81,7 +81,7 @@ def test_the_3d_filter_is_applied_as_published(tmp_path, name):
     assert np.allclose(cloud.scales, wider, rtol=1e-12)
     fainter = plain.opacities * (plain.scales / wider).prod(axis=1)
     assert np.allclose(cloud.opacities, fainter, rtol=1e-12)
-    assert any("filter" in note for note in report.notes)
+    assert "filter" in str(report.notes)
     assert cloud.antialias_px2 == MIP_PX2
 
 
@@ -90,7 +90,7 @@ def test_2d_gaussians_are_drawn_flat(tmp_path):
     cloud, report = opened(model(tmp_path / "b.ply", without="scale_2"))
     assert np.array_equal(cloud.scales[:, :2], plain.scales[:, :2])
     assert (cloud.scales[:, 2] < 0.01 * cloud.scales[:, :2].min(axis=1)).all()
-    assert any("2D" in note for note in report.notes)
+    assert "2D" in str(report.notes)
     camera = PinholeCamera.from_pose(32, 32, np.diag([20.0, 20.0, 1.0]), np.eye(4))
     assert np.isfinite(rasterize(cloud, camera).rgb).all()
 
@@ -123,7 +123,7 @@ def test_what_comments_state_of_the_drawing_is_noted(tmp_path, comments, noted):
 def test_antialiasing_that_comments_state_is_drawn_and_written(tmp_path, comments, antialias_px2):
     cloud, report = opened(model(tmp_path / "a.ply", comments=comments))
     assert cloud.antialias_px2 == antialias_px2
-    assert any("antialiasing" in note for note in report.notes) == (antialias_px2 > 0)
+    assert ("antialiasing" in str(report.notes)) == (antialias_px2 > 0)
     write_ply(tmp_path / "b.ply", cloud.take([2, 0]))
     assert opened(tmp_path / "b.ply")[0].antialias_px2 == antialias_px2
 

@@ -109,7 +109,7 @@ def test_a_connection_without_lanes_links_those_of_one_direction(contact):
         f'<junction id="9">{connection}</junction>',
     )
     assert lanes.lanes["1.0.-1"].successors == ("2.0.1" if contact == "end" else "2.0.-1",)
-    assert any("name no lanes" in note for note in notes)
+    assert "name no lanes" in str(notes)
 
 
 def test_a_link_that_stands_in_the_next_road_alone_counts():
@@ -125,7 +125,7 @@ def test_a_lane_that_ends_inside_the_map_is_said():
         road("1", section(0, lane(-1, None, -1), lane(-2)), after="road:2:start"),
         road("2", section(0, lane(-1)), x=50, before="road:1:end"),
     )
-    assert any("1.0.-2" in note for note in notes)
+    assert "1.0.-2" in str(notes)
 
 
 def test_links_of_a_road_between_two_junctions_stay_apart():
@@ -154,7 +154,7 @@ def test_records_out_of_order_are_put_in_order():
     _, notes = read(
         road("7", section(0, lane(-1)), length=100, view=arc.replace('x="50"', 'x="51"') + line)
     )
-    assert any("7 (1.00 m)" in note for note in notes)
+    assert "7 (1.00 m)" in str(notes)
 
 
 def test_a_reversed_lane_runs_and_sees_the_other_way():

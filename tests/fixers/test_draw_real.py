@@ -69,7 +69,7 @@ def test_published_conditioning_videos_hold_our_colours(shared_data, name):
     steps = np.linspace(0, 1, 25)[:, None]
     palette = np.concatenate(
         [
-            np.array(flat, dtype=float),
+            np.array(flat, float),
             *((1 - steps) * a + steps * b for a, b in np.array(list(BOX_COLOURS.values()))),
         ]
     )

@@ -109,7 +109,7 @@ def test_the_actor_is_learned_in_its_own_frame(posed):
 def test_a_mask_keeps_what_it_hides_out_of_the_model(posed):
     spoiled = []
     for view in posed.views:
-        rgb, mask = view.rgb.copy(), np.ones(view.rgb.shape[:2], dtype=bool)
+        rgb, mask = view.rgb.copy(), np.ones(view.rgb.shape[:2], bool)
         rgb[-8:], mask[-8:] = (255, 0, 255), False
         spoiled.append(replace(view, rgb=rgb, mask=mask))
     model = fit(spoiled, posed.start, replace(QUICK, steps=40)).graph()
