@@ -51,27 +51,20 @@ def test_cells_hold_their_pixels_in_rows_and_come_apart_again():
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("key", "value"),
     [
-        ({"refine.bias": None}, "missing: refine.bias"),
-        ({"more.weight": torch.zeros(2)}, "unexpected: more.weight"),
-        (
-            {"mix.weight": torch.zeros(8, 8, 1, 1)},
-            r"mix.weight is \[8, 8, 1, 1\] for \[8, 8, 3, 3\]",
-        ),
-        (
-            {"mix.bias": torch.full((8,), float("nan"))},
-            "mix.bias holds 8 values that are not finite",
-        ),
-        ({"stem.weight": None}, "no kernel stem.weight"),
+        ("refine.bias", None),
+        ("more.weight", torch.zeros(2)),
+        ("mix.weight", torch.zeros(8, 8, 1, 1)),
+        ("mix.bias", torch.full((8,), float("nan"))),
+        ("stem.weight", None),
     ],
 )
-def test_weights_that_do_not_fit_are_named(change, words):
-    tensors = {
-        key: value for key, value in (network().state_dict() | change).items() if value is not None
-    }
-    with pytest.raises(InputError):
-        PixelGenerator.from_state_dict(tensors)
+def test_weights_that_do_not_fit_are_named(key, value):
+    tensors = network().state_dict() | {key: value}
+    kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    with pytest.raises(InputError, match=key):
+        PixelGenerator.from_state_dict(kept)
 
 
 def test_the_state_is_all_that_goes_on():

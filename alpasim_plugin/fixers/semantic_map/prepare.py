@@ -126,7 +126,11 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
                 f"{name}: point {at} is {outline[at].tolist()}", "repair or drop this line"
             )
     for pose, box in lane_map.signs:
-        require_box("sign", pose, box)
+        require_rigid(pose, "sign")
+        if not np.isfinite(box.size_m).all() or min(box.size_m) < 0:
+            raise InputError(
+                f"sign: a box of {box.size_m} m", "give finite sizes, length, width and height"
+            )
     points = [outline for _, outline in outlines] + [
         pose[None, :3, 3] for pose, _ in lane_map.signs
     ]
@@ -151,15 +155,6 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     is_closed = np.zeros(len(triangles), bool)
     filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
     return PreparedMap(origin, _segments(pieces), filled)
-
-
-def require_box(name: str, pose: F64, box: Box) -> None:
-    """Raise `InputError` unless a box has a rigid pose and finite sizes that are not negative."""
-    require_rigid(pose, name)
-    if not np.isfinite(box.size_m).all() or min(box.size_m) < 0:
-        raise InputError(
-            f"{name}: a box of {box.size_m} m", "give finite sizes, length, width and height"
-        )
 
 
 def _pole(line: F64) -> F64:

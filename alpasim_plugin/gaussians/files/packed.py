@@ -247,7 +247,11 @@ def read_spz(path: Path | str) -> GaussianArrays:
     path = Path(path)
     data = read_bytes(path)
     if data[:2] == _GZIP:
-        data = _gunzip(path, data)
+        # The header first, so that the rest is bounded by what it announces.
+        stream = zlib.decompressobj(wbits=31)
+        head = stream.decompress(data, 16)
+        size = sum(_parse_header(path, head).stream_bytes) + MOST_EXTENDED
+        data = head + stream.decompress(stream.unconsumed_tail, size)
     header = _parse_header(path, data)
     if header.version == 4:
         table = struct.unpack_from("<I", data, 16)[0]
@@ -335,11 +339,12 @@ def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
     fixed = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     fixed = np.where(fixed & 0x800000, fixed - 0x1000000, fixed)
     means = fixed.astype(np.float64) / (1 << header.fractional_bits)
-    quats = (
-        unpack_smallest_three(rotations)
-        if header.version >= 3
-        else _unpack_xyz(rotations.reshape(n, 3))
-    )
+    if header.version >= 3:
+        quats = unpack_smallest_three(rotations)
+    else:  # w is what is left to length 1
+        xyz = rotations.reshape(n, 3) / 127.5 - 1.0
+        w = np.sqrt(np.maximum(1.0 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
+        quats = np.concatenate([w, xyz], axis=1)
     dc = (colours.reshape(n, 1, 3) / 255.0 - 0.5) / _COLOUR_SCALE
     rest = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
     sh = np.concatenate([dc, rest], axis=1).astype(np.float32)
@@ -350,25 +355,6 @@ def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
         opacities=alphas / 255.0,
         sh=sh,
     )
-
-
-def _unpack_xyz(packed: U8) -> F64:
-    """Return quaternions ``(N, 4)`` wxyz from the three bytes of version 2; w is what is left to
-    length 1.
-    """
-    xyz = packed / 127.5 - 1.0
-    w = np.sqrt(np.maximum(1.0 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
-    return np.concatenate([w, xyz], axis=1)
-
-
-def _gunzip(path: Path, data: bytes) -> bytes:
-    """Unpack versions 2 and 3: the header first, so that the rest is bounded by what it
-    announces.
-    """
-    stream = zlib.decompressobj(wbits=31)
-    head = stream.decompress(data, 16)
-    size = sum(_parse_header(path, head).stream_bytes) + MOST_EXTENDED
-    return head + stream.decompress(stream.unconsumed_tail, size)
 
 
 def _parse_header(path: Path, data: bytes) -> SpzHeader:

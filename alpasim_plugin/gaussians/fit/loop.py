@@ -41,7 +41,7 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
-from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
@@ -225,8 +225,11 @@ class SplatFit:
         loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
         if target.sky is not None:
             loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
-        if target.depth is not None:
-            loss = loss + recipe.depth_weight * _depth_error(out, *target.depth)
+        if target.depth is not None and len(target.depth[0]):
+            # Inverse depths differ by so much as a share of the true one, at most `DEPTH_CLIP`.
+            pixels, depth = target.depth
+            off = depth / out.depth.view(-1)[pixels].clamp(min=0.1) - 1
+            loss = loss + recipe.depth_weight * off.abs().clamp(max=DEPTH_CLIP).mean()
         seen, weight = true_rows(out.on_screen)
         shown = out.index[seen]
         if recipe.needle_weight > 0:
@@ -331,16 +334,6 @@ class SplatFit:
             f"view {target.name!r}, update {self.step}: {found}",
             "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update",
         )
-
-
-def _depth_error(out: GradientOutput, pixels: Tensor, depth: Tensor) -> Tensor:
-    """Return the mean difference of inverse depths as a share of the true one, over pixels ``(K,)``
-    of known depth ``(K,)``, at most `DEPTH_CLIP` each.
-    """
-    if not len(pixels):
-        return out.depth.new_zeros(())
-    off = depth / out.depth.view(-1)[pixels].clamp(min=0.1) - 1
-    return off.abs().clamp(max=DEPTH_CLIP).mean()
 
 
 def _digest(views: Sequence[PosedView], start: Start) -> str:

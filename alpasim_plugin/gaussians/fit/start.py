@@ -66,7 +66,6 @@ def start_from_depth(
     scene_id: str,
     seed: int,
     actor_points: int = 400,
-    size: float = 1.0,
 ) -> Start:
     """Sample ``count`` surface points from the views' depth, and more on actors.
 
@@ -76,7 +75,6 @@ def start_from_depth(
         count: Points of the background, shared evenly by the views.
         scene_id, seed: Key of the sample.
         actor_points: Most points of an actor.
-        size: See `cloud_from_points`.
 
     Raises:
         InputError: No view has depth.
@@ -110,8 +108,8 @@ def start_from_depth(
         rng = stream(scene_id, seed, f"fit.start.{name}")
         chosen = rng.permutation(len(points))[:actor_points]
         if len(chosen) >= FEWEST_POINTS:
-            actors[name] = cloud_from_points(points[chosen], rgb[chosen], size)
-    return Start(cloud_from_points(*_joined(rest), size), actors)
+            actors[name] = cloud_from_points(points[chosen], rgb[chosen])
+    return Start(cloud_from_points(*_joined(rest)), actors)
 
 
 def start_from_maps(
