@@ -166,14 +166,14 @@ class OneFixer(Fixer):
                 self._fix(view, history) for view, history in zip(views, self._history, strict=True)
             )
         out = list(block)
-        for pending in self._pending:
-            for b, mine in enumerate(pending.views.index):
+        for fixed in self._pending:
+            for b, mine in enumerate(fixed.views.index):
                 for t, i in enumerate(mine):
-                    event = pending.events[b][t]
+                    event = fixed.events[b][t]
                     out[i] = (
                         replace(block[i], events=(*block[i].events, event))
                         if event
-                        else replace(block[i], rgb=pending.images[b, t])
+                        else replace(block[i], rgb=fixed.images[b, t])
                     )
         return tuple(out)
 
