@@ -13,6 +13,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
+import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -289,6 +290,7 @@ def pretended_device(patch, computes=True):
         patch: pytest's ``monkeypatch``.
         computes: Whether Triton kernels do; interpreted, they take seconds a frame.
     """
+    pytest.importorskip("triton", reason="Triton is not installed")
     from alpasim_plugin.fixers import pixel_fixer
     from alpasim_plugin.fixers.semantic_map import tile_kernel
     from alpasim_plugin.gaussians.raster import rasterize_triton, triton_kernels

@@ -189,13 +189,12 @@ MAKES = ("torch.tensor", "torch.as_tensor", "torch.from_numpy")
 
 def makes_the_host_wait(call):
     """Return whether a call sends a tensor of the host to a device, and waits for it."""
-    arguments = {keyword.arg: keyword.value for keyword in call.keywords}
-    if "device" in arguments and dotted(call.func) in MAKES:
-        return not isinstance(arguments["device"], ast.Constant)
-    sends = isinstance(call.func, ast.Attribute) and call.func.attr in ("to", "cuda")
-    inner = (dotted(node.func) for node in ast.walk(call.func) if isinstance(node, ast.Call))
-    of_type = call.args and dotted(call.args[0]).startswith("torch.")
-    return sends and any(name in MAKES for name in inner) and not of_type
+    if dotted(call.func) in MAKES:
+        found = [ast.unparse(word.value) for word in call.keywords if word.arg == "device"]
+        return found not in ([], ["'cpu'"])
+    sends = isinstance(call.func, ast.Attribute) and call.func.attr == "to"
+    inner = {dotted(node.func) for node in ast.walk(call.func) if isinstance(node, ast.Call)}
+    return sends and inner & set(MAKES) and not dotted(call.args[0]).startswith("torch.")
 
 
 def test_tensors_of_the_host_are_sent_in_one_place_which_does_not_wait():

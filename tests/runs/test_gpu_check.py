@@ -1,15 +1,12 @@
 """The check of a card, tried on the CPU: its sections, and how it reports those that fail."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.runs import gpu_check
-from tests.fixers.views import EMPTY
+from tests.pretended_device import pretended_device
 
 
 def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch):
@@ -39,12 +36,7 @@ def test_images_that_differ_fail_the_section(levels, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("section", ["semantic_map", "gradient"])
 def test_a_section_compares_a_card_with_the_processor(section, monkeypatch):
-    pytest.importorskip("triton", reason="Triton is not installed")
-    from tests.pretended_device import pretended_device
-
-    part = {"prepare_map": lambda full: prepare_map(replace(EMPTY, road_edges=full.road_edges[:1]))}
-    small = {"SIZES": [(16, 9)], "SPLATS": 40, "REPEATS": 1, **part}
-    for name, value in small.items():
+    for name, value in {"SIZES": [(16, 9)], "SPLATS": 40, "REPEATS": 1}.items():
         monkeypatch.setattr(gpu_check, name, value)
     with pretended_device(monkeypatch) as traffic:
         facts = gpu_check.SECTIONS[section]("cuda:0")

@@ -18,9 +18,6 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.log.video import VideoWriter
 from tests.alpasim.test_sensorsim_local import SCENE, ask
 from tests.drives.street import write_transforms
-
-pytest.importorskip("triton", reason="Triton is not installed")
-
 from tests.pretended_device import pretended_device, traffic
 
 FRAMES = 6

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.loop import SplatFit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points
-from alpasim_plugin.gaussians.fit.views import PosedView, halved
-from tests.gaussians.gaussian_scenes import camera
+from alpasim_plugin.gaussians.fit.start import Start
+from alpasim_plugin.gaussians.fit.views import halved
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
@@ -74,15 +72,3 @@ def test_an_update_waits_once_and_goes_on_on_the_cpu(case, tmp_path, monkeypatch
     assert all(torch.equal(p, wanted[name]) for name, p in host.model.params.items())
     assert len(background) + len(actors["car"]) == len(host.model) > 30
     assert host.update()["loss"] < 1
-
-
-def test_a_drive_is_fitted_where_it_was_asked_for(monkeypatch):
-    views = [PosedView(camera(32, 16, 20.0), np.full((16, 32, 3), 90, np.uint8))]
-    points = cloud_from_points(np.array([[0.0, 0, 4], [0.5, 0, 5]]), np.full((2, 3), 0.5))
-    recipe = replace(RECIPE, steps=1)
-    wanted = fit_drive(views, points, recipe=recipe).model.background
-    with pretended_device(monkeypatch) as traffic:
-        found = fit_drive(views, points, recipe=recipe, device="cuda").model.background
-        assert traffic.launches
-    for name in ("means", "scales", "opacities", "sh"):
-        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-4)

@@ -29,6 +29,7 @@ from policies.learned import WEIGHTS
 from policies.learned_input import COMMANDS
 from policies.learned_net import LearnedNet, load_net
 from scenarios.load import load_scenario
+from tests.pretended_device import pretended_device, traffic
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
 QUICK = DemonstrationRecipe(drives=1, drive_s=1.6, headings=3)
@@ -143,9 +144,6 @@ def test_sigma_sends_no_gradient_into_the_plan(root):
 
 
 def test_an_update_on_a_device_waits_once(root, tmp_path, monkeypatch):
-    pytest.importorskip("triton", reason="Triton is not installed")
-    from tests.pretended_device import pretended_device, traffic
-
     def update(device):
         net = LearnedNet(0).to(device)
         task = PolicyTask(net, read_demonstrations(root, "train"), PolicyRecipe(batch=4))

@@ -3,27 +3,17 @@
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.lab.training import vae
 from alpasim_plugin.lab.training.clips import CropSize
-from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.fixer_run import train_fixer
-from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
-from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe
 from alpasim_plugin.lab.training.trainer import Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
-from tests.gaussians.scene_maps import straight, with_camera
 from tests.lab.training.test_generator import brightness, data, run_of  # noqa: F401 - data is a fixture
-from tests.renderers.recorded_drive import recorded_drive
-
-pytest.importorskip("triton", reason="Triton is not installed")
-
 from tests.pretended_device import pretended_device, traffic
 
 
@@ -66,34 +56,3 @@ def test_a_recipe_on_a_device_equals_the_processors(recipe, data, tmp_path, monk
     wanted = load_weights(trained(recipe, data, tmp_path / "host", "cpu", monkeypatch))
     for name, due in wanted.items():
         torch.testing.assert_close(found[name], due, rtol=0, atol=1e-3)
-
-
-def pairs(folder, device):
-    """Make a sequence of a street."""
-    scenario = with_camera(straight(), 64, 36)
-    log = scenario.ego_log
-    log = replace(log, t_us=log.t_us[:4], xyz=log.xyz[:4], quat=log.quat[:4])
-    scenario = replace(scenario, ego_log=log, end_us=400_000)
-    recipe = PairRecipe(source="clean")
-    assert make_sequence(
-        scenario, folder / "s", recipe, 0, split="val", family="street", device=device
-    )
-
-
-def photographs(folder, device):
-    """Make the pairs of a recorded street."""
-    drive = recorded_drive(folder)
-    xyz = np.random.default_rng(0).uniform((2, -5, 0), (40, 5, 0.1), (400, 3))
-    write_points(folder / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
-    recipe = PhotographRecipe(width=64, every=3, steps=2, split="train")
-    assert len(list(make_drive_pairs(drive, "street", folder / "pairs", recipe, device))) == 3
-
-
-# Five frames of two renderers; three fits of two updates, their models, and the frames held out.
-@pytest.mark.slow
-@pytest.mark.parametrize(("make", "waits"), [(pairs, 10), (photographs, 54)])
-def test_pairs_are_made_on_a_device(make, waits, tmp_path, monkeypatch):
-    with pretended_device(monkeypatch, computes=False):
-        make(tmp_path, "cuda")
-    assert traffic.launches
-    assert sum(traffic.waits.values()) == waits

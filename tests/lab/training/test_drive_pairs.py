@@ -11,15 +11,30 @@ from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe
 from alpasim_plugin.lab.training.reference_store import open_references
+from tests.pretended_device import pretended_device
 from tests.renderers.recorded_drive import recorded_drive
 
+RECIPE = PhotographRecipe(width=64, every=3, steps=2, split="train")
 
-def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_path):
-    drive = recorded_drive(tmp_path)
+
+@pytest.fixture
+def drive(tmp_path):
+    """Give a recorded drive along a road of points."""
     xyz = np.random.default_rng(0).uniform((2, -5, 0), (40, 5, 0.1), (400, 3))
     write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
-    recipe = PhotographRecipe(width=64, every=3, steps=2, split="train")
-    made = list(make_drive_pairs(drive, "street", tmp_path / "pairs", recipe))
+    return recorded_drive(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_device_that_fits_is_waited_for_once_an_update_and_a_frame(drive, tmp_path, monkeypatch):
+    with pretended_device(monkeypatch, computes=False) as traffic:
+        made = list(make_drive_pairs(drive, "street", tmp_path / "pairs", RECIPE, "cuda"))
+    # Three fits of two updates and their models' parameters; the frames held out of each.
+    assert sum(traffic.waits.values()) == 18 * len(made)
+
+
+def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(drive, tmp_path):
+    made = list(make_drive_pairs(drive, "street", tmp_path / "pairs", RECIPE))
     assert [one.folder.name for one in made] == [
         "street_front_0",
         "street_front_1",
@@ -38,7 +53,7 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
         shown += sorted(held)
     assert sorted(shown) == sorted(taken)
     assert not any(
-        one.made for one in make_drive_pairs(drive, "street", tmp_path / "pairs", recipe)
+        one.made for one in make_drive_pairs(drive, "street", tmp_path / "pairs", RECIPE)
     )
 
 

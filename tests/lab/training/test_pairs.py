@@ -14,6 +14,7 @@ from alpasim_plugin.lab.training.pairs import PairRecipe, lateral_offsets, make_
 from alpasim_plugin.lab.training.reference_store import open_references
 from alpasim_plugin.renderers.gaussian import clear_cache
 from tests.gaussians.scene_maps import parked, straight, with_camera
+from tests.pretended_device import pretended_device
 
 EMPTY = Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0)
 
@@ -79,6 +80,14 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
         assert held.mean() > 0.5
         error = np.abs(image[..., :3].astype(float) - sequence.clip.rgb_gt[i]).mean(axis=-1)
         assert np.median(error[held]) < 3  # the same surfaces, seen from beside
+
+
+@pytest.mark.slow
+def test_a_device_that_draws_a_sequence_is_waited_for_once_a_frame(street, tmp_path, monkeypatch):
+    with pretended_device(monkeypatch, computes=False) as traffic:
+        options = {"split": "val", "family": "street", "device": "cuda"}
+        assert make_sequence(street, tmp_path / "s", PairRecipe("clean"), 0, **options)
+    assert sum(traffic.waits.values()) == 10  # five frames of two renderers
 
 
 def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_refused(

@@ -240,7 +240,6 @@ def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_wh
 
 
 def test_a_run_on_a_device_equals_the_processors_and_goes_on_there(tmp_path, monkeypatch):
-    pytest.importorskip("triton", reason="Triton is not installed")
     wanted = load_weights(train_per_frame(run_of(), tmp_path / "host", None))
     waits = []
     with pretended_device(monkeypatch) as traffic:
