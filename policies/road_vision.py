@@ -168,9 +168,13 @@ class RidgeFilter:
     """
 
     def __init__(self, grid: GroundGrid) -> None:
-        sizes = np.column_stack(_windows(grid)).astype(
-            np.intp
-        )  # (R, 3) cells: half the stroke, start and length of a flank
+        # Per row and in cells: half the stroke, the start of the flanks, and their length.
+        half_m = np.maximum(PAINT_WIDTH_M / 2, 0.5 * grid.pixel_m)
+        gap_m = half_m + np.maximum(0.15, grid.pixel_m)
+        flank_m = np.maximum(0.3, grid.pixel_m)
+        sizes = np.column_stack(
+            (np.rint(half_m / CELL_M), np.rint(gap_m / CELL_M), np.rint(flank_m / CELL_M))
+        ).astype(np.intp)  # (R, 3) cells: half the stroke, start and length of a flank
         starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
         # Rows of equal windows are neighbours, and a few runs of them make the grid.
         self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
@@ -307,11 +311,3 @@ def _cells_around(
         mask[rows[wide[rows]], columns[wide[rows]]] = 1
         mask = cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
     return mask > 0
-
-
-def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:
-    """Return, per row and in cells: half the stroke, the start of the flanks, and their length."""
-    half = np.maximum(PAINT_WIDTH_M / 2, 0.5 * grid.pixel_m)
-    gap = half + np.maximum(0.15, grid.pixel_m)
-    flank = np.maximum(0.3, grid.pixel_m)
-    return np.rint(half / CELL_M), np.rint(gap / CELL_M), np.rint(flank / CELL_M)

@@ -37,7 +37,6 @@ from alpasim_plugin.core.types import (
     LaneMap,
     LaneMarkType,
     LensModel,
-    Trajectory,
     Vehicle,
 )
 from alpasim_plugin.world.ground import from_points
@@ -259,7 +258,12 @@ def read_argoverse(path: str | Path) -> RecordedLog:
     map_path = files.only(folder / "map", ("log_map_archive_*.json",), "the vector map")
     poses = read_ego_poses(files, pose_path)
     origin = np.round(poses.xyz[0])  # whole metres: the subtraction loses nothing
-    ego_log, dropped = _rig_log(files, pose_path, poses, origin)
+    t_us = poses.t_ns // 1000
+    keep = np.concatenate([[True], np.diff(t_us) > 0])
+    up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
+    xyz = near(pose_path, poses.xyz - origin - WHEEL_RADIUS_M * up)
+    ego_log = checked_trajectory(pose_path, t_us[keep], xyz[keep], poses.quat[keep], least=2)
+    dropped = int((~keep).sum())
     lane_map, notes = read_map(files, map_path, origin)
     ground = read_ground(files, folder / "map", lane_map, ego_log.xyz, origin)
     actors: tuple[Actor, ...] = ()
@@ -306,21 +310,6 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     xyz, quat = _columns(table, POSE[4:]), _columns(table, POSE[:4])
     checked = checked_trajectory(path, t_ns, xyz, quat, least=2)
     return EgoPoses(checked.t_us, checked.xyz, checked.quat)
-
-
-def _rig_log(
-    files: SourceFiles, path: Path, poses: EgoPoses, origin: F64
-) -> tuple[Trajectory, int]:
-    """Return the rig's trajectory (ground under the rear axle, local, microseconds) and how many
-    poses fell on a taken microsecond.
-    """
-    t_us = poses.t_ns // 1000
-    keep = np.concatenate([[True], np.diff(t_us) > 0])
-    up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
-    xyz = near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
-    return checked_trajectory(path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int(
-        (~keep).sum()
-    )
 
 
 def read_actors(

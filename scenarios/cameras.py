@@ -131,7 +131,23 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
                 "correct the path; it is relative to the scenario file",
             )
         with drawn.at("cameras", "from"):
-            cameras = _from_file(path)
+            if os.path.isdir(path):
+                from scenarios.argoverse import read_calibration
+
+                cameras = read_calibration(path)
+            elif path.suffix == ".usdz":
+                from scenarios.ftheta import rig_cameras
+
+                cameras = rig_cameras(path)
+            elif path.suffix == ".json":
+                from scenarios.transforms import read_transforms
+
+                cameras = read_transforms(path)
+            else:
+                raise InputError(
+                    f"{path}: no calibration that is known here",
+                    "give an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json",
+                )
         if given.names:
             known = {camera.name: camera for camera in cameras}
             for i, name in enumerate(given.names):
@@ -146,23 +162,3 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
         width = given.width
         cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)
     return tuple(replace(camera, shutter_us=given.shutter_us) for camera in cameras)
-
-
-def _from_file(path: Path) -> tuple[CameraSpec, ...]:
-    """Read the cameras of an Argoverse 2 log, an AlpaSim scene or a ``transforms.json``."""
-    if os.path.isdir(path):
-        from scenarios.argoverse import read_calibration
-
-        return read_calibration(path)
-    if path.suffix == ".usdz":
-        from scenarios.ftheta import rig_cameras
-
-        return rig_cameras(path)
-    if path.suffix == ".json":
-        from scenarios.transforms import read_transforms
-
-        return read_transforms(path)
-    raise InputError(
-        f"{path}: no calibration that is known here",
-        "give an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json",
-    )

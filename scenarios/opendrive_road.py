@@ -66,7 +66,14 @@ class Geometry:
         start.
         """
         if self.kind in ("line", "arc", "spiral"):
-            return self._clothoid(s_m)
+            # The heading is quadratic in s: 32 points are exact to rounding for any road's turn.
+            start = self.numbers[0] if self.numbers else 0.0
+            rate = (self.numbers[1] - start) / self.length_m if self.kind == "spiral" else 0.0
+            at = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
+            heading = self.heading_rad + at * (start + 0.5 * rate * at)
+            x = self.x_m + 0.5 * s_m * (np.cos(heading) @ _WEIGHTS)
+            y = self.y_m + 0.5 * s_m * (np.sin(heading) @ _WEIGHTS)
+            return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
         if self.kind == "poly3":
             p, along, across = self._along_poly3(s_m), Polynomial([0.0, 1.0]), self.numbers
         else:
@@ -77,18 +84,6 @@ class Geometry:
         heading = self.heading_rad + np.arctan2(left.deriv()(p), along.deriv()(p))
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
         return np.column_stack([self.x_m + u * c - v * s, self.y_m + u * s + v * c, heading])
-
-    def _clothoid(self, s_m: F64) -> F64:
-        """Integrate the heading, which is quadratic in s; 32-point Gauss-Legendre is exact to
-        rounding for any road's turn.
-        """
-        start = self.numbers[0] if self.numbers else 0.0
-        rate = (self.numbers[1] - start) / self.length_m if self.kind == "spiral" else 0.0
-        at = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
-        heading = self.heading_rad + at * (start + 0.5 * rate * at)
-        x = self.x_m + 0.5 * s_m * (np.cos(heading) @ _WEIGHTS)
-        y = self.y_m + 0.5 * s_m * (np.sin(heading) @ _WEIGHTS)
-        return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
 
     def _along_poly3(self, s_m: F64) -> F64:
         """Return u at arc lengths of ``v = a + b u + c u^2 + d u^3``."""

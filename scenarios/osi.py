@@ -215,7 +215,12 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
     for ids in (facts.left_lane_boundary_id, facts.right_lane_boundary_id):
         found = [borders[ref.value] for ref in ids if ref.value in borders]
         points = [_points(p.position for p in border.boundary_line) for border in found]
-        edge = _along(centre, np.concatenate([np.zeros((0, 3)), *points]) - origin)
+        border_points = np.concatenate([np.zeros((0, 3)), *points]) - origin
+        s_m = np.array([project(centre, point)[0] for point in border_points])
+        order = np.argsort(s_m, kind="stable")
+        line = border_points[order]
+        steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+        edge = line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
         if len(edge) < 2:
             return None
         sides.append((near(where, edge), _mark_type(found[0])))
@@ -249,15 +254,6 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
 
 def _points(vectors: Any) -> F64:
     return np.array([(one.x, one.y, one.z) for one in vectors], dtype=np.float64).reshape(-1, 3)
-
-
-def _along(centre: F64, points: F64) -> F64:
-    """Return the points of a border ``(N, 3)`` in the order of a centre line, each place once."""
-    s_m = np.array([project(centre, point)[0] for point in points])
-    order = np.argsort(s_m, kind="stable")
-    line = points[order]
-    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
-    return line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
 
 
 def _mark_type(border: Any) -> LaneMarkType:

@@ -293,7 +293,16 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
 
 
 def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[str, F64]) -> None:
-    line = _stations(road)
+    rows, passed_m = [], 0.0
+    for record in road.records:
+        if record.kind not in ("line", "arc"):
+            continue
+        s = np.linspace(
+            0.0, record.length_m, max(2, math.ceil(record.length_m / STEP_M)), dtype=np.float64
+        )
+        rows.append(np.column_stack([record.at(s), cubics_at(road.elevation, passed_m + s)]))
+        passed_m += record.length_m
+    line = np.concatenate(rows) if rows else np.zeros((0, 4))
     if not len(line) or not road.sections:
         return
     s = np.asarray(STEP_M * np.arange(len(line)), dtype=np.float64)
@@ -327,22 +336,6 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
                 [beside(line[:, :3], np.full(len(line), sign * LONE_EDGE_M)), np.zeros(len(line))]
             )
             edges.setdefault(f"{road.road_id}_{name}", lone)
-
-
-def _stations(road: Road) -> F64:
-    """Return ``(N, 4)`` x, y, heading, z at the loader's stations; where records meet, the point
-    stands twice.
-    """
-    rows, passed_m = [], 0.0
-    for record in road.records:
-        if record.kind not in ("line", "arc"):
-            continue
-        s = np.linspace(
-            0.0, record.length_m, max(2, math.ceil(record.length_m / STEP_M)), dtype=np.float64
-        )
-        rows.append(np.column_stack([record.at(s), cubics_at(road.elevation, passed_m + s)]))
-        passed_m += record.length_m
-    return np.concatenate(rows) if rows else np.zeros((0, 4))
 
 
 def _without_crossing(

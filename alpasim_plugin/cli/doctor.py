@@ -32,7 +32,18 @@ def doctor(
 ) -> None:
     """Test each part on a small case and report what fails."""
     if gpu:
-        _check_gpu(budget_s, as_json)
+        # One line a section as it ends; 0 if the card agrees with the CPU.
+        from alpasim_plugin.runs.gpu_check import check_gpu
+
+        device = require_device("cuda")
+        sections = {}
+        for section, found in check_gpu(device, budget_s):
+            sections[section] = found
+            if not as_json:
+                show(False, found, f"{section:>12}  {json.dumps(found)}")
+        if as_json:
+            show(True, {"device": device, "sections": sections})
+        raise typer.Exit(0 if all(found["ok"] for found in sections.values()) else 4)
     rows = []
     for name, check in CHECKS.items():
         row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}
@@ -50,21 +61,6 @@ def doctor(
     facts = {"hardware": hardware(), "versions": versions(), "checks": rows}
     show(as_json, facts, *lines)
     raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
-
-
-def _check_gpu(budget_s: float, as_json: bool) -> None:
-    """Print one line a section as it ends, then exit: 0 if the card agrees with the CPU."""
-    from alpasim_plugin.runs.gpu_check import check_gpu
-
-    device = require_device("cuda")
-    sections = {}
-    for name, facts in check_gpu(device, budget_s):
-        sections[name] = facts
-        if not as_json:
-            show(False, facts, f"{name:>12}  {json.dumps(facts)}")
-    if as_json:
-        show(True, {"device": device, "sections": sections})
-    raise typer.Exit(0 if all(facts["ok"] for facts in sections.values()) else 4)
 
 
 def _raster(backend: Literal["cpu", "triton"]) -> str:

@@ -298,7 +298,14 @@ def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:
     for n, key in enumerate(keys, 1):
         step: Any = key
         if isinstance(node, list):
-            step = _item(node, key, where)
+            ids = [item.get("id") if isinstance(item, dict) else None for item in node]
+            if key in ids:
+                step = ids.index(key)
+            elif key.isdecimal() and int(key) < len(node):
+                step = int(key)
+            else:
+                known = ", ".join(str(name) for name in ids if name) or f"0..{len(node) - 1}"
+                raise InputError(f"{where}: no list item {key!r}", f"use one of: {known}")
         elif not isinstance(node, dict):
             raise InputError(f"{where}: {dotted(loc)} holds a value, not keys", "shorten the path")
         elif n < len(keys):
@@ -308,17 +315,6 @@ def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:
             node = node[step]
     node[step] = value
     return loc
-
-
-def _item(items: list[Any], key: str, where: str) -> int:
-    """Return the index of the list item that a key names by its ``id`` or its index."""
-    ids = [item.get("id") if isinstance(item, dict) else None for item in items]
-    if key in ids:
-        return ids.index(key)
-    if key.isdecimal() and int(key) < len(items):
-        return int(key)
-    known = ", ".join(str(name) for name in ids if name) or f"0..{len(items) - 1}"
-    raise InputError(f"{where}: no list item {key!r}", f"use one of: {known}")
 
 
 def dotted(loc: Sequence[str | int]) -> str:
@@ -345,7 +341,14 @@ def validate(model: type[M], document: Document) -> M:
     for problem in problems[:MOST_PROBLEMS]:
         # The tag of a union of forms is in brackets and leads to no model.
         problem["loc"] = tuple(part for part in problem["loc"] if not str(part).startswith("("))
-        loc = _in_document(document.data, problem["loc"])
+        # Without the parts of pydantic's location that are union tags or missing keys.
+        data = document.data
+        loc: Key = ()
+        for part in problem["loc"]:
+            is_key = isinstance(data, dict) and part in data
+            if is_key or (isinstance(data, list) and isinstance(part, int) and part < len(data)):
+                data = data[part]
+                loc = (*loc, part)
         is_missing = problem["type"] == "missing"
         placed.append((is_missing, document.mark(loc), len(placed), loc, problem))
     placed.sort(key=lambda place: place[:3])
@@ -358,17 +361,6 @@ def validate(model: type[M], document: Document) -> M:
         rest = "; ".join(f"{mark}: {message}" for mark, message, _ in shown[1:])
         message = f"{shorten(message, 180)} (and {len(problems) - 1} more: {rest})"
     raise InputError(f"{mark}: {message}", hint)
-
-
-def _in_document(data: Any, loc: Key) -> Key:
-    """Drop the parts of a pydantic location that are union tags or missing keys."""
-    present: Key = ()
-    for part in loc:
-        is_key = isinstance(data, dict) and part in data
-        if is_key or (isinstance(data, list) and isinstance(part, int) and part < len(data)):
-            data = data[part]
-            present = (*present, part)
-    return present
 
 
 def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:

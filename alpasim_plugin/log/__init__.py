@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from alpasim_plugin.log.images import encode_image as encode_image
     from alpasim_plugin.log.reader import read_asl as read_asl
     from alpasim_plugin.log.schema import RolloutHeader as RolloutHeader
-    from alpasim_plugin.log.schema import header_from_scenario as header_from_scenario
     from alpasim_plugin.log.trace import read_facts as read_facts
     from alpasim_plugin.log.trace import write_facts as write_facts
     from alpasim_plugin.log.video import read_mp4 as read_mp4
@@ -23,7 +22,6 @@ __all__ = [
     "RolloutHeader",
     "decode_image",
     "encode_image",
-    "header_from_scenario",
     "read_asl",
     "read_facts",
     "read_mp4",
@@ -38,7 +36,6 @@ __getattr__ = lazy_names(
         "RolloutHeader": ".schema",
         "decode_image": ".images",
         "encode_image": ".images",
-        "header_from_scenario": ".schema",
         "read_asl": ".reader",
         "read_facts": ".trace",
         "read_mp4": ".video",

@@ -11,7 +11,6 @@ import os
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 from google.protobuf.message import DecodeError
@@ -159,13 +158,8 @@ class AslFile:
     def __enter__(self) -> AslFile:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if kind is None:
+    def __exit__(self, *failure: object) -> None:
+        if failure[0] is None:
             self.finish()
         else:
             self.abandon()

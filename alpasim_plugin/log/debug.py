@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.log.images import encode_image, smaller
 
@@ -43,7 +42,17 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
             shown = [base64.b64encode(encode_image(smaller(array, WIDTH_PX), "jpeg", 76)).decode()]
         elif kind == "heat":
             ends = [f"{value:.3g}" for value in (np.nanmin(array), np.nanmax(array))]
-            shown = [heat_png(array), *ends]
+            # Yellow where values are high, clear where they are low or missing.
+            finite = np.where(np.isfinite(array), array, np.nan).astype(np.float64)
+            low, high = np.nanmin(finite), np.nanmax(finite)
+            share = np.nan_to_num((finite - low) / ((high - low) or 1.0))
+            bgra = np.stack(
+                [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2
+            )
+            shown = [
+                base64.b64encode(cv2.imencode(".png", bgra.astype(np.uint8))[1].tobytes()).decode(),
+                *ends,
+            ]
         else:
             known = array[np.isfinite(array).all(axis=1)]
             shown = [known[:, : 4 if kind == "boxes" else 2].astype(np.float64).round(3).tolist()]
@@ -65,19 +74,6 @@ def kind_of(name: str, value: Any) -> str:
             ):
                 return kind
     return "text"
-
-
-def heat_png(values: npt.NDArray[Any]) -> str:
-    """Return a heat map as PNG in base64: yellow where values are high, clear where they are low or
-    missing.
-    """
-    known = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
-    low, high = np.nanmin(known), np.nanmax(known)
-    share = np.nan_to_num((known - low) / ((high - low) or 1.0))
-    bgra = np.stack(
-        [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2
-    )
-    return base64.b64encode(cv2.imencode(".png", bgra.astype(np.uint8))[1].tobytes()).decode()
 
 
 def _words(value: Any) -> str:

@@ -23,7 +23,6 @@ from alpasim_plugin.core.types import (
     EgoState,
     LensModel,
     RenderRequest,
-    Scenario,
     Trajectory,
     Vehicle,
 )
@@ -105,29 +104,6 @@ class RolloutHeader:
     def T_rig_box(self) -> F64:
         """Return the ``(4, 4)`` pose of the ego's box centre in the rig."""
         return T_rig_box(self.vehicle)
-
-
-def header_from_scenario(
-    scenario: Scenario,
-    session_uuid: str,
-    seed: int,
-    n_steps: int,
-    versions: Mapping[str, str] | None = None,
-) -> RolloutHeader:
-    """Return the header of a rollout of `scenario`."""
-    return RolloutHeader(
-        scene_id=scenario.scene_id,
-        session_uuid=session_uuid,
-        vehicle=scenario.vehicle,
-        actors=scenario.actors,
-        ego_log=scenario.ego_log,
-        render_start_us=scenario.start_us,
-        force_gt_us=scenario.warmup_us,
-        control_us=scenario.rates.control_us,
-        n_steps=n_steps,
-        seed=seed,
-        versions=dict(versions or {}),
-    )
 
 
 def T_rig_box(vehicle: Vehicle) -> F64:
@@ -310,7 +286,8 @@ def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionReq
     """Return the message that opens a session of road users: the ego first, then every track, and
     when the service takes over.
     """
-    xyz, quat = rigid_product(header.ego_log.xyz, header.ego_log.quat, header.T_rig_box)
+    quat = header.ego_log.quat
+    xyz = header.ego_log.xyz + matrix_from_quat(quat) @ header.T_rig_box[:3, 3]
     ego = wire_trajectory(Trajectory(header.ego_log.t_us, xyz, quat), "the recorded ego")
     objects = [
         traffic_pb2.ObjectTrajectory(
@@ -412,10 +389,3 @@ def read_camera(camera: sensorsim_pb2.AvailableCamerasReturn.AvailableCamera) ->
     )
     mounting = read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
     return CameraSpec(camera.logical_id, spec.resolution_w, spec.resolution_h, matrix, mounting)
-
-
-def rigid_product(xyz: F64, quat: F64, T_body_other: F64) -> tuple[F64, F64]:
-    """Return poses ``(N, 3)``, ``(N, 4)`` of a frame that is shifted, not turned, in the body:
-    exact in rotation.
-    """
-    return xyz + matrix_from_quat(quat) @ T_body_other[:3, 3], quat

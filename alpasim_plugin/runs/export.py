@@ -236,36 +236,26 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
             if manifest["status"] != "ok":
                 run.failed += 1
                 continue
-            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1])
+            source = root / manifest["path"] / LOG_NAME
+            check_vouched(source)
+            rollout = read_asl(source)
+            cameras = alpasim_cameras(loaded[manifest["scene"]][1].cameras)
+            names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
+            if not rollout.images:
+                raise InputError(
+                    f"{manifest['path']}: the log holds no camera image, and AlpaSim's evaluation needs them",
+                    f"run again without {manifest['policy']}: it uses no camera",
+                )
+            target = partial / run.folder / "rollouts" / manifest["scene"] / rollout.session_uuid
+            target.mkdir(parents=True)
+            copy_log(source, target / LOG_NAME, cameras=names)
+            (target / COMPLETE).touch()
             run.rollouts += 1
             say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
         for run in runs.values():
             _finish(partial / run.folder, out, run, info, manifests)
         scenes = _write_scenes(partial, loaded)
     return Export(out, tuple(runs.values()), scenes)
-
-
-def _export_rollout(
-    root: Path,
-    folder: Path,
-    manifest: JsonView,
-    scenario: Scenario,
-) -> None:
-    """Copy one log with AlpaSim's names, and mark it complete."""
-    source = root / manifest["path"] / LOG_NAME
-    check_vouched(source)
-    rollout = read_asl(source)
-    cameras = alpasim_cameras(scenario.cameras)
-    names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
-    if not rollout.images:
-        raise InputError(
-            f"{manifest['path']}: the log holds no camera image, and AlpaSim's evaluation needs them",
-            f"run again without {manifest['policy']}: it uses no camera",
-        )
-    target = folder / "rollouts" / manifest["scene"] / rollout.session_uuid
-    target.mkdir(parents=True)
-    copy_log(source, target / LOG_NAME, cameras=names)
-    (target / COMPLETE).touch()
 
 
 def _finish(

@@ -10,7 +10,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -37,7 +36,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import (
     AslWriter,
-    header_from_scenario,
+    RolloutHeader,
     read_asl,
     write_facts,
     write_mp4,
@@ -139,13 +138,8 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if error is not None and self._writer is not None:
+    def __exit__(self, *failure: object) -> None:
+        if failure[0] is not None and self._writer is not None:
             self._writer.abandon()
             with suppress(SimrunError):  # the failure of the rollout says more
                 self._write_rows()
@@ -170,8 +164,19 @@ class Recorder:
             self._film_camera = first if self._keep_frames else ""
             self._film_period_us = self._scenario.period_us(SensorSpec(first))
         self._n_steps = clock.n_steps
-        header = header_from_scenario(
-            self._scenario, self._session, self._seed, clock.n_steps, self._versions
+        scenario = self._scenario
+        header = RolloutHeader(
+            scene_id=scenario.scene_id,
+            session_uuid=self._session,
+            vehicle=scenario.vehicle,
+            actors=scenario.actors,
+            ego_log=scenario.ego_log,
+            render_start_us=scenario.start_us,
+            force_gt_us=scenario.warmup_us,
+            control_us=scenario.rates.control_us,
+            n_steps=clock.n_steps,
+            seed=self._seed,
+            versions=self._versions,
         )
         self._writer = AslWriter(self.folder / LOG_NAME, header)
         self._writer.begin(list(cameras.values()))

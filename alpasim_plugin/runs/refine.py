@@ -392,13 +392,16 @@ def _joined(
             for timed, reader in zip(row, readers.values(), strict=True)
         ]
         starts = starts or times
-        _check_times(
-            index,
-            dict(
-                zip(roles, [t - start for t, start in zip(times, starts, strict=True)], strict=True)
-            ),
-            readers,
+        times_s = dict(
+            zip(roles, [t - start for t, start in zip(times, starts, strict=True)], strict=True)
         )
+        rate = readers["input"].format.rate
+        for role, time_s in times_s.items():
+            if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):
+                raise InputError(
+                    f"{readers[role].path}: frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s",
+                    "give videos of the same frames at the same times",
+                )
         given = dict(zip(roles, row, strict=True))
         timed = given["input"]
         timing.append(timed)
@@ -409,18 +412,6 @@ def _joined(
         )
         sdmap = given["sdmap"].image if "sdmap" in given else None
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
-
-
-def _check_times(
-    index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, Reader]
-) -> None:
-    rate = readers["input"].format.rate
-    for role, time_s in times_s.items():
-        if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):
-            raise InputError(
-                f"{readers[role].path}: frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s",
-                "give videos of the same frames at the same times",
-            )
 
 
 def _alpha(image: U8, index: int, path: Path) -> F32:

@@ -128,7 +128,19 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
     Raises:
         InputError: Two rollouts of a scene have the same name.
     """
-    ranks = _ranks(rollouts)
+    # Each rollout's rank among the names of its scene, dropped ones included.
+    names: dict[str, list[str]] = {}
+    for rollout in rollouts:
+        names.setdefault(rollout.of.scene, []).append(rollout.of.rollout)
+    for scene, own in names.items():
+        twice = next((name for name in own if own.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"scene {scene!r}: two rollouts named {twice!r}",
+                "score the runs apart, or rename the folder of one log",
+            )
+        own.sort()
+    ranks = [names[rollout.of.scene].index(rollout.of.rollout) for rollout in rollouts]
     kept = [
         (rank, rollout.values)
         for rank, rollout in zip(ranks, rollouts, strict=True)
@@ -148,22 +160,6 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
             out[name] = float(np.mean(column)) if len(column) else None
             spread[f"{name}_std"] = float(np.std(column, ddof=1)) if len(column) > 1 else None
     return {**out, **spread, "n_rollouts": len(rows)}
-
-
-def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
-    """Return each rollout's rank among the names of its scene, dropped ones included."""
-    names: dict[str, list[str]] = {}
-    for rollout in rollouts:
-        names.setdefault(rollout.of.scene, []).append(rollout.of.rollout)
-    for scene, own in names.items():
-        twice = next((name for name in own if own.count(name) > 1), None)
-        if twice is not None:
-            raise InputError(
-                f"scene {scene!r}: two rollouts named {twice!r}",
-                "score the runs apart, or rename the folder of one log",
-            )
-        own.sort()
-    return [names[rollout.of.scene].index(rollout.of.rollout) for rollout in rollouts]
 
 
 def _column(rows: Sequence[Mapping[str, float | None]], name: str) -> F64:

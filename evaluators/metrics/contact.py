@@ -297,22 +297,18 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     other = shapely.polygons(rectangle_corners(seen, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1]))
     shared = shapely.intersection(own, other)
     middle = shapely.get_coordinates(shapely.centroid(shared)).reshape(-1, 2)
-    return _sides(pairs, tau), np.clip(middle, -half, half)
-
-
-def _sides(pairs: Motions, tau: F64) -> I64:
-    """Return the side ``(M,)`` of the ego that the normal of touching pairs leaves through."""
     gap = gaps(pairs, tau)  # (M, 8)
     turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])
-    c = np.cos(turned)
-    s = np.sin(turned)
-    ones = np.ones(len(tau))
-    zero = np.zeros(len(tau))
+    cosine = np.cos(turned)
+    sine = np.sin(turned)
+    ones, zero = np.ones(len(tau)), np.zeros(len(tau))
     # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look
     # the other way.
-    forward = np.repeat(np.stack([ones, zero, c, -s], axis=1), 2, axis=1) * np.tile([1.0, -1.0], 4)
-    left = np.repeat(np.stack([zero, ones, s, c], axis=1), 2, axis=1)
+    forward = np.repeat(np.stack([ones, zero, cosine, -sine], axis=1), 2, axis=1)
+    forward *= np.tile([1.0, -1.0], 4)
+    left = np.repeat(np.stack([zero, ones, sine, cosine], axis=1), 2, axis=1)
     normal = gap >= gap.max(axis=1, keepdims=True) - PLACE_M
     along = np.abs(forward) >= np.abs(left)
     front, rear = (np.any(normal & along & (forward * sign > 0), axis=1) for sign in (1, -1))
-    return np.where(front, FRONT, np.where(rear, REAR, LATERAL)).astype(np.int64)
+    side = np.where(front, FRONT, np.where(rear, REAR, LATERAL)).astype(np.int64)
+    return side, np.clip(middle, -half, half)

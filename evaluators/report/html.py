@@ -25,7 +25,7 @@ from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.log.run_folder.reader import reporting
-from alpasim_plugin.log.run_folder.rows import Series
+from alpasim_plugin.log.run_folder.rows import Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import AGAIN, KEYS, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.numbers import DASH, listed_counts, percents, plural, short
@@ -37,7 +37,7 @@ from evaluators.report.fixers import pool_text, refused
 from evaluators.report.flips import colours_of, flip_bases, flip_rows
 from evaluators.report.gate import gate_section
 from evaluators.report.overview import TONES, overview_of
-from evaluators.report.rollouts import read_series, rollout_block
+from evaluators.report.rollouts import SERIES, rollout_block
 from evaluators.viewer.above import still_map
 from evaluators.viewer.worst import worst_change
 
@@ -119,7 +119,7 @@ def context(run: Run) -> dict[str, Any]:
     interesting = by_interest(run)
     variant_of = colours_of(run)
     looked_at = interesting[: 2 * MAX_SCENE_PLOTS]
-    series = read_series(run, looked_at) if looked_at else {}
+    series = series_by_cell(run.steps(SERIES, looked_at)) if looked_at else {}
     views, no_view = scene_views(run, series, looked_at, variant_of)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary, run.table)

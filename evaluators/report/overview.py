@@ -408,6 +408,15 @@ def _row(
     cut_steps = [censored.get(name) or 0 for name in ("steps_after_event", "steps_after_drift")]
     mean_ms = finite(((run.summary.get("speed") or {}).get(key) or {}).get("ms_per_frame_mean"))
     median_m = finite(entry.get(f"{DISTANCE}_median"))
+    # The failures of a variant by their ending, the gravest first.
+    places: dict[str, list[str]] = {}
+    for metric, facts in entry["outcomes"].items():
+        outcome = OUTCOMES[metric]
+        for cell in facts["cells"]:
+            seed = f" seed {cell['seed']}" if cell["seed"] else ""
+            when = "" if cell["t_s"] is None else f" at {cell['t_s']:.1f}\u00a0s"
+            ending = places.setdefault(outcome.ending or outcome.words, [])
+            ending.append(f"{cell['scene']}{seed}{when}")
     return VariantRow(
         key,
         variant_name(run, variant),
@@ -417,18 +426,5 @@ def _row(
         DASH if median_m is None else fixed(median_m, 2),
         median_m is not None and sum(cut_steps) > 0,
         DASH if mean_ms is None else fixed(mean_ms, 0 if mean_ms >= 10 else 1),
-        _places(entry),
+        places,
     )
-
-
-def _places(entry: JsonView) -> dict[str, list[str]]:
-    """Return ending -> scene and time of the failures of a variant, the gravest first."""
-    places: dict[str, list[str]] = {}
-    for name, facts in entry["outcomes"].items():
-        outcome = OUTCOMES[name]
-        for cell in facts["cells"]:
-            seed = f" seed {cell['seed']}" if cell["seed"] else ""
-            when = "" if cell["t_s"] is None else f" at {cell['t_s']:.1f}\u00a0s"
-            ending = places.setdefault(outcome.ending or outcome.words, [])
-            ending.append(f"{cell['scene']}{seed}{when}")
-    return places

@@ -12,14 +12,14 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
+from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series
 from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
 from evaluators.metrics.outcomes import (
     OUTCOMES,
@@ -93,11 +93,6 @@ def clock_zero_us(content: Mapping[str, Any], first_us: int) -> int:
             (scored logs of others).
     """
     return max(int(content.get("start_us") or 0), first_us)
-
-
-def read_series(run: Run, scenes: Sequence[str] | None = None) -> Series:
-    """Read every series that events and plots need, for some scenes or all."""
-    return series_by_cell(run.steps(SERIES, scenes))
 
 
 def events_of(rollout: Rollout, series: Series) -> list[Event]:

@@ -193,27 +193,22 @@ def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) 
         began = str(entry.info.get("started_at") or DASH)[:16].replace("T", " ")
         project = entry.info.get("project") or {}
         commit = str(project.get("commit") or DASH)[:7]
+        scenes = entry.info.get("scenes") or {}
+        asked = [str(name) for name in entry.info.get("asked") or scenes]
+        first = (
+            Path(asked[0]).name if asked and Path(asked[0]).is_absolute() else "".join(asked[:1])
+        )
+        more = f" + {len(asked) - 1}" if len(asked) > 1 else ""
         table.add_row(
             Text(escape(os.path.relpath(entry.folder, root.parent)), style="bold"),
             Text(escape(began)),
             Text(escape(f"{commit}+" if project.get("dirty") else commit)),
-            Text(scenes_text(entry)),
+            Text(f"{len(scenes)} x {len(entry.info.get('seeds') or ())} {escape(first)}{more}"),
             Text(escape(str(entry.info.get("preset") or DASH))),
             _state(entry),
             *(Text(text or DASH) for text in texts),
         )
     return table
-
-
-def scenes_text(entry: RunEntry) -> str:
-    """Count a run's scenes and seeds, and name the first thing that the command named, else the
-    first scene.
-    """
-    scenes = entry.info.get("scenes") or {}
-    names = [str(name) for name in entry.info.get("asked") or scenes]
-    first = Path(names[0]).name if names and Path(names[0]).is_absolute() else "".join(names[:1])
-    more = f" + {len(names) - 1}" if len(names) > 1 else ""
-    return f"{len(scenes)} x {len(entry.info.get('seeds') or ())} {escape(first)}{more}"
 
 
 def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:

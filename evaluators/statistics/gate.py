@@ -281,7 +281,15 @@ def check_gate(
     owner = "the run" if stored is None else "the stored baseline"
     base_sides = sides if stored is None else _sides(stored)
     is_paired = any(rule.is_paired for rule in spec.metrics.values())
-    base = _base(list(sides), spec, list(base_sides), owner, is_paired)
+    variants = list(sides)
+    if spec.baseline is not None:
+        base = base_named(spec.baseline, list(base_sides), owner)
+    else:
+        is_one_renderer = len({variant.renderer for variant in variants}) == 1
+        if owner != "the run" or (is_one_renderer and not is_paired):
+            base = None
+        else:
+            base = usual_base(variants)
     compares = is_paired or stored is not None or spec.baseline is not None
     checks = []
     for variant in _tested_variants(list(sides), spec, base, is_paired):
@@ -328,20 +336,6 @@ def failures_of(table: RolloutTable) -> JsonObject:
     by_class = table.failures()
     n_failed = sum(by_class.values())
     return {"n_rollouts": table.n_rollouts, "n_failed": n_failed, "by_class": by_class}
-
-
-def _base(
-    variants: list[Variant], spec: GateSpec, others: list[Variant], owner: str, is_paired: bool
-) -> Base | None:
-    """Return what variants are compared with; None: with the same variant of a stored baseline, or
-    limits alone hold for all policies.
-    """
-    if spec.baseline is not None:
-        return base_named(spec.baseline, others, owner)
-    is_one_renderer = len({variant.renderer for variant in variants}) == 1
-    if owner != "the run" or (is_one_renderer and not is_paired):
-        return None
-    return usual_base(variants)
 
 
 def _tested_variants(

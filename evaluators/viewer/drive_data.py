@@ -241,7 +241,19 @@ def moments(
                 text += _with_whom(event.t_s, manifest)
             text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
         found.append({"t": t_ms, "kind": event.kind, "text": text})
-    return found + _frame_events(frames, place)
+    # An event of the frames, such as a replaced frame, is told once where it goes on.
+    began = []
+    before: set[str] = set()
+    for row in frames:
+        now = set(str(row.get("events") or "").split())
+        if isinstance(row.get("t_us"), int):
+            began_ms = place.ms([row["t_us"]])[0]
+            started = sorted(now - before)
+            began += [
+                {"t": began_ms, "kind": "frame", "text": f"frame: {name}"} for name in started
+            ]
+        before = now
+    return found + began[:MAX_FRAME_EVENTS]
 
 
 def _with_whom(t_s: float, manifest: JsonView) -> str:
@@ -249,22 +261,6 @@ def _with_whom(t_s: float, manifest: JsonView) -> str:
         if abs(float(contact["t_s"]) - t_s) <= CONTACT_TOLERANCE_S:
             return f" with {contact['actor_id']}"
     return ""
-
-
-def _frame_events(frames: Rows, place: Place) -> list[JsonObject]:
-    """Return when an event of the frames began, such as a fixer's frame that was replaced; one that
-    goes on is told once.
-    """
-    found = []
-    before: set[str] = set()
-    for row in frames:
-        now = set(str(row.get("events") or "").split())
-        if isinstance(row.get("t_us"), int):
-            t_ms = place.ms([row["t_us"]])[0]
-            started = sorted(now - before)
-            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in started]
-        before = now
-    return found[:MAX_FRAME_EVENTS]
 
 
 def plans_part(flips: Sequence[JsonView], place: Place, by_policy: bool) -> list[JsonObject]:

@@ -38,7 +38,21 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
     if not plans:
         return []
     if met in log.actors:
-        return _towards(log, plans, log.actors[met], failed_us)
+        actor = log.actors[met]
+        leads = [_leads_into(log, plan.trajectory, actor) for plan in plans]
+        facts = _since(plans, leads, failed_us, f"before the failure leads into {actor.actor_id}")
+        driven = speeds(log.ego)
+        for plan in plans:
+            speed = float(np.interp(plan.now_us, log.ego.t_us, driven))
+            asked = float(np.hypot(*(_ahead(plan, 1_000_000) - _ahead(plan, 900_000)))) / 0.1
+            if asked < BRAKES * speed:
+                before_s = (failed_us - plan.now_us) * 1e-6
+                found = f"The first plan that brakes comes {before_s:.1f} s before the contact"
+                return [*facts, f"{found}, at {speed:.1f} m/s."]
+        return [
+            *facts,
+            f"No plan brakes: the last one asks for {asked:.1f} m/s, at {speed:.1f} m/s.",
+        ]
     if not outcomes or outcomes & {"stalled", "braked_without_cause"}:
         reaches = [float(np.hypot(*_ahead(plan, 2_000_000))) < STANDS_M for plan in plans]
         event = "failure" if outcomes else "end"
@@ -59,23 +73,6 @@ def _since(
         return []
     before_s = (failed_us - plans[first].now_us) * 1e-6
     return [f"Every plan of the last {before_s:.1f} s {said}."]
-
-
-def _towards(
-    log: RolloutLog, plans: Sequence[LoggedPlan], actor: Actor, failed_us: int
-) -> list[str]:
-    """Say since when plans lead into a road user, and when the first one brakes."""
-    leads = [_leads_into(log, plan.trajectory, actor) for plan in plans]
-    facts = _since(plans, leads, failed_us, f"before the failure leads into {actor.actor_id}")
-    driven = speeds(log.ego)
-    for plan in plans:
-        speed = float(np.interp(plan.now_us, log.ego.t_us, driven))
-        asked = float(np.hypot(*(_ahead(plan, 1_000_000) - _ahead(plan, 900_000)))) / 0.1
-        if asked < BRAKES * speed:
-            before_s = (failed_us - plan.now_us) * 1e-6
-            found = f"The first plan that brakes comes {before_s:.1f} s before the contact"
-            return [*facts, f"{found}, at {speed:.1f} m/s."]
-    return [*facts, f"No plan brakes: the last one asks for {asked:.1f} m/s, at {speed:.1f} m/s."]
 
 
 def _leads_into(log: RolloutLog, plan: Trajectory, actor: Actor) -> bool:

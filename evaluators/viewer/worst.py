@@ -4,7 +4,6 @@ failed, and a variant that repairs it, side by side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,19 +99,7 @@ def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
     if log is None or not images:
         return None
     outcomes = outcomes_of(rollout)
-    return Shot(
-        variant_name(run, rollout.variant),
-        rollout.scene,
-        (t_us - log.render_start_us) * 1e-6,
-        in_words(outcomes),
-        "worse" if outcomes else "better",
-        f"data:image/jpeg;base64,{jpeg(_together(images))}",
-        run.href(rollout, WHY_NAME) or run.href(rollout),
-    )
-
-
-def _together(images: Sequence[U8]) -> U8:
-    """Return the first camera's image above a row of the others'."""
+    # The first camera's image above a row of the others'.
     first, *others = images
     rows = [smaller(first, WIDTH_PX)]
     if others:
@@ -122,7 +109,15 @@ def _together(images: Sequence[U8]) -> U8:
         for i, image in enumerate(small):
             row[: len(image), i * step : i * step + image.shape[1]] = image
         rows.append(row)
-    return np.concatenate(rows)
+    return Shot(
+        variant_name(run, rollout.variant),
+        rollout.scene,
+        (t_us - log.render_start_us) * 1e-6,
+        in_words(outcomes),
+        "worse" if outcomes else "better",
+        f"data:image/jpeg;base64,{jpeg(np.concatenate(rows))}",
+        run.href(rollout, WHY_NAME) or run.href(rollout),
+    )
 
 
 def _frame_at(source: Source, t_us: int) -> U8 | None:

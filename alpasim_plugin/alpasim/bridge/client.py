@@ -10,7 +10,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable
-from types import TracebackType
 from typing import Any
 
 import grpc
@@ -38,12 +37,7 @@ class RendererClient:
     def __enter__(self) -> RendererClient:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._channel.close()
 
     def version(self, wait_s: float = 30.0) -> common_pb2.VersionId:

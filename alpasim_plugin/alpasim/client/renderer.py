@@ -46,7 +46,29 @@ class NreRenderer(Renderer):
                 f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {some_of(sorted(scenes))}",
                 "give the service that scene, or name one of its own with ?scene=ID",
             )
-        self._names = self._camera_names(scenario, place.options.get("cameras"))
+        text = place.options.get("cameras")
+        if text is not None:
+            self._names = {
+                camera.name: theirs for theirs, camera in cameras_of(scenario, text).items()
+            }
+        else:
+            request = sensorsim_pb2.AvailableCamerasRequest(scene_id=self._scene)
+            known = {
+                camera.logical_id
+                for camera in self._service.call(
+                    "get_available_cameras", request, READY_S
+                ).available_cameras
+            }
+            own = {camera.name for camera in scenario.cameras}
+            self._names = (
+                {}
+                if own <= known
+                else {
+                    camera.name: theirs
+                    for theirs, camera in cameras_of(scenario, None).items()
+                    if theirs in known
+                }
+            )
 
     @staticmethod
     def check_address(address: str) -> None:
@@ -109,25 +131,3 @@ class NreRenderer(Renderer):
                 "see the service's log",
             ) from error
         return Frame(request.t_us, request.camera.name, rgb)
-
-    def _camera_names(self, scenario: Scenario, text: str | None) -> dict[str, str]:
-        """Return the service's name of each of the scenario's cameras."""
-        if text is not None:
-            return {camera.name: theirs for theirs, camera in cameras_of(scenario, text).items()}
-        request = sensorsim_pb2.AvailableCamerasRequest(scene_id=self._scene)
-        known = {
-            camera.logical_id
-            for camera in self._service.call(
-                "get_available_cameras", request, READY_S
-            ).available_cameras
-        }
-        own = {camera.name for camera in scenario.cameras}
-        return (
-            {}
-            if own <= known
-            else {
-                camera.name: theirs
-                for theirs, camera in cameras_of(scenario, None).items()
-                if theirs in known
-            }
-        )
