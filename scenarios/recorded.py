@@ -211,7 +211,7 @@ def checked_trajectory(
     )
 
 
-def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
+def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool) -> bool:
     """Return whether a track is that of a standing object, given the noise of annotated boxes.
 
     It stands if it never leaves its median position by more than its class's reach and that reach,

@@ -14,7 +14,6 @@ from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import PAGES
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.self_test import run_self_test
@@ -129,7 +128,7 @@ def gate(
         )
     files = write_gate_files(verdict, source, stored_run, out or run)
     if out is None and os.path.isfile(run / PAGES[0]):
-        write_reports(run, flips=read_run_json(run).get("kind") != "score")
+        write_reports(run)
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
     show(as_json, facts, *verdict_lines(verdict))
     raise typer.Exit(verdict.exit_code)

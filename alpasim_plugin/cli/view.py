@@ -21,7 +21,6 @@ from alpasim_plugin.cli.options import (
 from alpasim_plugin.cli.output import first_screen, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.logged_rollout import named_rollout
@@ -160,8 +159,7 @@ def report(
     """Write the reports of a run again and print its table."""
     folder = run_or_newest(run)
     ensure_tables(folder, warn)
-    info = read_run_json(folder)
-    page = write_reports(folder, flips=info.get("kind") != "score")
+    page = write_reports(folder)
     opened = read_run(folder)
     facts = {"report": str(page), "summary": opened.summary}
     lines = first_screen(opened)

@@ -58,7 +58,7 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     return read_json_lines(path, do_this="run the rollout again")
 
 
-def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> Trace:
+def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]]) -> Trace:
     """Read the components of a rollout out of its log.
 
     Names of sessions and services are not part of any component: rollouts of different names can be

@@ -29,19 +29,18 @@ from evaluators.viewer.cause import cause_of, write_cause
 from evaluators.viewer.cells import read_log
 
 
-def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
+def write_reports(root: Path, page: bool = True) -> Path | None:
     """Write ``summary.md``, ``junit.xml`` and ``report.html`` of a run folder and
     return the path of the last.
 
     Args:
         root: A run folder whose tables are written.
-        flips: Find cells whose outcome differs from their baseline's first; not for scored logs of
-            others.
-        page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an
-            earlier command are removed, and None is returned.
+        page: Write ``report.html`` and the flips that it shows and links to, which scored logs of
+            others do not have. Otherwise those of an earlier command are removed, and None is
+            returned.
     """
     run = read_run(root)
-    if flips and page:
+    if page and run.info.get("kind") != "score":
         write_flips(run)
         failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
         for rollout in list(failed.values())[::-1][:MAX_CAUSES]:

@@ -38,20 +38,13 @@ from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
 from alpasim_plugin.runs.summary import pool_of, write_summary
-from evaluators.metrics import MetricTable, table_of
+from evaluators.metrics import table_of
 from evaluators.statistics.decision import State
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
 SHORT_KEY = 4  # letters in the name of a run folder
-IN_SUMMARY = (
-    "pool",
-    "repeat",
-    "exit_code",
-    "alpasim",
-    "boundary",
-)  # members of run.json in the summary too
 
 
 class Progress(Protocol):
@@ -276,32 +269,13 @@ def finish_run(
         info["rollouts"] = folders
     write_run_json(root, info)
     REMADE.pop(real(root), None)
-    summary = summary_of_run(root, info, manifests)
+    summary = write_summary(root, info, manifests, root)
     scenes = [f"{SCENES}/{slug(scene)}.json" for scene in info["scenes"]]
     state_files(root, [RUN_INFO, DECISION, *TABLES, *scenes])
     from alpasim_plugin.runs.reports import write_reports  # templates: only once all is driven
 
-    write_reports(root, flips=info.get("kind") != "score", page=report)
+    write_reports(root, report)
     return summary
-
-
-def summary_of_run(
-    root: Path,
-    info: JsonView,
-    manifests: Sequence[JsonObject],
-    tables: Path | None = None,
-) -> JsonObject:
-    """Write the tables of a run, by default into its folder, and return the summary."""
-    return write_summary(
-        root,
-        manifests,
-        info["preset"],
-        info["config"].get("baseline"),
-        {name: info[name] for name in IN_SUMMARY if name in info},
-        info.get("bases") or {},
-        MetricTable.of_run(info),
-        tables,
-    )
 
 
 def claim(

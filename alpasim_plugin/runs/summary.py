@@ -24,9 +24,9 @@ from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import fixers
 from evaluators import censoring
-from evaluators.metrics import METRICS, MetricTable
+from evaluators.metrics import MetricTable
 from evaluators.statistics.outcomes import outcome_table, times_of
-from evaluators.statistics.summary import NO_BASES, by_policy, numbers
+from evaluators.statistics.summary import by_policy, numbers
 from evaluators.statistics.variants import base_named, variants_in
 
 SPEEDS = (
@@ -36,42 +36,36 @@ SPEEDS = (
     "frames_per_s",
     "first_frame_ms",
 )
+# Members of run.json that are in the summary too.
+IN_SUMMARY = ("pool", "repeat", "exit_code", "alpasim", "boundary")
 
 
 def write_summary(
-    root: Path,
-    manifests: Sequence[JsonObject],
-    preset: str,
-    baseline: str | None,
-    more: JsonView,
-    bases: Mapping[str, str] = NO_BASES,
-    known: MetricTable = METRICS,
-    tables: Path | None = None,
+    root: Path, info: JsonView, manifests: Sequence[JsonObject], tables: Path
 ) -> JsonObject:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
     Args:
         root: The run folder; the manifests' rollouts are below it.
+        info: ``run.json``.
         manifests: One per rollout, in the order of the tables.
-        preset: Evaluator preset of the scores.
-        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the
-            first.
-        more: What the manifests do not tell, for the summary.
-        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not
-            the baseline, the two are paired too.
-        known: What the metrics are.
-        tables: Folder to write to; by default the run folder.
+        tables: Folder to write to.
     """
-    tables = tables or root
+    known = MetricTable.of_run(info)
     rollouts = write_tables(root, manifests, tables)
     done = [m for m in manifests if m["status"] == "ok"]
     failed = [m for m in manifests if m["status"] != "ok"]
     by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
     cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
     summary = {
-        "preset": preset,
+        "preset": info["preset"],
         "outcomes": outcome_table(rollouts_of_table(rollouts), times_of(manifests)),
-        **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
+        **numbers(
+            RolloutTable.of_table(rollouts),
+            info["config"].get("baseline"),
+            info.get("bases") or {},
+            known,
+        ),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": {
             "n_failed": len(failed),
@@ -82,7 +76,7 @@ def write_summary(
         "copies": sum("copied_from" in m for m in manifests),
         "fixers": by_policy(_of_policies(done), fixers),
         "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
-        **more,
+        **{name: info[name] for name in IN_SUMMARY if name in info},
     }
     write_json(tables / SUMMARY, summary)
     return summary

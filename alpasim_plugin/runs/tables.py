@@ -48,12 +48,12 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     if run.unfinished or not run.cells:
         done = f"{len(run.manifests)} of {len(run.cells)} rollouts are finished."
         raise InputError(f"{root}: {done}", again(info))
-    from alpasim_plugin.runs.run import summary_of_run  # a run that is whole loads no loop
+    from alpasim_plugin.runs.summary import write_summary  # a run that is whole loads no loop
 
     say(f"note: {root}: {tables[0]}; the tables are made from the rollouts")
     folder = temporary_folder("simrun-tables-")
     with parsing(root, AGAIN, "manifests from which no table can be made"):
-        summary_of_run(root, info, run.manifests, Path(folder.name))
+        write_summary(root, info, run.manifests, Path(folder.name))
     REMADE[real(root)] = folder
 
 

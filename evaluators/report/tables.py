@@ -110,7 +110,7 @@ def metric_rows(
     return rows
 
 
-def metric_cell(metric: MetricInfo, entry: JsonView, places: int, reason: str = "") -> Cell:
+def metric_cell(metric: MetricInfo, entry: JsonView, places: int, reason: str) -> Cell:
     """Print a mean with its interval, scenes as clusters, and for rates the count."""
     mean = finite(entry.get("mean"))
     if mean is None:

@@ -53,9 +53,7 @@ def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
     return aggregate_sides(by_renderer(rows), metric_names(rows), known)
 
 
-def aggregate_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS
-) -> Table:
+def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable) -> Table:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:

@@ -141,20 +141,17 @@ def rollout_table(manifests: Sequence[JsonObject]) -> pa.Table:
     return pa.Table.from_batches(batches, schema)
 
 
-def write_tables(
-    root: Path, manifests: Sequence[JsonObject], tables: Path | None = None
-) -> pa.Table:
+def write_tables(root: Path, manifests: Sequence[JsonObject], tables: Path) -> pa.Table:
     """Write ``rollouts.parquet`` and ``steps.parquet`` of a run folder and return the first.
 
     Args:
         root: The run folder; the manifests' rollouts are below it.
         manifests: One per rollout, in the order of the tables.
-        tables: Folder to write to; by default the run folder.
+        tables: Folder to write to.
 
     Raises:
         InfrastructureError: The disk refuses.
     """
-    tables = tables or root
     rollouts = rollout_table(manifests)
     write_parquet(tables / ROLLOUTS, rollouts)
     parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
