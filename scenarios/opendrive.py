@@ -38,7 +38,6 @@ from scenarios.opendrive_road import (
     lane_borders,
     lane_key,
     lanes_at,
-    missing_m,
     parse_map,
     placed,
     reference_line,
@@ -274,7 +273,8 @@ def read_lanes(
             with parsing(f"{place}, section {index}", "repair its numbers"):
                 found = _section(road, index, section, T_local_map, left_out)
             lanes.update({one.lane_id: one for one in found})
-        missing = missing_m(road) if road.records else 0.0
+        ends_m = (one.s_m + one.length_m for one in road.records)
+        missing = road.length_m - max(ends_m, default=road.length_m)
         if missing > MAX_MISSING_M:
             raise InputError(
                 f"{place}: a reference line that ends {missing:g} m before the road of {road.length_m:g} m",

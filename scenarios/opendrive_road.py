@@ -106,11 +106,6 @@ def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
     return out
 
 
-def missing_m(road: Road) -> float:
-    """Return by how many metres the reference line of a road ends before the road does."""
-    return road.length_m - max(one.s_m + one.length_m for one in road.records)
-
-
 def gap_m(road: Road) -> float:
     """Return the largest distance, metres, between the end of a record of a road's reference line
     and the start of the next one.

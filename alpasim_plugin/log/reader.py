@@ -80,10 +80,8 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
             raise _bad(
                 path, f"first entry is {kind}", "give a whole log: rollout_metadata comes first"
             )
-        handler = _HANDLERS.get(kind)
-        if handler is not None:
-            handler(got, getattr(entry, kind))
-        elif kind == "driver_camera_image" and images:
+        _collect(got, kind, entry)
+        if kind == "driver_camera_image" and images:
             image = entry.driver_camera_image.camera_image
             got.images.append(
                 LoggedImage(
@@ -98,23 +96,32 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
     return _assemble(got, tuple(warnings))
 
 
-def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata) -> None:
-    if got.metadata is not None:
-        raise InputError(f"{got.path}: a second rollout_metadata", "give one rollout a file")
-    got.metadata = message
-
-
-def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses) -> None:
-    for pose in message.actor_poses:
-        got.poses.setdefault(pose.actor_id, []).append((message.timestamp_us, pose.actor_pose))
-
-
-def _route(got: _Collected, message: egodriver_pb2.RouteRequest) -> None:
-    got.route = message.route
-
-
-def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest) -> None:
-    got.requests.append(message)
+def _collect(got: _Collected, kind: str, entry: logging_pb2.LogEntry) -> None:
+    """Keep what a rollout is made of; images are the caller's to keep."""
+    if kind == "rollout_metadata":
+        if got.metadata is not None:
+            raise InputError(f"{got.path}: a second rollout_metadata", "give one rollout a file")
+        got.metadata = entry.rollout_metadata
+    elif kind == "actor_poses":
+        t_us = entry.actor_poses.timestamp_us
+        for pose in entry.actor_poses.actor_poses:
+            got.poses.setdefault(pose.actor_id, []).append((t_us, pose.actor_pose))
+    elif kind == "driver_request":
+        got.requests.append(entry.driver_request)
+    elif kind == "route_request":
+        got.route = entry.route_request.route
+    elif kind == "driver_return":
+        _driver_return(got, entry.driver_return)
+    elif kind == "driver_session_request":
+        got.info["seed"] = entry.driver_session_request.random_seed
+    elif kind == "traffic_session_request":
+        objects = entry.traffic_session_request.logged_object_trajectories
+        got.static_ids.update(one.object_id for one in objects if one.is_static)
+    elif kind == "available_cameras_return":
+        cameras = entry.available_cameras_return.available_cameras
+        specs = {camera.logical_id: read_camera(camera) for camera in cameras}
+        got.info["cameras"] = tuple(spec for spec in specs.values() if spec is not None)
+        got.info["other_cameras"] = tuple(name for name, spec in specs.items() if spec is None)
 
 
 def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> None:
@@ -144,32 +151,6 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> Non
             np.array([[p.x, p.y] for p in got.route.waypoints]).reshape(-1, 2),
         )
     )
-
-
-def _driver_session(got: _Collected, message: egodriver_pb2.DriveSessionRequest) -> None:
-    got.info["seed"] = message.random_seed
-
-
-def _traffic_session(got: _Collected, message: Any) -> None:
-    got.static_ids.update(o.object_id for o in message.logged_object_trajectories if o.is_static)
-
-
-def _cameras(got: _Collected, message: Any) -> None:
-    specs = {camera.logical_id: read_camera(camera) for camera in message.available_cameras}
-    got.info["cameras"] = tuple(spec for spec in specs.values() if spec is not None)
-    got.info["other_cameras"] = tuple(name for name, spec in specs.items() if spec is None)
-
-
-_HANDLERS: dict[str, Any] = {
-    "rollout_metadata": _metadata,
-    "actor_poses": _actor_poses,
-    "driver_request": _driver_request,
-    "route_request": _route,
-    "driver_return": _driver_return,
-    "driver_session_request": _driver_session,
-    "traffic_session_request": _traffic_session,
-    "available_cameras_return": _cameras,
-}
 
 
 def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:

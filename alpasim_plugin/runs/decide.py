@@ -14,10 +14,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import rollout_table
 from alpasim_plugin.runs.plan import RunPlan, part_of
@@ -34,7 +36,6 @@ from evaluators.statistics.decision import (
     question_as_dict,
     scene_harm,
     state_after,
-    write_decision,
 )
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.variants import (
@@ -168,7 +169,7 @@ class SequentialTest:
     def announce(self, root: Path, progress: Progress) -> None:
         """Show the analysis and write ``decision.json``."""
         progress.looked(self.state, len(self.driven), len(self.plan.cells))
-        write_decision(root, self.record())
+        write_json(root / DECISION, self.record())
 
     def facts(self) -> JsonObject:
         """Return nothing: ``decision.json`` holds the decision."""

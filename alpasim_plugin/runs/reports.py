@@ -69,16 +69,12 @@ MAX_FLIPS = 60  # cells whose logs are read
 IMAGE_WIDTH = 560
 
 
-def write_flips(run_dir: Path | Run) -> Path:
+def write_flips(run: Run) -> None:
     """Find the first plan divergence of every flipped cell of a run folder and write
     ``flips.json``.
 
     The two logs are compared; their poses are equal until the plans diverge.
-
-    Raises:
-        InputError: The run folder is not complete enough to be read.
     """
-    run = read_run(run_dir)
     root = run.folder
     flips, compared = find_flips(run)
     cells = []
@@ -101,7 +97,6 @@ def write_flips(run_dir: Path | Run) -> Path:
         "n_pairs": compared,
     }
     write_json(root / FLIPS_NAME, about | {"cells": cells})
-    return root / FLIPS_NAME
 
 
 def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:

@@ -25,7 +25,6 @@ from typing import Any, Literal
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
@@ -433,15 +432,6 @@ def question_as_dict(question: Question) -> AskedRecord:
             for asked in question.metrics
         },
     }
-
-
-def write_decision(root: Path, decision: Decision) -> None:
-    """Write ``decision.json`` into a run folder.
-
-    Raises:
-        InfrastructureError: The disk refuses.
-    """
-    write_json(root / DECISION, decision)
 
 
 def read_decision(root: Path) -> Decision | None:
