@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import yaw_of
 from alpasim_plugin.core.types import Plan, SensorSpec
 from policies import conformance
 from policies.conformance import canned_scenario, check_policy
 from policies.simple import PurePursuit
 from tests.examples import first_rows_of
+from tests.runs import faulty_policies
 
 SCENARIO = canned_scenario()
 
@@ -40,13 +40,11 @@ class MirroredY(Honest):
 
 
 class Centimetres(Honest):
-    def spoil(self, plan, observation):
-        return replace(plan, xy=plan.xy * 100)
+    spoil = faulty_policies.Centimetres.spoil
 
 
 class SwappedAxes(Honest):
-    def spoil(self, plan, observation):
-        return replace(plan, xy=plan.xy[:, ::-1].copy(), yaw=np.pi / 2 - plan.yaw)
+    spoil = faulty_policies.SwappedAxes.spoil
 
 
 class MillisecondSteps(Honest):
@@ -84,17 +82,13 @@ class Degrees(Honest):
 
 
 class WorldFrame(Honest):
-    def spoil(self, plan, observation):
-        T = observation.ego.T_world_rig
-        return replace(plan, xy=plan.xy @ T[:2, :2].T + T[:2, 3], yaw=plan.yaw + yaw_of(T))
+    spoil = faulty_policies.WorldFrame.spoil
 
 
 class WorldAxes(Honest):
     """Answers in the world's axes, the pose staying at the origin."""
 
-    def spoil(self, plan, observation):
-        T = observation.ego.T_world_rig
-        return replace(plan, xy=plan.xy @ T[:2, :2].T, yaw=plan.yaw + yaw_of(T))
+    spoil = faulty_policies.WorldAxes.spoil
 
 
 class Short(Honest):
