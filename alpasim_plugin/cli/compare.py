@@ -37,7 +37,7 @@ Examples:
 
 - `simrun compare runs/both --baseline clean/lane-camera`: every other pair of renderer and policy with this one
 
-- `simrun compare runs/main runs/change`: the second run minus the first, on shared cells
+- `simrun compare runs/main runs/change`: the second run minus the first, on shared rollouts
 
 - `simrun compare runs/night-1 runs/night-2 runs/night-3`: the shards of one run, as of one
 """
@@ -193,7 +193,7 @@ def _table(
 
 
 def _missing(entries: Mapping[str, JsonView], most: int) -> list[str]:
-    """List missing pairs: metrics without any, cells without any, and metrics that lack some cells;
+    """List missing pairs: metrics without any, rollouts without any, and metrics that lack some rollouts;
     ``most`` names a line.
     """
     paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}

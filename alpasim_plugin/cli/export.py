@@ -37,7 +37,7 @@ Examples:
 
 - `simrun export runs/smoke/rollouts/3dgs/lane-camera/smoke-curve/0 --mcap curve.mcap`
 
-Exit codes: 0 written; 2 no such run or rollout, several cells where one was needed, or a library is not installed; 4 the disk refuses.
+Exit codes: 0 written; 2 no such run or rollout, several scenes, policies or seeds where one was needed, or a library is not installed; 4 the disk refuses.
 """
 
 
@@ -58,7 +58,7 @@ def export(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a run as AlpaSim run folders and scenes, or one cell as a recording for Foxglove and
+    """Write a run as AlpaSim run folders and scenes, or the rollouts of one scene, policy and seed as a recording for Foxglove and
     Rerun.
 
     With `--alpasim`, one run folder for each renderer and policy: logs, `_complete` marks, metadata
@@ -113,14 +113,14 @@ def export_recording(items: Sequence[str], asked: Wanted, path: Path) -> dict[st
 
     Args:
         items: The run folder or the rollout's folder; one.
-        asked: Which cell of a run, and which renderers.
+        asked: Which scene, policy and seed of a run, and which renderers.
         path: The file.
 
     Returns:
         As `export_mcap`.
 
     Raises:
-        InputError: Not one run or rollout, several cells, a file that is there already, a damaged
+        InputError: Not one run or rollout, several scenes, policies or seeds, a file that is there already, a damaged
             log, or the library is not installed.
         InfrastructureError: The disk refuses.
     """

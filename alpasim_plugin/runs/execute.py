@@ -1,9 +1,9 @@
-"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the
+"""Run the rollouts of a plan: in this process for one worker, in spawned processes for more, or on the
 nodes of a cluster.
 
 A cell's result does not depend on where or when it runs: every random stream is keyed by (scene,
 seed, component, step) and the rasteriser is bit-equal for any number of threads. Workers may
-therefore run cells in any order.
+therefore run rollouts in any order.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL)
     cores that the executor asks for.
 
     Args:
-        workers: Number of workers; None is one per core. Never more than cells. On other nodes it
+        workers: Number of workers; None is one per core. Never more than rollouts. On other nodes it
             is the most, and None is no bound.
-        n_cells: Number of cells to run.
+        n_cells: Number of rollouts to run.
         executor: Where rollouts run.
     """
     if not executor.is_local:
@@ -105,7 +105,7 @@ def execute(
     on_done: OnDone,
     notify: Callable[[str], None],
 ) -> list[JsonObject]:
-    """Run every unfinished cell and return all manifests in the plan's order.
+    """Run every unfinished rollout and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
     scored again from their logs; damaged ones are driven again. A policy without a camera drives
@@ -161,7 +161,7 @@ def execute(
 
 
 def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Drive cells where the executor says; with Ray only this process writes the run folder."""
+    """Drive rollouts where the executor says; with Ray only this process writes the run folder."""
     if how.executor.is_local:
         yield from _run_local([(cell, None) for cell in todo], plan, root, how)
     elif todo:
@@ -173,7 +173,7 @@ def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done
 
 
 def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
-    """Drive or copy cells in this process, or in workers that write the run folder themselves."""
+    """Drive or copy rollouts in this process, or in workers that write the run folder themselves."""
     workers, threads = how.here.workers, how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
@@ -189,7 +189,7 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
 
 
 def _work(options: RunOptions, root: Path, here: Threads, job: Job) -> JsonObject:
-    """Drive or copy a cell in a worker of this machine."""
+    """Drive or copy a rollout in a worker of this machine."""
     share_card(options.device, here.workers)
     cell, original = job
     threads = here.per_worker

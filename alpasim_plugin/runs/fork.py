@@ -177,7 +177,7 @@ class Change:
         return f"{', '.join(part for part in parts if part)} from {self.after_us * 1e-6:g} s"
 
     def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
-        """Return the cell with the replaced parts; ``fixer`` are the run's fixer settings."""
+        """Return the rollout with the replaced parts; ``fixer`` are the run's fixer settings."""
         renderer = (
             cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
         )

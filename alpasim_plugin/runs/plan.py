@@ -1,4 +1,4 @@
-"""The plan of a run: its cells, renderer x policy x scene x seed, with resolved parts and content
+"""The plan of a run: its rollouts, renderer x policy x scene x seed, with resolved parts and content
 keys.
 """
 
@@ -29,7 +29,7 @@ from scenarios.suite import ScenarioRef
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Everything except the cells that determines a run's results."""
+    """Everything except the rollouts that determines a run's results."""
 
     preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = DEFAULT
     images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = (
@@ -99,7 +99,7 @@ class Cell:
 
     @property
     def names(self) -> dict[str, str | int]:
-        """Give the columns that identify the cell in tables."""
+        """Give the columns that identify the rollout in tables."""
         return {
             "renderer": self.renderer.name,
             "policy": self.policy.name,
@@ -114,7 +114,7 @@ class RunPlan:
 
     Attributes:
         asked: The scenarios as the command named them: files, folders, suites; in no key.
-        question: Digest of a question that decides which of the cells are driven; empty where all
+        question: Digest of a question that decides which of the rollouts are driven; empty where all
             are.
         whole: The plan that this is a part of, whose keys it bears; see `part_of`.
     """
@@ -176,7 +176,7 @@ def make_plan(
     seeds: Sequence[int],
     options: RunOptions,
 ) -> RunPlan:
-    """Load every scenario, resolve every part, and list the cells, scene by scene so that workers
+    """Load every scenario, resolve every part, and list the rollouts, scene by scene so that workers
     reuse a loaded scene.
 
     Raises:
@@ -290,7 +290,7 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
 
 
 def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
-    """Return the part of a plan that consists of some of its cells, with the keys of the whole."""
+    """Return the part of a plan that consists of some of its rollouts, with the keys of the whole."""
     scenes, seeds = {cell.scene for cell in cells}, {cell.seed for cell in cells}
     scenarios = {name: scenario for name, scenario in plan.scenarios.items() if name in scenes}
     kept = tuple(seed for seed in plan.seeds if seed in seeds)

@@ -66,11 +66,11 @@ def require_mcap() -> Any:
 
 
 def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObject:
-    """Write a cell of a run as a recording.
+    """Write the rollouts of one scene, policy and seed as a recording.
 
     Args:
         run: The run.
-        cell: One of its cells.
+        cell: Which ones.
         logs: Its logs (`evaluators.viewer.cells.read_logs`).
         path: The file; replaced.
 

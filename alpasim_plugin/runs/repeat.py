@@ -31,7 +31,7 @@ def repeat_rollout(
     Args:
         plan: The run.
         root: Its folder.
-        manifests: One per cell, in the plan's order.
+        manifests: One per rollout, in the plan's order.
         threads: Threads of the second rollout.
 
     Returns:

@@ -65,12 +65,12 @@ def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:
     return [entry for entry in flip_entries(run) if key_of_entry(entry)[:4] == rollout.cell]
 
 
-MAX_FLIPS = 60  # cells whose logs are read
+MAX_FLIPS = 60  # rollouts whose logs are read
 IMAGE_WIDTH = 560
 
 
 def write_flips(run: Run) -> None:
-    """Find the first plan divergence of every flipped cell of a run folder and write
+    """Find the first plan divergence of every flipped rollout of a run folder and write
     ``flips.json``.
 
     The two logs are compared; their poses are equal until the plans diverge.

@@ -78,7 +78,7 @@ class Search(Protocol):
         plan: Holds the key of the command.
         ceiling: The plan with as many rollouts as are driven at most.
         at_once: Rollouts of a round, about.
-        driven: Manifests by the cell's folder.
+        driven: Manifests by the rollout's folder.
     """
 
     kind: ClassVar[str]

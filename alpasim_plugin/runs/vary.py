@@ -133,7 +133,7 @@ class BoundarySearch:
         plan: The scene as written, with the keys of the whole run.
         sweeps: One or two parameters and their ranges.
         reached: The parts of the ranges in which the scene can be built.
-        cells: The cells driven so far.
+        cells: The rollouts driven so far.
         scenes: Values of the parameters -> plan of the scene with them.
         unreachable: Values of the parameters -> why the scene cannot be built with them.
     """
@@ -248,7 +248,7 @@ class BoundarySearch:
         return self.plan_of(cells) if cells else None
 
     def plan_of(self, cells: Sequence[Cell]) -> RunPlan:
-        """Return a plan of some cells with the keys of the whole run."""
+        """Return a plan of some rollouts with the keys of the whole run."""
         known = {name: one for plan in self.scenes.values() for name, one in plan.scenarios.items()}
         wanted = dict.fromkeys(cell.scene for cell in cells)
         scenarios = {name: known[name] for name in wanted}

@@ -1,4 +1,4 @@
-"""The cells whose outcome differs from the baseline's, with both images when the plans part."""
+"""The rollouts whose outcome differs from the baseline's, with both images when the plans part."""
 
 from __future__ import annotations
 

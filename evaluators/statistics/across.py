@@ -1,4 +1,4 @@
-"""Paired differences within a run, or between two runs on the cells that both have."""
+"""Paired differences within a run, or between two runs on the rollouts that both have."""
 
 from __future__ import annotations
 

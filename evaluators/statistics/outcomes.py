@@ -23,8 +23,8 @@ from evaluators.metrics.outcomes import (
 
 Times = Mapping[
     tuple[str, str, str, int], Mapping[str, float]
-]  # cell -> outcome -> seconds after the first frame
-LISTED = 20  # cells named per outcome in summary.json
+]  # rollout -> outcome -> seconds after the first frame
+LISTED = 20  # rollouts named per outcome in summary.json
 DISTANCE = "lateral_distance_m"
 
 

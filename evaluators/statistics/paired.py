@@ -1,4 +1,4 @@
-"""Paired differences between renderers on shared scene-seed cells.
+"""Paired differences between renderers on shared scenes and seeds.
 
 Two renderers meet the same scenes, seeds and noise, so the difference per cell is far less spread
 than either value. Cells of one scene are not independent: differences are averaged per scene, and
