@@ -20,7 +20,6 @@ from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cameras import recorded_requests
@@ -174,7 +173,14 @@ def check_driver(
         times.watch(policy.service)
         warmup += scene.warmup_us // scene.rates.policy_us + 1
         try:
-            ended[scene.scene_id] = rehearse(scene, policy)
+            log = run_rollout(scene, make_renderer("clean", scene), policy).log()
+            values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
+            measured = {name: values[name] for name in OUTCOMES if name in values}
+            ended[scene.scene_id] = in_words(
+                tuple(
+                    name for name, one in measured.items() if one["valid"] and one["value"] >= 0.5
+                )
+            )
         except (PolicyError, InfrastructureError) as error:
             ended[scene.scene_id], failed = error.message, failed or error
             if isinstance(error, InfrastructureError):
@@ -195,16 +201,6 @@ def check_driver(
     lines = [f"{check.result:7} {check.name}: {check.text}" for check in checks]
     show(as_json, facts, f"driver  {driver}", *lines)
     raise typer.Exit(code)
-
-
-def rehearse(scene: Scenario, policy: AlpasimPolicy) -> str:
-    """Drive a scene and return how it ended, in words."""
-    log = run_rollout(scene, make_renderer("clean", scene), policy).log()
-    values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
-    measured = {name: values[name] for name in OUTCOMES if name in values}
-    return in_words(
-        tuple(name for name, one in measured.items() if one["valid"] and one["value"] >= 0.5)
-    )
 
 
 app = typer_of(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
@@ -270,7 +270,17 @@ class BoundarySearch:
         for cell, manifest in zip(plan.cells, manifests, strict=True):
             self.cells.append(cell)
             self.driven[cell.folder.as_posix()] = manifest
-            failed = _has_failed(manifest)
+            if manifest["status"] != "ok":
+                failed = True if manifest["error"]["failure_class"] == POLICY_FAULT else None
+            else:
+                metrics = manifest["metrics"]
+                measured = [metrics[name] for name in OUTCOMES if name in metrics]
+                failed = any(one["valid"] and one["value"] >= 0.5 for one in measured)
+                known = [
+                    metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")
+                ]
+                if not failed and not all(known):
+                    failed = None  # it is not known
             if failed is None:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"
                 continue
@@ -348,17 +358,3 @@ class BoundarySearch:
 def _steps(failed: Mapping[Point, bool]) -> dict[int, bool]:
     """Return outcomes along one parameter by step."""
     return {step: has_failed for (step,), has_failed in failed.items()}
-
-
-def _has_failed(manifest: JsonView) -> bool | None:
-    """Tell whether a rollout had an outcome that counts as a failure; None where that is not
-    known.
-    """
-    if manifest["status"] != "ok":
-        return True if manifest["error"]["failure_class"] == POLICY_FAULT else None
-    metrics = manifest["metrics"]
-    measured = [metrics[name] for name in OUTCOMES if name in metrics]
-    if any(one["valid"] and one["value"] >= 0.5 for one in measured):
-        return True
-    known = {name: metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")}
-    return False if all(known.values()) else None

@@ -40,26 +40,6 @@ TOLERANCE = 1e-9  # of a bound, as a share of the range
 BINS = 256
 
 
-def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
-    """Return the different values and their counts ``(k,)``, with the worst as one more; many are
-    put into bins that keep their mean.
-
-    A value between two edges counts in shares for both, which widens the bounds a little and never
-    narrows them.
-    """
-    distinct, counts = np.unique(np.append(values, most), return_counts=True)
-    if len(distinct) <= BINS:
-        return distinct, counts.astype(np.float64)
-    edges = np.linspace(distinct[0], distinct[-2], BINS)
-    place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])
-    left = np.minimum(place.astype(np.int64), BINS - 2)
-    share = place - left
-    filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
-        left + 1, share * counts[:-1], BINS
-    )
-    return np.append(edges, distinct[-1]), np.append(filled, counts[-1])
-
-
 def chance_above(values: F64, counts: F64, mean: float) -> float:
     """Return the chance that the weighted mean of values ``(k,)`` with counts is at least ``mean``.
 
@@ -98,7 +78,21 @@ def upper_bound(values: F64, most: float) -> float:
     scale = max(float(np.max(np.abs(values))), abs(most))
     if scale == 0.0:
         return most
-    distinct, counts = _with_worst(np.asarray(values, dtype=np.float64) / scale, most / scale)
+    # The different values, with the worst as one more. Many are put into bins that keep their mean:
+    # one between two edges counts in shares for both, which widens the bounds and never narrows.
+    distinct, counts = np.unique(
+        np.append(np.asarray(values, dtype=np.float64) / scale, most / scale), return_counts=True
+    )
+    counts = counts.astype(np.float64)
+    if len(distinct) > BINS:
+        edges = np.linspace(distinct[0], distinct[-2], BINS)
+        place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])
+        left = np.minimum(place.astype(np.int64), BINS - 2)
+        share = place - left
+        filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
+            left + 1, share * counts[:-1], BINS
+        )
+        distinct, counts = np.append(edges, distinct[-1]), np.append(filled, counts[-1])
     low = float(np.mean(np.asarray(values) / scale))
     if low >= distinct[-1]:
         return most

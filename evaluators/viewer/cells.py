@@ -37,7 +37,6 @@ from evaluators.viewer.drive_data import (
 )
 from evaluators.viewer.images import (
     NO_FRAMES,
-    Rows,
     encoded,
     frame_rows,
     sources,
@@ -297,7 +296,18 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
             facts = frame_rows(run, rollout)
             drive = drive_data(run, rollout, log, place, tracks, facts)
             drive["why"] = run.href(rollout, WHY_NAME) or ""
-            drives.append(name | drive | _camera_data(run, rollout, log, facts, place))
+            cameras = [encoded(one, place.zero_us) for one in sources(run, rollout, log)]
+            lenses = {camera.name: camera for camera in log.info["cameras"]}
+            for camera in cameras:
+                trust = trust_by_time(facts, camera["name"])
+                by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
+                if by_ms:
+                    camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
+                if camera["name"] in lenses:
+                    camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
+            drives.append(
+                name | drive | {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
+            )
     keys = {flip.key for flip in cell.flips}
     entries = [entry for entry in flip_entries(run) if key_of_entry(entry) in keys]
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
@@ -312,24 +322,6 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
         "origin": place.origin.tolist(),
         "zero_us": place.zero_us,
     }
-
-
-def _camera_data(
-    run: Run, rollout: Rollout, log: RolloutLog, facts: Rows, place: Place
-) -> JsonObject:
-    """Return a rollout's camera frames for a page, with lenses and trust maps where known, or why
-    there are none.
-    """
-    cameras = [encoded(one, place.zero_us) for one in sources(run, rollout, log)]
-    lenses = {camera.name: camera for camera in log.info["cameras"]}
-    for camera in cameras:
-        trust = trust_by_time(facts, camera["name"])
-        by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
-        if by_ms:
-            camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
-        if camera["name"] in lenses:
-            camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
-    return {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
 
 
 def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:

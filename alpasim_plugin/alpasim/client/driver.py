@@ -169,7 +169,19 @@ class DriverPolicy(Policy):
     def _send_motion(self, observation: Observation) -> None:
         """Send every pose since the last one sent, with its speeds."""
         history = observation.history
-        states = motion_states(history, observation.ego)
+        states = [observation.ego]
+        if len(history) > 1:
+            poses = se3(history.xyz, history.quat)
+            t_s = (history.t_us - history.t_us[0]) * 1e-6
+            velocity = np.gradient(history.xyz, t_s, axis=0)
+            speed = np.einsum("ti,ti->t", velocity, poses[:, :3, 0])
+            yaw = np.unwrap([yaw_of(pose) for pose in poses])
+            rate, accel = np.gradient(yaw, t_s), np.gradient(speed, t_s)
+            rows = zip(history.t_us, poses, speed, accel, rate, strict=True)
+            states = [
+                EgoState(int(t), pose, float(v), float(a), float(w)) for t, pose, v, a, w in rows
+            ]
+            states[-1] = observation.ego
         first = int(np.searchsorted(history.t_us, self._sent_us, side="right"))
         new = Trajectory(history.t_us[first:], history.xyz[first:], history.quat[first:])
         self._sent_us = observation.t_us
@@ -270,24 +282,6 @@ def cameras_of(
             "write ?cameras=THEIRS:OURS,...",
         )
     return {a: own[b] for a, b in pairs}
-
-
-def motion_states(history: Trajectory, ego: EgoState) -> list[EgoState]:
-    """Return the state at every pose of a history ``(T,)``: speeds by differences, the last one as
-    it is known.
-    """
-    poses, t_s = se3(history.xyz, history.quat), (history.t_us - history.t_us[0]) * 1e-6
-    if len(history) == 1:
-        return [ego]
-    velocity = np.gradient(history.xyz, t_s, axis=0)
-    speed = np.einsum("ti,ti->t", velocity, poses[:, :3, 0])
-    yaw = np.unwrap([yaw_of(pose) for pose in poses])
-    rate, accel = np.gradient(yaw, t_s), np.gradient(speed, t_s)
-    states = [
-        EgoState(int(t), pose, float(v), float(a), float(w))
-        for t, pose, v, a, w in zip(history.t_us, poses, speed, accel, rate, strict=True)
-    ]
-    return [*states[:-1], ego]
 
 
 def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None) -> tuple[I64, F64]:
