@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.types import F64, I64, Actor, LaneMap, Signal
+from alpasim_plugin.core.types import F64, I64, Actor, LaneMap
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
 from scenarios.ego_path import walk_track
@@ -67,18 +67,15 @@ def place_walkers(
         walked_m = float(np.hypot(*(driven.xyz[row] - start)[:2]))
         begin_us = round((there_s - walked_m / speed_mps) * 1e6)
         if own:
-            begin_us = _red_us(own[-1], round(there_s * 1e6)) + AFTER_RED_US
+            # The last time at which the light has turned red.
+            cycle_us = sum(lasts_us for _, lasts_us in own[-1].phases)
+            turns_us = own[-1].offset_us + cycle_us - own[-1].phases[-1][1]
+            n_cycles = (round(there_s * 1e6) - turns_us) // cycle_us
+            begin_us = turns_us + n_cycles * cycle_us + AFTER_RED_US
         box = SIZES["pedestrian"]
         track = walk_track(start, goal, t_us, begin_us, speed_mps, box)
         walkers.append(Actor(f"walker-{number}", "pedestrian", box, track))
     return walkers
-
-
-def _red_us(signal: Signal, t_us: int) -> int:
-    """Return the last time up to a moment at which a light turned red."""
-    cycle_us = sum(lasts_us for _, lasts_us in signal.phases)
-    turns_us = signal.offset_us + cycle_us - signal.phases[-1][1]
-    return turns_us + (t_us - turns_us) // cycle_us * cycle_us
 
 
 def _ends(ring: F64, heading_rad: float, height_m: float) -> tuple[F64, F64]:

@@ -163,19 +163,16 @@ def _ahead(
         return []
     entered = 0 if link.at_start else len(target.sections) - 1
     if not linked:  # the link may stand in the other road alone
+        back = target.predecessor if link.at_start else target.successor
+        joins = back is not None and (back.kind, back.target) == ("road", road.road_id)
         linked = tuple(
             one.lane_id
             for one in target.sections[entered].lanes
             if lane.lane_id in (one.predecessors if link.at_start else one.successors)
             and driven_along(target, one) == link.at_start
-            and _joins(target, link.at_start, road)
+            and joins
         )
     return [lane_key(target, entered, i) for i in linked]
-
-
-def _joins(target: Road, at_start: bool, road: Road) -> bool:
-    back = target.predecessor if at_start else target.successor
-    return back is not None and (back.kind, back.target) == ("road", road.road_id)
 
 
 def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:

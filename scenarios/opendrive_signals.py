@@ -114,7 +114,15 @@ def _heads(
     heads = []
     for along in _senses(one):
         link = road.successor if along else road.predecessor
-        junction, s_m = f"on road {road.road_id}", _waiting_m(road, one, along)
+        junction = f"on road {road.road_id}"
+        stop_lines = [
+            line.s_m
+            for line in road.signals
+            if line.kind == STOP_LINE
+            and along in _senses(line)
+            and abs(line.s_m - one.s_m) <= STOP_REACH_M
+        ]
+        s_m = min(stop_lines, key=lambda stop_m: abs(stop_m - one.s_m), default=one.s_m)
         if road.junction != "-1":
             junction, s_m = road.junction, 0.0 if along else road.length_m
         elif link is not None and link.kind == "junction":
@@ -159,18 +167,6 @@ def _for_people(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_
 def _senses(one: RoadSignal) -> tuple[bool, ...]:
     """Return whether a signal is for traffic along its road, against it, or both."""
     return {"+": (True,), "-": (False,)}.get(one.orientation, (True, False))
-
-
-def _waiting_m(road: Road, one: RoadSignal, along: bool) -> float:
-    """Return the arc length at which one waits for a light."""
-    lines = [
-        line.s_m
-        for line in road.signals
-        if line.kind == STOP_LINE
-        and along in _senses(line)
-        and abs(line.s_m - one.s_m) <= STOP_REACH_M
-    ]
-    return min(lines, key=lambda s_m: abs(s_m - one.s_m), default=one.s_m)
 
 
 Held = tuple[str, float, float]  # a lane and the signed distances of its borders

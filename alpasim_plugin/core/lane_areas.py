@@ -56,19 +56,16 @@ def ring_area(ring: F64, even_odd: bool = False) -> Any:
     polygon = shapely.polygons(np.ascontiguousarray(ring[:, :2]))
     if shapely.is_valid(polygon):
         return polygon
-    return areal_parts(shapely.make_valid(polygon)) if even_odd else _wound(polygon)
-
-
-def _wound(polygon: Any) -> Any:
-    """Return what the ring of a polygon winds round; by ``make_valid`` (even-odd), what it winds
-    round twice would be a hole.
-    """
+    if even_odd:
+        return areal_parts(shapely.make_valid(polygon))
     faces = shapely.get_parts(
         shapely.polygonize([shapely.node(shapely.get_exterior_ring(polygon))])
     )
     inside = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
-    ring = shapely.get_coordinates(polygon)[None] - inside[:, None]  # (F, N, 2)
-    turn = np.diff(np.unwrap(np.arctan2(ring[..., 1], ring[..., 0]), axis=1)[:, [0, -1]])[:, 0]
+    to_ring = shapely.get_coordinates(polygon)[None] - inside[:, None]  # (F, N, 2)
+    turn = np.diff(np.unwrap(np.arctan2(to_ring[..., 1], to_ring[..., 0]), axis=1)[:, [0, -1]])[
+        :, 0
+    ]
     return areal_parts(shapely.union_all(faces[np.abs(turn) > np.pi]))
 
 

@@ -4,6 +4,7 @@ but lossy.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -144,7 +145,7 @@ class VideoReader:
             else max(1, round(1 / (self.format.rate * self.format.time_base)))
         )
         last: int | None = None
-        for index, frame in enumerate(self._all()):
+        for index, frame in enumerate(itertools.chain([self._first], self._decoded)):
             time = frame.pts if frame.pts is not None else 0 if last is None else last + step
             if last is not None and time <= last:
                 found = f"frame {index} at {float(time * self.format.time_base):.6f} s, not after the one before"
@@ -195,11 +196,6 @@ class VideoReader:
             colour=(int(first.colorspace), int(first.color_primaries), int(first.color_trc)),
             left_out=(*tracks, "sound") if self._container.streams.audio else tuple(tracks),
         )
-
-    def _all(self) -> Iterator[Any]:
-        yield self._first
-        self._first = None
-        yield from self._decoded
 
     def _decode(self) -> Iterator[Any]:
         count = 0
@@ -336,7 +332,13 @@ class VideoWriter:
             image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge"
         )
         if self.count == 0:
-            self._state_format(*even.shape[:2])
+            codec = self._stream.codec_context
+            codec.height, codec.width = even.shape[:2]
+            matrix, primaries, transfer = self._colour
+            codec.colorspace = matrix if matrix in WRITABLE else self._matrix
+            codec.color_primaries, codec.color_trc = primaries, transfer
+            if self._pixel_aspect != 1:
+                codec.sample_aspect_ratio = self._pixel_aspect
         rgb = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
         frame = rgb.reformat(
             format="yuv420p",
@@ -350,15 +352,6 @@ class VideoWriter:
         except (OSError, self._av.FFmpegError) as error:
             raise self._failure(error) from error
         self.count += 1
-
-    def _state_format(self, height: int, width: int) -> None:
-        codec = self._stream.codec_context
-        codec.height, codec.width = height, width
-        matrix, primaries, transfer = self._colour
-        codec.colorspace = matrix if matrix in WRITABLE else self._matrix
-        codec.color_primaries, codec.color_trc = primaries, transfer
-        if self._pixel_aspect != 1:
-            codec.sample_aspect_ratio = self._pixel_aspect
 
     def _failure(self, error: Exception) -> InfrastructureError:
         return InfrastructureError(

@@ -27,7 +27,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.reading import natural_order, real
 from alpasim_plugin.core.reading.images import read_image
-from alpasim_plugin.core.types import F32, U8, Frame
+from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter
 
@@ -405,23 +405,18 @@ def _joined(
         given = dict(zip(roles, row, strict=True))
         timed = given["input"]
         timing.append(timed)
-        alpha = (
-            _alpha(given["opacity"].image, index, readers["opacity"].path)
-            if "opacity" in given
-            else None
-        )
+        alpha = None
+        if "opacity" in given:
+            image = given["opacity"].image
+            sample = image[::8, ::8].astype(np.int16)
+            if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
+                raise InputError(
+                    f"{readers['opacity'].path}: frame {index} of the opacity is coloured",
+                    "give the accumulated opacity as a grey video, white where the input is reliable",
+                )
+            alpha = image[..., 1].astype(np.float32) / np.float32(255)
         sdmap = given["sdmap"].image if "sdmap" in given else None
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
-
-
-def _alpha(image: U8, index: int, path: Path) -> F32:
-    sample = image[::8, ::8].astype(np.int16)
-    if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
-        raise InputError(
-            f"{path}: frame {index} of the opacity is coloured",
-            "give the accumulated opacity as a grey video, white where the input is reliable",
-        )
-    return image[..., 1].astype(np.float32) / np.float32(255)
 
 
 def _lengths_differ(role: str, path: Path, counts: str) -> InputError:

@@ -188,7 +188,11 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObj
     for number, run in enumerate(runs):
         if real(run) in {real(other) for other in runs[:number]}:
             raise InputError(f"{run}: named twice", "Name every run once.")
-    infos = {run: _info_of(run) for run in runs}
+    infos: dict[Path, JsonObject] = {}
+    for run in runs:
+        infos[run] = read_run_json(run)
+        if not os.path.isfile(table_path(run, SUMMARY)):
+            raise InputError(f"The run {run} is not finished.", AGAIN)
     _check_alike(infos)
     first = next(iter(infos.values()))
     table = RolloutTable.of_files([table_path(run, ROLLOUTS) for run in runs])
@@ -222,18 +226,6 @@ def _joined(infos: Mapping[Path, JsonView], metrics: Sequence[str]) -> MetricTab
     for run, info in others:
         known = known.joined(MetricTable.of_run(info), metrics, f"{first[0]} and {run}")
     return known
-
-
-def _info_of(run: Path) -> JsonObject:
-    """Return a run's description.
-
-    Raises:
-        InputError: The run is not finished, or damaged.
-    """
-    info = read_run_json(run)
-    if not os.path.isfile(table_path(run, SUMMARY)):
-        raise InputError(f"The run {run} is not finished.", AGAIN)
-    return info
 
 
 def _check_alike(infos: Mapping[Path, JsonView]) -> None:

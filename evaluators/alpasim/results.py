@@ -372,18 +372,18 @@ def _entry(
         "rollout_id": rollout.of.rollout,
     }
     values = {name: _number(value) for name, value in rollout.values.items()}
-    status = "unscored" if score is None else "pass" if score.passed else "fail"
-    own = {} if score is None else {"progress_score": score.progress_score}
-    return ids | {
-        "status": status,
-        "passed": None if score is None else score.passed,
-        "score": None if score is None else score.score,
-        "failure_reason": None if score is None else score.failure_reason,
-        "score_metrics": None
-        if score is None
-        else {name: (values | own).get(name) for name in shown},
-        "metrics": values | ids,
-    }
+    entry: JsonObject = {"status": "unscored"}
+    entry |= dict.fromkeys(("passed", "score", "failure_reason", "score_metrics"))
+    if score is not None:
+        known = values | {"progress_score": score.progress_score}
+        entry = {
+            "status": "pass" if score.passed else "fail",
+            "passed": score.passed,
+            "score": score.score,
+            "failure_reason": score.failure_reason,
+            "score_metrics": {name: known.get(name) for name in shown},
+        }
+    return ids | entry | {"metrics": values | ids}
 
 
 def _number(value: float | int | None) -> float | int | None:

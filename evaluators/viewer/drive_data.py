@@ -238,7 +238,10 @@ def moments(
         if event.t_us is not None and event.t_s is not None:
             t_ms = place.ms([event.t_us])[0]
             if event.kind == "collision":
-                text += _with_whom(event.t_s, manifest)
+                for contact in manifest.get("contacts") or ():
+                    if abs(float(contact["t_s"]) - event.t_s) <= CONTACT_TOLERANCE_S:
+                        text += f" with {contact['actor_id']}"
+                        break
             text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
         found.append({"t": t_ms, "kind": event.kind, "text": text})
     # An event of the frames, such as a replaced frame, is told once where it goes on.
@@ -254,13 +257,6 @@ def moments(
             ]
         before = now
     return found + began[:MAX_FRAME_EVENTS]
-
-
-def _with_whom(t_s: float, manifest: JsonView) -> str:
-    for contact in manifest.get("contacts") or ():
-        if abs(float(contact["t_s"]) - t_s) <= CONTACT_TOLERANCE_S:
-            return f" with {contact['actor_id']}"
-    return ""
 
 
 def plans_part(flips: Sequence[JsonView], place: Place, by_policy: bool) -> list[JsonObject]:

@@ -157,15 +157,13 @@ def part_digest(
     """
     content = None if settings is None else settings.model_dump(mode="json")
     for name in files:
-        _blank(content, name.split("."))
+        *outer, last = name.split(".")
+        node: Any = content
+        for key in outer:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, dict) and last in node:
+            node[last] = None
     return digest([[code_digest(module) for module in modules], attribute, content, dict(files)])
-
-
-def _blank(content: Any, keys: list[str]) -> None:
-    for key in keys[:-1]:
-        content = content.get(key) if isinstance(content, dict) else None
-    if isinstance(content, dict) and keys[-1] in content:
-        content[keys[-1]] = None
 
 
 ERRORS: dict[str, type[SimrunError]] = {
