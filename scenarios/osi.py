@@ -189,7 +189,22 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
         for pair in one.classification.lane_pairing:
             begin, end = str(pair.antecessor_lane_id.value), str(pair.successor_lane_id.value)
             if begin in lanes and end in lanes and begin != end:
-                lane = _through(str(one.id.value), lanes[begin], lanes[end])
+                # From the end of one lane to the start of another.
+                first = lanes[begin]
+                second = lanes[end]
+                left, right = (
+                    _curve(*edges) for edges in zip(rails(first), rails(second), strict=True)
+                )
+                lane = Lane(
+                    f"{one.id.value!s}.{first.lane_id}.{second.lane_id}",
+                    (left + right) / 2,
+                    left,
+                    right,
+                    successors=(second.lane_id,),
+                    left_mark_type="none",
+                    right_mark_type="none",
+                    is_intersection=True,
+                )
                 after[begin].append(lane.lane_id)
                 lanes[lane.lane_id] = lane
     out = {}
@@ -264,21 +279,6 @@ def _mark_type(border: Any) -> LaneMarkType:
     if border.classification.type in (DASHED, DOTS):
         return "dashed_yellow" if yellow else "dashed_white"
     return "none"
-
-
-def _through(area: str, begin: Lane, end: Lane) -> Lane:
-    """Return the lane through an intersection from the end of one lane to the start of another."""
-    left, right = (_curve(*edges) for edges in zip(rails(begin), rails(end), strict=True))
-    return Lane(
-        f"{area}.{begin.lane_id}.{end.lane_id}",
-        (left + right) / 2,
-        left,
-        right,
-        successors=(end.lane_id,),
-        left_mark_type="none",
-        right_mark_type="none",
-        is_intersection=True,
-    )
 
 
 def _curve(begin: F64, end: F64) -> F64:

@@ -59,7 +59,12 @@ def list_names(
         for name, text in names("fixer").items():
             known[name] = f"3dgs, repaired by the fixer {name}: {text}"
     elif kind == "fixers":
-        known = _fixers()
+        known = {}
+        for fixer, help_text in names("fixer").items():
+            spec = unidentified("fixer", fixer)
+            factory = load(spec.target, "fixer")
+            help_text = getattr(factory, "help", {}).get(fixer, help_text)
+            known[fixer] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
     elif kind == "policies":
         known = names("policy")
     elif kind == "scenarios":
@@ -77,14 +82,3 @@ def list_names(
         known = described()
     width = max((len(name) for name in known), default=0)
     show(as_json, known, *(f"{name:<{width}}  {text}" for name, text in known.items()))
-
-
-def _fixers() -> dict[str, str]:
-    """Return every fixer with its help and whose weights it has."""
-    listed = {}
-    for name, help_text in names("fixer").items():
-        spec = unidentified("fixer", name)
-        factory = load(spec.target, "fixer")
-        help_text = getattr(factory, "help", {}).get(name, help_text)
-        listed[name] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
-    return listed

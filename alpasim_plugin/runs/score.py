@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,13 @@ def execute_score(
     key = digest(facts)[:12]
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
-        _check_key(root, key)
+        held = key
+        with suppress(InputError):  # a damaged run.json is written again
+            held = str(read_run_json(root)["key"])
+        if held != key:
+            raise InputError(
+                f"{root}: the folder holds other results (key {held})", "Name another --out."
+            )
         unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
         more: JsonObject = {}
@@ -102,18 +109,6 @@ def execute_score(
         more["pool"] = pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None)
         summary = finish_run(root, manifests, more | {"exit_code": code})
     return ScoreResult(root, summary, code)
-
-
-def _check_key(root: Path, key: str) -> None:
-    """Refuse a folder that holds other results; a damaged run.json is written again."""
-    try:
-        held = str(read_run_json(root)["key"])
-    except InputError:
-        return
-    if held != key:
-        raise InputError(
-            f"{root}: the folder holds other results (key {held})", "Name another --out."
-        )
 
 
 def _aggregate(

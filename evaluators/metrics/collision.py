@@ -165,14 +165,9 @@ def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
     """Return at which steps something touches the ego that was found standing in a
     reconstruction.
     """
+    stands = np.array([name.startswith(STANDING_ID) for name in actors.ids], dtype=np.bool_)
     touched = np.zeros(count, dtype=np.bool_)
-    touched[
-        [
-            k
-            for k, index in zip(step, actor, strict=True)
-            if actors.ids[index].startswith(STANDING_ID)
-        ]
-    ] = True
+    touched[step[stands[actor]]] = True
     return touched
 
 

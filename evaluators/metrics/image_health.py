@@ -6,8 +6,6 @@ image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from alpasim_plugin.core.image_metrics import is_black
@@ -48,19 +46,8 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     for image in images:
         black[image.end_us] = black.get(image.end_us, False) or is_black(decode(image))
     t_us = np.array(sorted(black), dtype=np.int64)
-    stuck = frozen_times(images, rollout)
-    return [
-        series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], dtype=np.float64)),
-        series("img_is_frozen", t_us, np.array([int(t) in stuck for t in t_us], dtype=np.float64)),
-    ]
-
-
-def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]:
-    """Return the times of images that equal the one before from the same camera, byte for byte,
-    though the ego moved more than 0.1 m.
-    """
     before: dict[str, LoggedImage] = {}
-    frozen: set[int] = set()
+    stuck: set[int] = set()
     for image in sorted(images, key=lambda image: image.end_us):
         last = before.get(image.camera)
         if last is None or last.data != image.data:
@@ -68,13 +55,16 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
             continue
         # Counted from the first of the equal images, so that a creeping car leaves it behind as
         # well.
-        ends = [
+        moved = [
             np.interp([last.end_us, image.end_us], rollout.ego.t_us, rollout.ego.xyz[:, k])
             for k in (0, 1)
         ]
-        if float(np.hypot(*(np.diff(e)[0] for e in ends))) > FROZEN_MOVE_M:
-            frozen.add(image.end_us)
-    return frozen
+        if float(np.hypot(*(np.diff(e)[0] for e in moved))) > FROZEN_MOVE_M:
+            stuck.add(image.end_us)
+    return [
+        series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], dtype=np.float64)),
+        series("img_is_frozen", t_us, np.array([int(t) in stuck for t in t_us], dtype=np.float64)),
+    ]
 
 
 FACTORY = with_preset(evaluate_images)

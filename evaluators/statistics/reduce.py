@@ -125,7 +125,13 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
         )
     for name, parts in _DERIVED_FLAGS.items():
         if name not in table and all(part in table for part in parts):
-            table[name] = _any_of(name, [table[part] for part in parts])
+            # 1 where any is known to be 1, unknown where none is and one is unknown.
+            flags = [table[part] for part in parts]
+            fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in flags], axis=0)
+            known = fired | np.all([part.valid for part in flags], axis=0)
+            value = np.where(known, fired.astype(np.float64), np.nan)
+            reason = "" if bool(known.all()) else next(part.reason for part in flags if part.reason)
+            table[name] = MetricSeries(METRICS[name], flags[0].t_us, value, known, reason)
     first_us, last_us, ledger = _window(table, chosen)
     # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have
     # it.
@@ -157,17 +163,6 @@ _DERIVED_FLAGS = {
     "offroad_or_collision": ("collision_any", "offroad"),
     "offroad_or_collision_at_fault": ("collision_at_fault", "offroad"),
 }
-
-
-def _any_of(name: str, parts: Sequence[MetricSeries]) -> MetricSeries:
-    """Combine flags on one time line: 1 where any is known to be 1, unknown where none is and one
-    is unknown.
-    """
-    fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in parts], axis=0)
-    known = fired | np.all([part.valid for part in parts], axis=0)
-    value = np.where(known, fired.astype(np.float64), np.nan)
-    reason = "" if bool(known.all()) else next(part.reason for part in parts if part.reason)
-    return MetricSeries(METRICS[name], parts[0].t_us, value, known, reason)
 
 
 def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, Ledger]:
