@@ -190,17 +190,14 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
             begin, end = str(pair.antecessor_lane_id.value), str(pair.successor_lane_id.value)
             if begin in lanes and end in lanes and begin != end:
                 # From the end of one lane to the start of another.
-                first = lanes[begin]
-                second = lanes[end]
-                left, right = (
-                    _curve(*edges) for edges in zip(rails(first), rails(second), strict=True)
-                )
+                sides = zip(rails(lanes[begin]), rails(lanes[end]), strict=True)
+                left, right = (_curve(*edges) for edges in sides)
                 lane = Lane(
-                    f"{one.id.value!s}.{first.lane_id}.{second.lane_id}",
+                    f"{one.id.value}.{begin}.{end}",
                     (left + right) / 2,
                     left,
                     right,
-                    successors=(second.lane_id,),
+                    successors=(end,),
                     left_mark_type="none",
                     right_mark_type="none",
                     is_intersection=True,

@@ -200,7 +200,18 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     factory = load(target, kind)
     if address is not None and hasattr(factory, "check_address"):
         factory.check_address(address)
-    settings = _settings(kind, plain, factory, (*at_steps, *overrides))
+    overrides = (*at_steps, *overrides)
+    model: Any = getattr(factory, "settings_model", None)
+    if model is None and kind == "fixer":
+        model = load("alpasim_plugin.fixers.settings:FixerSettings", kind)
+    if model is None:
+        settings = None
+    elif hasattr(model, "load"):
+        settings = model.load(plain, overrides)
+    else:
+        settings = validate(
+            model, apply_overrides(Document({}, {}, f"the defaults of {plain}"), overrides)
+        )
     return PartSpec(kind, name, target, settings, address=address)
 
 
@@ -398,19 +409,3 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
         is_blind=spec.kind == "policy" and not getattr(factory, "sensors", True),
         missing=declared.missing,
     )
-
-
-def _settings(
-    kind: KindName, name: str, factory: Any, overrides: Sequence[str]
-) -> BaseModel | None:
-    """Return a part's validated settings: its defaults (for a fixer ``configs/fixers/NAME.yaml``)
-    with the overrides on top.
-    """
-    model: Any = getattr(factory, "settings_model", None)
-    if model is None and kind == "fixer":
-        model = load("alpasim_plugin.fixers.settings:FixerSettings", kind)
-    if model is None:
-        return None
-    if hasattr(model, "load"):
-        return model.load(name, overrides)
-    return validate(model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides))

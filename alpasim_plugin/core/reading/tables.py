@@ -95,26 +95,21 @@ def check_columns(
     Raises:
         InputError: It does; the columns that are there are named.
     """
-    names = table.column_names
-    for name, kind in columns.items():
-        if names.count(name) != 1:
-            found = "several columns" if name in names else "no column"
-            raise InputError(f"{where}: {found} {name!r} among {', '.join(names[:12])}", do_this)
-        type_ = table.schema.field(name).type
-        if not _is(type_, kind):
-            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
-
-
-def _is(type_: Any, kind: Kind) -> bool:
     import pyarrow.types as t
 
-    if t.is_dictionary(type_):
-        type_ = type_.value_type
     tests = {
         "text": (t.is_string, t.is_large_string),
         "integer": (t.is_integer,),
         "number": (t.is_integer, t.is_floating),
         "flag": (t.is_boolean,),
     }
-    # a column of nothing but nulls has a type of its own
-    return any(test(type_) for test in (t.is_null, *tests[kind]))
+    names = table.column_names
+    for name, kind in columns.items():
+        if names.count(name) != 1:
+            found = "several columns" if name in names else "no column"
+            raise InputError(f"{where}: {found} {name!r} among {', '.join(names[:12])}", do_this)
+        type_ = table.schema.field(name).type
+        held = type_.value_type if t.is_dictionary(type_) else type_
+        # A column of nothing but nulls has a type of its own.
+        if not any(test(held) for test in (t.is_null, *tests[kind])):
+            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
