@@ -240,7 +240,7 @@ def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
 def _length(x: F64, rows: F64, used: Bool) -> float:
     """Return the metres of road over which at least one used point lies."""
     at = x[used]
-    is_new = np.ones(len(at), dtype=bool)
+    is_new = np.ones(len(at), bool)
     np.not_equal(at[1:], at[:-1], out=is_new[1:])
     return float(rows[used][is_new].sum())
 

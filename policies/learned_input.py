@@ -25,7 +25,7 @@ SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther 
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
 MEAN, STD = 115.0, 64.0  # grey levels
 _RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+_GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
@@ -149,7 +149,7 @@ def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0, view: View = F
 
 def network_input(now: U8, before: U8) -> F32:
     """Return the network's input ``(4, H, W)`` from a view now and before, ``(H, W, 3)``."""
-    out = np.empty((CHANNELS, *now.shape[:2]), dtype=np.float32)
+    out = np.empty((CHANNELS, *now.shape[:2]), np.float32)
     out[:3] = now.transpose(2, 0, 1)
     out[3] = before.astype(np.float32) @ _GREY
     return (out - np.float32(MEAN)) / np.float32(STD)

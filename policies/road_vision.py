@@ -196,7 +196,7 @@ class RidgeFilter:
         image.
         """
         total, n = _running_sums(value), value.shape[1]
-        out = np.zeros(value.shape, dtype=np.float32)
+        out = np.zeros(value.shape, np.float32)
         for rows, half, gap, flank in self._runs:
             reach = gap + flank
             if 2 * reach >= n:
@@ -301,7 +301,7 @@ def _cells_around(
     """Return the cells ``(R, C)`` within `BAR_HALF_M` of bars, on rows where they make a
     crosswalk.
     """
-    mask = np.zeros(shape, dtype=np.uint8)
+    mask = np.zeros(shape, np.uint8)
     if len(rows):
         count = np.bincount(rows, minlength=shape[0])
         high, low = np.full(shape[0], -np.inf), np.full(shape[0], np.inf)

@@ -193,7 +193,7 @@ def _trajectory(path: Path, track: JsonObject) -> Trajectory:
 
 def _rows(values: Any, width: int = 3) -> F64:
     """Return rows ``(N, width)``; rows of different lengths are an error of shape."""
-    return np.array(values, dtype=np.float64).reshape(-1, width)
+    return np.array(values, np.float64).reshape(-1, width)
 
 
 def _map_of(document: JsonObject) -> LaneMap:
@@ -209,7 +209,7 @@ def _map_of(document: JsonObject) -> LaneMap:
 def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightField:
     path = folder / GROUND_FILE
     files.note_bytes(GROUND_FILE, files.read_bytes(path))
-    z = np.array(open_npy(path, DO_THIS), dtype=np.float64)
+    z = np.array(open_npy(path, DO_THIS), np.float64)
     if z.ndim != 2 or min(z.shape) < 2:
         raise InputError(f"{path}: heights of shape {z.shape}", DO_THIS)
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], z)

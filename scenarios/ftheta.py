@@ -138,7 +138,7 @@ def mount(sensor: JsonObject) -> F64:
     turns = Rotation.from_euler("xyz", [nominal["roll-pitch-yaw"], turn], degrees=True).as_matrix()
     out = np.eye(4)
     out[:3, :3] = turns[0] @ turns[1] @ FLU_FROM_CAMERA
-    out[:3, 3] = np.array(nominal["t"], dtype=np.float64) + np.array(shift, dtype=np.float64)
+    out[:3, 3] = np.array(nominal["t"], np.float64) + np.array(shift, np.float64)
     return out
 
 

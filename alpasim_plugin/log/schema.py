@@ -325,7 +325,7 @@ def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
     """
     # Each attribute access makes a Python object, so vec and quat are fetched once a pose.
     rows = [(v.x, v.y, v.z, q.w, q.x, q.y, q.z) for v, q in ((p.vec, p.quat) for p in poses)]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    table = np.array(rows, np.float64).reshape(-1, 7)
     xyz, quat = table[:, :3], table[:, 3:]
     square = np.sum(quat * quat, axis=1)
     bad = ~(np.isfinite(xyz).all(axis=1) & (np.abs(square - 1.0) <= QUAT_NORM_TOLERANCE))
@@ -355,7 +355,7 @@ def increasing_times(times: Sequence[int], what: str) -> np.ndarray[tuple[int], 
     Raises:
         InputError: They do not increase strictly, or exceed 63 bits.
     """
-    t_us = np.array(times, dtype=np.uint64)
+    t_us = np.array(times, np.uint64)
     late = np.flatnonzero((t_us[1:] <= t_us[:-1]) | (t_us[1:] > np.iinfo(np.int64).max)) + 1
     if len(late):
         i = int(late[0])

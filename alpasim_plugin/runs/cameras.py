@@ -81,7 +81,7 @@ def make_cadence(
         return Cadence(
             np.array(
                 [tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last],
-                dtype=np.int64,
+                np.int64,
             )
         )
     first, then = block.first, block.then

@@ -91,9 +91,7 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     enough = len(t_us) > nuplan.LEAST_INSTANTS
     moves = nuplan.motion(drive.ego) if enough else None
     against = (
-        drive.against_m >= nuplan.AGAINST_M
-        if drive.has_map
-        else np.zeros(len(t_us), dtype=np.bool_)
+        drive.against_m >= nuplan.AGAINST_M if drive.has_map else np.zeros(len(t_us), np.bool_)
     )
     margin_m, impact_mps = rss_margin_m(drive.ego, drive.tracks), np.full(len(t_us), np.nan)
     for hit in drive.hits:

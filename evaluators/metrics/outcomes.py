@@ -227,7 +227,7 @@ def _slow(
     expected = np.minimum(fastest, usual)
     stands = engaged & (v < STAND_MPS)
     slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
-    ahead = np.zeros(len(t_us), dtype=np.bool_)
+    ahead = np.zeros(len(t_us), np.bool_)
     asked = np.flatnonzero(
         _recently((stands | slow)[::-1], -seconds[::-1])[::-1]
     )  # what comes before a slow step may excuse it
@@ -275,7 +275,7 @@ def actor_ahead(
     """
     origin = origin_of(rollout.ego_log, preset)
     actors = ActorTable(rollout, preset, origin)
-    out = np.zeros(len(steps), dtype=np.bool_)
+    out = np.zeros(len(steps), np.bool_)
     if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
         return out
     way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[steps, :2] - origin[:2]

@@ -60,7 +60,7 @@ def moving(path: F64) -> I64:
     """
     away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
     if not (away[0].any() and away[1].any()):
-        return np.zeros(1, dtype=np.int64)
+        return np.zeros(1, np.int64)
     first, last = int(np.argmax(away[0])), len(path) - 1 - int(np.argmax(away[1][::-1]))
     return np.concatenate([[0], np.arange(first, last + 1), [len(path) - 1]])
 

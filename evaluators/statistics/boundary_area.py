@@ -96,7 +96,7 @@ def claims_of(failed: Mapping[Point, bool]) -> list[Claims]:
     least.
     """
     shape = AREA_STEPS + 1, AREA_STEPS + 1
-    outcomes = np.zeros((2, *shape), dtype=bool)
+    outcomes = np.zeros((2, *shape), bool)
     for point, has_failed in failed.items():
         outcomes[int(has_failed)][point] = True
     found = []
@@ -176,7 +176,7 @@ def _deciding_point(claims: Claims, asked: Sequence[Point], skipped: set[Point])
     """
     fails, holds = claims.squares()
     is_open = ~(fails | holds)
-    worth = np.zeros((2, AREA_STEPS + 1, AREA_STEPS + 1), dtype=int)  # if it fails, if it holds
+    worth = np.zeros((2, AREA_STEPS + 1, AREA_STEPS + 1), int)  # if it fails, if it holds
     worth[0, 1:, 1:] = is_open.cumsum(axis=0).cumsum(axis=1)
     worth[1, :-1, :-1] = is_open[::-1, ::-1].cumsum(axis=0).cumsum(axis=1)[::-1, ::-1]
     decided = claims.fails | claims.holds | _marked(claims, skipped)

@@ -81,7 +81,7 @@ def upper_bound(values: F64, most: float) -> float:
     # The different values, with the worst as one more. Many are put into bins that keep their mean:
     # one between two edges counts in shares for both, which widens the bounds and never narrows.
     distinct, counts = np.unique(
-        np.append(np.asarray(values, dtype=np.float64) / scale, most / scale), return_counts=True
+        np.append(np.asarray(values, np.float64) / scale, most / scale), return_counts=True
     )
     counts = counts.astype(np.float64)
     if len(distinct) > BINS:
@@ -110,7 +110,7 @@ def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
         >>> [round(bound, 3) for bound in mean_bounds(np.array([0.0] * 57 + [1.0] * 3), -1.0, 1.0)]
         [-0.028, 0.139]
     """
-    x = np.clip(np.asarray(values, dtype=np.float64), least, most)
+    x = np.clip(np.asarray(values, np.float64), least, most)
     return -upper_bound(-x, -least), upper_bound(x, most)
 
 

@@ -176,9 +176,9 @@ def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> JsonOb
     steps = [row.get("censored") or {} for row in side.rows]
     cut = np.array(
         [sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps],
-        dtype=np.float64,
+        np.float64,
     )
-    scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], dtype=np.float64)
+    scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], np.float64)
     for name in names:
         values = side.raw(name)
         absent = np.flatnonzero(side.ok & ~np.isfinite(values))

@@ -100,7 +100,7 @@ def decode_image(data: bytes, where: Path | str, do_this: str = GIVE, flag: int 
 
     check_image(data, where, do_this)
     with parsing(where, do_this, "no readable image"):
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flag)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
     if image is None:
         raise InputError(f"{where}: {len(data)} bytes that do not decode", do_this)
     return image

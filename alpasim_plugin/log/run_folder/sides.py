@@ -104,17 +104,17 @@ class Side:
         cells = tuple(sorted(set(keys)))
         number = {cell: i for i, cell in enumerate(cells)}
         _, scene = np.unique([scene for _, scene, _ in cells], return_inverse=True)
-        cell = np.array([number[key] for key in keys], dtype=np.int64)
+        cell = np.array([number[key] for key in keys], np.int64)
         return cls(ok, cells, cell, scene, raw, reason, failure, rows)
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Side:
         """Lay out rows of one renderer, flat (``rollouts.parquet``) or nested (manifests)."""
         keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
-        ok = np.array([row.get("status", "ok") == "ok" for row in rows], dtype=bool)
+        ok = np.array([row.get("status", "ok") == "ok" for row in rows], bool)
 
         def raw(metric: str) -> F64:
-            values = np.array([value_of(row, metric) for row in rows], dtype=np.float64)
+            values = np.array([value_of(row, metric) for row in rows], np.float64)
             return np.where(ok, values, np.nan)
 
         return cls.laid_out(
@@ -133,7 +133,7 @@ class Side:
         if other not in self._places:
             number = {cell: i for i, cell in enumerate(other.cells)}
             places = [number.get(cell, -1) for cell in self.cells]
-            self._places[other] = np.array(places, dtype=np.int64)
+            self._places[other] = np.array(places, np.int64)
         return self._places[other]
 
     @cached_property
@@ -205,7 +205,7 @@ class RolloutTable:
         self.n_rollouts = len(self._keys)
         self.renderers = list(dict.fromkeys(keys["renderer"]))
         self.policies = list(dict.fromkeys(keys["policy"]))
-        self._ok = np.array(keys["status"], dtype=object) == "ok"
+        self._ok = np.array(keys["status"], object) == "ok"
         self._failure_class = [None] * self.n_rollouts
         if "failure_class" in columns:
             self._failure_class = self._read(["failure_class"])[0].to_pylist()
