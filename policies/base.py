@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
@@ -191,7 +191,7 @@ def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
     step = np.gradient(line, axis=0)
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
-    return line + left_m * np.column_stack([-step[:, 1], step[:, 0]]) / length[:, None]
+    return line + left_m * left_of(step) / length[:, None]
 
 
 def curve_speeds(path: Path, cruise_mps: float) -> F64:

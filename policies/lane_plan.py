@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample
 from alpasim_plugin.core.types import F64
 from policies.base import Path, make_path
 from policies.lane_filter import LaneState
@@ -119,7 +119,7 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
         correction = np.where(
             beyond, correction[last] * np.exp(-(np.arange(len(x)) - last) / 8.0), correction
         )
-    normal = np.column_stack([-np.sin(heading), np.cos(heading)])
+    normal = left_of(direction_of(heading))
     # The correction is measured along the rig's y axis; along the path's normal it is shorter by
     # the cosine.
     fused = points + normal * (correction * np.cos(heading))[:, None]
@@ -212,7 +212,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     shift_m, faster = (noise[1:] - noise[0]).T[:, :, None]
     shift_m = sigma_m * shift_m  # (N_SAMPLES - 1, 1)
     lines = np.empty((len(shift_m), len(s), 3))
-    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
+    lines[..., :2] = xy + (shift_m * ramp)[..., None] * left_of(direction_of(yaw))
     lines[..., 2] = yaw + np.arctan(shift_m * ramp_slope)
     return [
         np.column_stack([xy, yaw]),

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import direction_of
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
@@ -176,7 +177,7 @@ class Learned(Policy):
         xy = np.concatenate(
             [
                 np.zeros((1, 2)),
-                np.cumsum(np.column_stack([np.cos(middle), np.sin(middle)]), axis=0),
+                np.cumsum(direction_of(middle), axis=0),
             ]
         )
         over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight beyond the last knot

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, rectangle_corners
+from alpasim_plugin.core.geometry import direction_of, interpolate, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import ROAD_M
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
@@ -198,7 +198,7 @@ def _footprints(track: Trajectory, t_us: I64, box: Box, ahead_m: float = 0.0) ->
     """
     poses = interpolate(track, t_us)
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    xy = poses[:, :2, 3] + ahead_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    xy = poses[:, :2, 3] + ahead_m * direction_of(yaw)
     return shapely.polygons(rectangle_corners(xy, yaw, np.array([[box.length_m, box.width_m]])))
 
 

@@ -69,7 +69,7 @@ def check_mounts(drawn: Drawn, cameras: Sequence[CameraSpec], vehicle: Vehicle) 
     """
     box = vehicle.box
     centre = np.array([vehicle.rear_axle_to_centre_m, 0.0, box.height_m / 2])
-    half = np.array([box.length_m, box.width_m, box.height_m]) / 2
+    half = np.array(box.size_m) / 2
     for i, camera in enumerate(cameras):
         outside = np.abs(camera.T_rig_camera[:3, 3] - centre) - half  # along each axis, metres
         deep_m = -float(outside.max())

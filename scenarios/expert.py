@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import quat_from_yaw, yaw_from_quat
+from alpasim_plugin.core.geometry import direction_of, quat_from_yaw, yaw_from_quat
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -394,7 +394,7 @@ def _predicted(
         heading = heading.reshape(at.shape)
         xy.append(points[:, :2].reshape(*at.shape, 2))
         yaw.append(heading)
-        velocity.append(v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1))
+        velocity.append(v[:, None] * direction_of(heading))
         present.append(at <= lines.length_m)
     return PredictedBodies(
         np.concatenate(xy, axis=1),

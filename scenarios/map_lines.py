@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, densify, matrix_from_quat
+from alpasim_plugin.core.geometry import arc_lengths, densify, left_of, matrix_from_quat
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.world.ground import flat, from_points, height_at
@@ -195,7 +195,7 @@ def _beside(centre: F64, left_m: float) -> F64:
     along = np.gradient(centre[:, :2], axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     out = centre.copy()
-    out[:, :2] += left_m * np.column_stack([-along[:, 1], along[:, 0]])
+    out[:, :2] += left_m * left_of(along)
     return out
 
 

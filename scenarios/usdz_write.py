@@ -164,10 +164,9 @@ def _rig(scenario: Scenario, cameras: Mapping[str, CameraSpec]) -> JsonObject:
 def rig_box(vehicle: Vehicle) -> JsonObject:
     """Return the ego's box in the rig, as ``rig_trajectories.json`` holds it."""
     box = vehicle.box
-    size = [box.length_m, box.width_m, box.height_m]
     return {
         "centroid": [vehicle.rear_axle_to_centre_m, 0.0, box.height_m / 2],
-        "dim": size,
+        "dim": list(box.size_m),
         "rot": [0.0, 0.0, 0.0],
     }
 

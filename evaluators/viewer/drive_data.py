@@ -182,7 +182,7 @@ def user_data(actor: Actor, place: Place) -> JsonObject:
     poses = set(zip(way["x"], way["y"], way["a"], strict=True))
     if len(poses) == 1:  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
-    size = [round(100 * side) for side in (box.length_m, box.width_m, box.height_m)]
+    size = [round(100 * side) for side in box.size_m]
     return {"id": actor.actor_id, "label": actor.label or "other", "size": size, **way}
 
 
