@@ -15,7 +15,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
-from evaluators import paired
+from evaluators import paired, rollout_values, score
 
 DT_US = 100_000
 CAR = Box(4.5, 1.8, 1.5)
@@ -29,9 +29,9 @@ def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None):
     given.
     """
     n = n or (len(t_us) if t_us is not None else max(np.size(a) for a in (x, y, yaw, z)))
-    t = np.arange(n, dtype=np.int64) * DT_US if t_us is None else np.asarray(t_us, dtype=np.int64)
-    xyz = np.stack([np.broadcast_to(np.asarray(a, dtype=float), n) for a in (x, y, z)], axis=1)
-    return Trajectory(t, xyz, quat_from_yaw(np.broadcast_to(np.asarray(yaw, dtype=float), n)))
+    t = np.arange(n, dtype=np.int64) * DT_US if t_us is None else np.asarray(t_us, np.int64)
+    xyz = np.stack([np.broadcast_to(np.asarray(a, float), n) for a in (x, y, z)], axis=1)
+    return Trajectory(t, xyz, quat_from_yaw(np.broadcast_to(np.asarray(yaw, float), n)))
 
 
 def car(name, poses, box=CAR):
@@ -98,6 +98,16 @@ TWO_LANES = road_map(
 
 def by_name(series):
     return {one.name: one for one in series}
+
+
+def scored(log, lane_map=TWO_LANES, preset="strict"):
+    """Return the series of a log by name."""
+    return by_name(score(log, scene(lane_map, log), preset))
+
+
+def values_of(log, lane_map=TWO_LANES, preset="strict"):
+    """Return the value of each metric over a log."""
+    return rollout_values(score(log, scene(lane_map, log), preset), preset)
 
 
 def base_pairs(rows, baseline, bases):

@@ -145,7 +145,7 @@ class Tally:
         self.logs, self.values, self.equal, self.largest = 0, 0, 0, 0.0
 
     def add(self, got, want):
-        got, want = np.asarray(got, dtype=float), np.asarray(want, dtype=float)
+        got, want = np.asarray(got, float), np.asarray(want, float)
         same = (got == want) | (np.isnan(got) & np.isnan(want))
         off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
         self.logs, self.values, self.equal = (
@@ -176,7 +176,7 @@ def parity_table(root):
         numbers = {key: value for key, value in over_sweeps(reduced).items() if key in want}
         assert set(numbers) == set(want) - {"run_uuid", "run_name"}
         both = [(numbers[key], want[key]) for key in numbers if want[key] is not None]
-        tables[f"over sweeps, {name}"].add(*np.array(both, dtype=float).T)
+        tables[f"over sweeps, {name}"].add(*np.array(both, float).T)
         rows = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())[
             "rollouts"
         ]

@@ -204,7 +204,7 @@ def test_unprocessed_steps_keep_order_and_a_row_for_an_empty_metric():
     one = rollout("a", n=2)
     empty = replace(
         one,
-        series=(*one.series, series("plan_deviation", np.zeros(0, dtype=np.int64), np.zeros(0))),
+        series=(*one.series, series("plan_deviation", np.zeros(0, np.int64), np.zeros(0))),
     )
     rows = metrics_unprocessed_table([empty]).to_pylist()
     assert [row["timestamps_us"] for row in rows if row["name"] == "progress"] == [0, 100_000]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Trajectory
-from evaluators import METRICS, PRESETS, preset, reduce_rollout, rollout_values, score
+from evaluators import METRICS, PRESETS, preset, reduce_rollout, score
 from evaluators.alpasim import (
     EvalSettings,
     ScoredRollout,
@@ -20,7 +20,16 @@ from evaluators.alpasim import (
 )
 from evaluators.alpasim.settings import Modifiers, SceneScoreSettings
 from evaluators.metrics.route import from_corridor, to_path
-from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import (
+    TWO_LANES,
+    by_name,
+    lane,
+    road_map,
+    rollout,
+    scene,
+    track,
+    values_of,
+)
 from tests.evaluators.golden import scored
 
 NOW, LATER = PRESETS["alpasim"], PRESETS["alpasim@6f1029c"]
@@ -40,7 +49,7 @@ RECORDED = track(np.linspace(0.0, 50.0, 51), 0.0)
     ],
 )
 def test_distance_to_the_side_ignores_what_was_driven_past_the_end(path, at, away_m):
-    line, point = np.array(path, dtype=float), np.array([at])
+    line, point = np.array(path, float), np.array([at])
     distance_m, s = to_path(line, point)
     assert from_corridor(line, s, point, distance_m) == pytest.approx([away_m])
 
@@ -51,10 +60,7 @@ def drift(y_end, x_end=50.0):
 
 
 def values(log, chosen, road=TWO_LANES):
-    return {
-        name: one.value
-        for name, one in rollout_values(score(log, scene(road, log), chosen), chosen).items()
-    }
+    return {name: one.value for name, one in values_of(log, road, chosen).items()}
 
 
 def test_leaving_the_path_to_the_side_is_a_fault_and_passing_its_end_is_none():

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.types import Box
-from evaluators import PRESETS, score
+from evaluators import PRESETS
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, find_contacts
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
-from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.eval_build import CAR, car, rollout, scored, track
 from tests.evaluators.reference_rules import contacts_by_step
 from tests.examples import examples
 
@@ -41,7 +41,7 @@ def assert_twins_agree(log, preset=PAPER, gap_tol_m=1e-9):
 
 def flags(log):
     """Return the steps of the flags that are raised at any."""
-    found = by_name(score(log, scene(TWO_LANES, log), "paper"))
+    found = scored(log, preset="paper")
     steps = {
         name: np.flatnonzero(found[f"collision_{name}"].value).tolist()
         for name in ("any", "front", "rear", "lateral", "at_fault")
@@ -124,7 +124,7 @@ def test_the_gap_is_zero_exactly_where_there_is_contact():
 
 def test_without_actors_the_gap_is_invalid_with_a_reason_and_no_flag_is_set():
     log = rollout(track([0.0, 1.0], 0.0))
-    found = by_name(score(log, scene(TWO_LANES, log), "paper"))
+    found = scored(log, preset="paper")
     gap = found["min_distance_to_obstacle_m"]
     assert not gap.valid.any()
     assert np.isnan(gap.value).all()
@@ -137,7 +137,7 @@ def test_an_actor_counts_only_between_its_first_and_last_logged_time():
     t = np.array([200_000, 300_000])
     log = rollout(track(0.0, 0.0, n=6), [car("ghost", track(0.0, 0.0, t_us=t))])
     assert flags(log)["any"] == [2, 3]
-    gap = by_name(score(log, scene(TWO_LANES, log), "paper"))["min_distance_to_obstacle_m"]
+    gap = scored(log, preset="paper")["min_distance_to_obstacle_m"]
     assert gap.valid.tolist() == [False, False, True, True, False, False]
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Lane
-from evaluators import PRESETS, score
+from evaluators import PRESETS
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
 from evaluators.metrics.road import Road
-from tests.evaluators.eval_build import by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import lane, road_map, rollout, scene, scored, track
 from tests.evaluators.reference_rules import road_by_step
 from tests.examples import examples
 
@@ -197,7 +197,7 @@ def test_a_closed_ring_is_one_lane_without_a_border_where_it_begins(clockwise):
     way = arc(30.0)
     log = rollout(track(way[:, 0], way[:, 1], turn + np.sign(turn[-1]) * np.pi / 2))
     one, two = (
-        by_name(score(log, scene(road_map(*lanes), log)))["offroad_margin_m"].value
+        scored(log, road_map(*lanes))["offroad_margin_m"].value
         for lanes in ([ring("a")], [ring("a", slice(0, 101)), ring("b", slice(100, 201))])
     )
     assert one.min() > 0.7

@@ -8,12 +8,8 @@ import pytest
 from alpasim_plugin.core.types import Signal
 from evaluators import reduce_rollout, score
 from evaluators.metrics.motion import safe_distance_m
-from tests.evaluators.eval_build import TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, scored, track
 from tests.evaluators.test_benchmarks import CRUISE, N, braking
-
-
-def scored(log, preset="strict"):
-    return by_name(score(log, scene(TWO_LANES, log), preset))
 
 
 def test_a_hard_stop_that_touches_nothing_is_an_event_with_its_time():
@@ -69,7 +65,7 @@ def test_driving_against_the_lane_is_the_wrong_way_and_alpasims_preset_has_none_
     log = rollout(track(CRUISE[::-1], 0.0, yaw=np.pi))
     assert scored(log)["wrong_way"].value.max() == 1.0
     assert scored(rollout(track(CRUISE, 0.0)))["wrong_way"].value.max() == 0.0
-    assert not {"hard_brake", "wrong_way"} & set(scored(log, "alpasim"))
+    assert not {"hard_brake", "wrong_way"} & set(scored(log, preset="alpasim"))
 
 
 def signalled(*phases, offset_us=0, heading_rad=0.0, y=0.0, z=0.0):
@@ -80,8 +76,8 @@ def signalled(*phases, offset_us=0, heading_rad=0.0, y=0.0, z=0.0):
 
 def ran_red(lane_map, y=0.0):
     log = rollout(track(CRUISE, y))  # 8 m/s; the front is at the line after 3.4 s
-    one = by_name(score(log, scene(lane_map, log), "strict"))["red_light"]
-    navsim = by_name(score(log, scene(lane_map, log), "navsim"))["navsim_tlc"]
+    one = scored(log, lane_map)["red_light"]
+    navsim = scored(log, lane_map, "navsim")["navsim_tlc"]
     assert navsim.value.tolist() == [1.0 - one.value.max()] * N
     return one.value
 

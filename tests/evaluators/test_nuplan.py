@@ -28,8 +28,7 @@ SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_
 
 def states(rows):
     pose, velocity, accel = (
-        np.array([row[key] for row in rows], dtype=float)
-        for key in ("pose", "velocity", "acceleration")
+        np.array([row[key] for row in rows], float) for key in ("pose", "velocity", "acceleration")
     )
     t_us = np.array([row["time_us"] for row in rows])
     size = (FRONT_M + REAR_M, WIDTH_M)
@@ -160,7 +159,7 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
         np.array([[4.0, 1.8]]),
         velocity,
     )
-    everyone, steps = np.zeros(n, dtype=np.int64), np.arange(n)
+    everyone, steps = np.zeros(n, np.int64), np.arange(n)
     first_s, last_s = nuplan.touching_s(ego, others, everyone, steps)
     for after_s in np.arange(0.0, 4.0, 0.05):
         own = ego.boxes(ego.centre + after_s * ego.speed[:, None] * ego.heading, ego.yaw).shapes()

@@ -14,19 +14,23 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
-from evaluators import PRESETS, reduce_rollout, score
+from evaluators import PRESETS
 from evaluators.metrics import surface
 from evaluators.metrics.surface import MARGIN_M, Region, Surface, closed_union
-from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import (
+    TWO_LANES,
+    lane,
+    road_map,
+    rollout,
+    scored,
+    track,
+    values_of,
+)
 from tests.evaluators.reference_strict import depth_by_points
 from tests.examples import examples
 
 STRICT = PRESETS["strict"]
 HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
-
-
-def scored(log, lane_map=TWO_LANES, preset="strict"):
-    return by_name(score(log, scene(lane_map, log), preset))
 
 
 def margins(log, lane_map=TWO_LANES):
@@ -98,7 +102,7 @@ def test_closing_leaves_the_outer_border_where_the_map_has_it():
             lane_polygon(Lane(k, bend, grow(a), grow(b)))
             for k, a, b in (("in", 16, 19.98), ("out", 20.02, 24))
         ],
-        dtype=object,
+        object,
     )
     joined, plain = closed_union(areas, 0.1), shapely.union_all(areas)
     added = shapely.difference(joined, plain)
@@ -239,7 +243,7 @@ def test_heading_at_180_degrees_is_not_a_wrong_lane():
 
 def test_the_rollout_value_is_the_least_margin_of_the_scored_steps_and_off_road_ends_it():
     log = rollout(track(np.arange(4.0), [0.0, -0.5, -1.0, -2.0]))
-    values = reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT).values
+    values = values_of(log, preset=STRICT)
     assert values["offroad_margin_m"].value == pytest.approx(1.75 - 1.0 - HALF_W, abs=MARGIN_M)
     assert values["offroad"].value == 1.0
 
@@ -262,7 +266,7 @@ def layouts(draw):
 @settings(max_examples=examples(15), deadline=None, derandomize=True)
 @given(layouts(), COORDINATE, COORDINATE, st.sampled_from([0.0, math.pi, math.pi / 2, 0.4, -2.0]))
 def test_random_layouts_agree_with_distances_point_by_point(rings, x, y, yaw):
-    areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], dtype=object)
+    areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], object)
     body = box(x, y, yaw)
     drivable = Surface(areas, [np.zeros((2, 3))] * len(rings), 0.0, 3.0)
     found = float(drivable.margin_m(np.array([shapely.Polygon(body)]), np.array([[x, y, 0.0]]))[0])

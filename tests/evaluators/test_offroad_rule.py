@@ -16,7 +16,17 @@ from evaluators import PRESETS, rollout_values, score
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
 from evaluators.metrics.road import road_of
-from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import (
+    TWO_LANES,
+    by_name,
+    lane,
+    road_map,
+    rollout,
+    scene,
+    scored,
+    track,
+    values_of,
+)
 from tests.evaluators.reference import convex_contains
 from tests.evaluators.reference_rules import ego_corners, road_by_step
 from tests.examples import examples
@@ -26,7 +36,7 @@ HALF_W = 0.94
 
 
 def offroad_of(log, lane_map, preset="paper"):
-    return by_name(score(log, scene(lane_map, log), preset))["offroad"]
+    return scored(log, lane_map, preset)["offroad"]
 
 
 def held(log, lane_map, preset=PAPER):
@@ -96,7 +106,7 @@ def test_far_beyond_the_edge_nothing_is_touched_and_the_step_counts_as_on_road()
 
 def test_after_the_edge_was_crossed_the_later_steps_do_not_count():
     log = rollout(track(0.0, [0.0, -1.5, -30.0, -60.0]), log=track([0.0, 1.0, 2.0, 3.0], 0.0))
-    values = rollout_values(score(log, scene(TWO_LANES, log), "paper"))
+    values = values_of(log, preset="paper")
     assert values["offroad"].value == 1.0
     assert values["dist_to_gt_trajectory"].value == pytest.approx(1.5)
 
@@ -130,7 +140,7 @@ def test_a_road_edge_of_a_bridge_overhead_does_not_count():
 
 def test_without_lanes_every_road_metric_is_invalid_and_never_zero():
     log = rollout(track([0.0, 1.0], 0.0))
-    found = by_name(score(log, scene(road_map(edges=[edge_line(0.0)]), log), "paper"))
+    found = scored(log, road_map(edges=[edge_line(0.0)]), "paper")
     for name in ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m"):
         assert not found[name].valid.any()
         assert np.isnan(found[name].value).all()
@@ -146,24 +156,24 @@ def test_a_road_edge_that_is_needed_but_missing_makes_the_step_invalid():
     found = offroad_of(log, no_edges)
     assert found.valid.tolist() == [True, False, True]
     assert found.reason == "no lane contains the footprint and the map has no road edges to decide"
-    value = rollout_values(score(log, scene(no_edges, log), "paper"))["offroad"]
+    value = values_of(log, no_edges, "paper")["offroad"]
     assert (value.value, value.valid) == (None, False)
     inside = rollout(track(0.0, [0.0, 0.1]))
-    assert rollout_values(score(inside, scene(no_edges, inside), "paper"))["offroad"].value == 0.0
+    assert values_of(inside, no_edges, "paper")["offroad"].value == 0.0
 
 
 def test_driving_against_the_lane_is_wrong_and_a_shared_junction_is_not():
     log = rollout(track([0.0, -1.0], 0.0, yaw=np.pi))
-    found = by_name(score(log, scene(TWO_LANES, log), "paper"))["wrong_lane"]
+    found = scored(log, preset="paper")["wrong_lane"]
     assert found.value.tolist() == [1.0, 1.0]
     back = Lane("back", np.array([[200.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]), None, None)
     shared = road_map(lane("there", 0.0), back)
-    assert by_name(score(log, scene(shared, log), "paper"))["wrong_lane"].value.tolist() == [
+    assert scored(log, shared, "paper")["wrong_lane"].value.tolist() == [
         0.0,
         0.0,
     ]
     opposing = replace(PAPER, wrong_lane_rule="any_opposes")
-    assert by_name(score(log, scene(shared, log), opposing))["wrong_lane"].value.tolist() == [
+    assert scored(log, shared, opposing)["wrong_lane"].value.tolist() == [
         1.0,
         1.0,
     ]
@@ -173,9 +183,7 @@ def test_driving_against_the_lane_is_wrong_and_a_shared_junction_is_not():
 def test_driving_along_minus_x_in_a_lane_along_minus_x_is_right(yaw):
     west = Lane("west", np.array([[100.0, 0.0, 0.0], [-100.0, -1e-9, 0.0]]), None, None)
     log = rollout(track(0.0, 0.0, yaw=yaw))
-    assert by_name(score(log, scene(road_map(west), log), "paper"))[
-        "wrong_lane"
-    ].value.tolist() == [0.0]
+    assert scored(log, road_map(west), "paper")["wrong_lane"].value.tolist() == [0.0]
 
 
 def test_reversed_right_edge_is_repaired_to_its_two_triangles():

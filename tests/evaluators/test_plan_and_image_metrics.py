@@ -9,7 +9,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.types import LoggedImage, LoggedPlan, Trajectory
-from evaluators import PRESETS, rollout_values, score
+from evaluators import PRESETS, score
 from tests.evaluators.eval_build import (
     DT_US,
     T_RIG_BOX,
@@ -19,6 +19,7 @@ from tests.evaluators.eval_build import (
     rollout,
     scene,
     track,
+    values_of,
 )
 from tests.evaluators.reference import open_loop_by_plan
 
@@ -183,14 +184,14 @@ def test_one_black_camera_of_two_is_enough():
 
 def test_a_black_frame_does_not_remove_the_rollout():
     log = rollout(drive(), images=[image(DT_US, 0)])
-    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    values = values_of(log)
     assert values["img_is_black"].value == 1.0
     assert values["collision_any"].value == 0.0
 
 
 def test_a_log_without_images_has_no_value_for_them():
     log = rollout(drive())
-    value = rollout_values(score(log, scene(TWO_LANES, log)))["img_is_black"]
+    value = values_of(log)["img_is_black"]
     assert (value.value, value.valid, value.reason) == (
         None,
         False,

@@ -132,7 +132,7 @@ def test_a_last_value_that_is_invalid_is_not_replaced_by_an_earlier_one():
 
 
 def test_metrics_on_their_own_time_line_are_cut_by_time():
-    t = np.array([150_000, 200_000, 400_000], dtype=np.int64)
+    t = np.array([150_000, 200_000, 400_000], np.int64)
     own = series("plan_deviation", t, [9.0, 1.0, 5.0])
     assert value("plan_deviation", plan_deviation=own).value == pytest.approx(3.0)
     assert value(

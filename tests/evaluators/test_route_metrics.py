@@ -9,16 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evaluators import rollout_values, score
 from evaluators.metrics.route import beside, moving, to_path
-from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
+from tests.evaluators.eval_build import rollout, scored, track, values_of
 from tests.evaluators.reference import route_by_step
 from tests.evaluators.reference_rules import point_to_segment
 from tests.examples import examples
-
-
-def scored(log):
-    return by_name(score(log, scene(TWO_LANES, log)))
 
 
 def test_driving_the_recording_again_has_no_distance_and_full_progress():
@@ -35,7 +30,7 @@ def test_driving_the_recording_again_has_no_distance_and_full_progress():
 def test_route_distance_is_the_mean_over_the_scored_steps_of_the_distance_to_the_path():
     y = np.array([5.0, 5.0, 0.0, 1.0, 2.0])  # 5 m away in the warm-up: does not count
     log = rollout(track(np.arange(5.0), y), log=track(np.arange(5.0), 0.0), warmup_us=200_000)
-    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    values = values_of(log)
     assert values["route_distance_m"].value == pytest.approx(1.0)
     assert values["dist_to_gt_trajectory"].value == pytest.approx(2.0)
     assert values["dist_traveled_m"].value == pytest.approx(2 * np.sqrt(2.0))
@@ -67,7 +62,7 @@ def test_a_recording_that_stands_still_has_no_progress_and_is_not_divided_by_zer
 
 def test_one_step_rollout_and_one_pose_recording_are_scored():
     log = rollout(track(3.0, 4.0), log=track(0.0, 0.0))
-    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    values = values_of(log)
     assert values["route_distance_m"].value == pytest.approx(5.0)
     assert values["progress_rel"].value == 1.0
     assert values["dist_traveled_m"].value == 0.0
@@ -85,7 +80,7 @@ def test_nothing_is_relevant_before_the_handover_and_a_pure_replay_gives_no_valu
     log = rollout(track(np.arange(5.0), 0.0), warmup_us=300_000)
     assert scored(log)["eval_relevant"].value.tolist() == [0, 0, 0, 1, 1]
     whole = replace(log, force_gt_us=10_000_000)
-    value = rollout_values(score(whole, scene(TWO_LANES, whole)))["offroad"]
+    value = values_of(whole)["offroad"]
     assert value.value is None
     assert value.reason == "the policy never took over: every step belongs to the warm-up"
 
@@ -152,9 +147,9 @@ def test_lateral_bias_is_the_signed_mean_left_positive_and_follows_the_paths_dir
         log=track(np.arange(5.0), 0.0),
         warmup_us=200_000,
     )
-    assert rollout_values(score(log, scene(TWO_LANES, log)))[
-        "lateral_bias_m"
-    ].value == pytest.approx(0.2)  # the warm-up does not count
+    assert values_of(log)["lateral_bias_m"].value == pytest.approx(
+        0.2
+    )  # the warm-up does not count
 
 
 def test_lateral_bias_changes_side_with_a_bend_and_agrees_with_the_distance():
@@ -175,7 +170,7 @@ def test_driving_past_the_end_of_the_recording_counts_in_the_papers_distance_and
     assert found["route_distance_m"].value[-1] == pytest.approx(np.hypot(4.0, 0.4))
     assert found["lateral_distance_m"].value == pytest.approx(np.full(9, 0.4))
     assert found["lateral_bias_m"].value == pytest.approx(np.full(9, 0.4))
-    assert "lateral_distance_m" not in by_name(score(log, scene(TWO_LANES, log), "alpasim"))
+    assert "lateral_distance_m" not in scored(log, preset="alpasim")
 
 
 @settings(max_examples=examples(40))
@@ -271,7 +266,7 @@ def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_
         ego = track(np.append(x, np.full(k, 10.0)), np.append(y, np.full(k, 3.0)))
         log = rollout(ego, log=track(path[0], path[1]))
         assert scored(log)["progress"].value[-1] * (200 + 2 * np.pi) == pytest.approx(want, abs=0.1)
-        assert rollout_values(score(log, scene(TWO_LANES, log), "strict"))["progress"].value < 0.06
+        assert values_of(log)["progress"].value < 0.06
 
 
 def test_a_recording_that_turns_back_on_itself_is_followed_out_and_back():

@@ -18,7 +18,16 @@ from evaluators import PRESETS, reduce_rollout, score
 from evaluators.metrics.collision import SIDES, contact_events
 from evaluators.metrics.contact import PLACE_M, find_contacts, find_swept
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
-from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.eval_build import (
+    CAR,
+    TWO_LANES,
+    car,
+    rollout,
+    scene,
+    scored,
+    track,
+    values_of,
+)
 from tests.evaluators.reference_rules import contacts_by_step
 from tests.evaluators.reference_strict import Motion, first_touch, side_at
 from tests.examples import examples
@@ -29,17 +38,13 @@ AXLE = 1.4  # box centre ahead of the rear axle
 POST = Box(0.3, 0.3, 1.0)
 
 
-def found(log, preset="strict"):
-    return by_name(score(log, scene(TWO_LANES, log), preset))
-
-
 def flag(log, name):
-    return found(log)[name].value.tolist()
+    return scored(log)[name].value.tolist()
 
 
 def test_a_pedestrian_who_runs_across_between_two_steps_is_hit():
     log = rollout(track([0.0, 0.1], 0.0), [car("runner", track(1.0, [1.5, -1.5]), POST)])
-    assert found(log, "paper")["collision_any"].value.tolist() == [0, 0]
+    assert scored(log, preset="paper")["collision_any"].value.tolist() == [0, 0]
     assert flag(log, "collision_any") == [0, 1]
     assert flag(log, "collision_lateral") == [0, 1]
     (event,) = contact_events(log)
@@ -67,10 +72,10 @@ def test_time_and_place_of_a_front_contact():
 
 def test_without_contact_time_and_place_are_invalid_with_a_reason():
     log = rollout(track([0.0, 1.0], 0.0), [car("a", track(20.0, 0.0, n=2))])
-    one = found(log)["contact_time_s"]
+    one = scored(log)["contact_time_s"]
     assert not one.valid.any()
     assert one.reason == "nothing touches the ego"
-    values = reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT).values
+    values = values_of(log, preset=STRICT)
     assert values["contact_time_s"].value is None
     assert values["contact_time_s"].unit == "s"
 
@@ -79,7 +84,7 @@ def test_a_side_swipe_that_reaches_the_bumper_by_the_next_step_is_lateral():
     # The other comes from the left and slides forward along the ego; at the step it overlaps the
     # front side as well.
     log = rollout(track(0.0, 0.0, n=2), [car("a", track([0.0, 3.0], [2.5, 1.5]))])
-    assert found(log, "paper")["collision_front"].value.tolist() == [0, 1]
+    assert scored(log, preset="paper")["collision_front"].value.tolist() == [0, 1]
     assert flag(log, "collision_lateral") == [0, 1]
     assert flag(log, "collision_front") == [0, 0]
 
@@ -99,7 +104,7 @@ def test_every_touching_actor_has_its_own_side_and_keeps_it():
         assert flag(log, f"collision_{side}") == [0, 1, 1]
     # Times differ; the row tells the earliest.
     times = sorted(one.t_s for one in events.values())
-    assert found(log)["contact_time_s"].value[1:].tolist() == pytest.approx([times[0]] * 2)
+    assert scored(log)["contact_time_s"].value[1:].tolist() == pytest.approx([times[0]] * 2)
 
 
 @pytest.mark.parametrize(("degrees", "side"), [(40, "front"), (50, "lateral")])
@@ -123,7 +128,7 @@ def test_a_corner_contact_goes_by_the_direction_of_the_blow(degrees, side):
 
 def test_a_long_bus_beside_the_ego_is_lateral_although_it_reaches_both_bumpers():
     log = rollout(track(0.0, 0.0, n=2), [car("bus", track(0.0, [2.5, 1.5]), Box(12.0, 2.5, 3.0))])
-    assert found(log, "paper")["collision_front"].value.tolist() == [0, 1]
+    assert scored(log, preset="paper")["collision_front"].value.tolist() == [0, 1]
     assert [one.side for one in contact_events(log)] == ["lateral"]
 
 
@@ -181,21 +186,11 @@ def test_a_contact_before_the_handover_belongs_to_the_forced_rows():
     runner = car("runner", track(0.0, [3.0, -3.0, -3.0]), POST)
     log = rollout(track(0.0, 0.0, n=3), [runner], warmup_us=100_000)
     assert flag(log, "collision_any") == [1, 0, 0]
-    assert (
-        reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT)
-        .values["collision_any"]
-        .value
-        == 0.0
-    )
+    assert values_of(log, preset=STRICT)["collision_any"].value == 0.0
     late = rollout(
         track(0.0, 0.0, n=3), [car("runner", track(0.0, [3.0, 3.0, -3.0]), POST)], warmup_us=100_000
     )
-    assert (
-        reduce_rollout(score(late, scene(TWO_LANES, late), STRICT), STRICT)
-        .values["collision_any"]
-        .value
-        == 1.0
-    )
+    assert values_of(late, preset=STRICT)["collision_any"].value == 1.0
 
 
 def test_one_step_and_no_actors():

@@ -22,7 +22,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
-from evaluators import PRESETS, reduce_rollout, resolve_evaluators, rollout_values, score
+from evaluators import PRESETS, reduce_rollout, resolve_evaluators, score
 from evaluators.alpasim import (
     EvalSettings,
     ScoredRollout,
@@ -42,7 +42,9 @@ from tests.evaluators.eval_build import (
     road_map,
     rollout,
     scene,
+    scored,
     track,
+    values_of,
 )
 from tests.log.make_rollout import write_rollout
 
@@ -54,16 +56,11 @@ FRONT_WIDE = "camera_front_wide_120fov"
 
 def both(log, road=TWO_LANES):
     """Score a log with ``alpasim`` and with ``strict``."""
-    return by_name(score(log, scene(road, log), "alpasim")), by_name(
-        score(log, scene(road, log), "strict")
-    )
+    return scored(log, road, "alpasim"), by_name(score(log, scene(road, log), "strict"))
 
 
 def values(log, preset, road=TWO_LANES):
-    return {
-        name: one.value
-        for name, one in rollout_values(score(log, scene(road, log), preset), preset).items()
-    }
+    return {name: one.value for name, one in values_of(log, road, preset).items()}
 
 
 def image(t_us, bright, camera=FRONT_WIDE):
@@ -110,9 +107,7 @@ def test_d01_of_several_contacts_only_the_last_named_one_is_classified():
 def test_d02_invalid_values_enter_alpasims_rollout_values():
     alone = rollout(STAND)
     assert values(alone, "alpasim")["min_distance_to_obstacle_m"] == np.inf
-    one = rollout_values(score(alone, scene(TWO_LANES, alone), "strict"), "strict")[
-        "min_distance_to_obstacle_m"
-    ]
+    one = values_of(alone)["min_distance_to_obstacle_m"]
     assert (one.value, one.valid, one.reason) == (None, False, "no other actor is present")
 
 
@@ -208,7 +203,7 @@ def test_d09_alpasim_compares_headings_without_wrapping():
 def test_d11_a_rollout_without_handover_is_scored_whole_by_alpasim():
     log = rollout(STAND, warmup_us=10_000_000)
     assert values(log, "alpasim")["collision_any"] == 0.0
-    for one in rollout_values(score(log, scene(TWO_LANES, log), "strict"), "strict").values():
+    for one in values_of(log).values():
         assert one.value is None
         assert "never took over" in one.reason
 
@@ -224,10 +219,7 @@ def test_d16_the_ego_is_found_by_name_wherever_a_log_puts_it(tmp_path):
                 entry.actor_poses.actor_poses.extend(poses)
             out.write(entry)
     for preset in ("alpasim", "strict"):
-        one, two = (
-            by_name(score(log, scene(TWO_LANES, log), preset))
-            for log in map(read_asl, (path, first))
-        )
+        one, two = (scored(log, preset=preset) for log in map(read_asl, (path, first)))
         assert set(one) == set(two)
         for name, series in one.items():
             np.testing.assert_array_equal(series.value, two[name].value)
@@ -285,7 +277,7 @@ def test_d19_the_least_number_of_plan_times_is_read_and_never_used():
     xs = np.arange(3.0)
     log = rollout(DRIVE, plans=[plan(0, xs), plan(DT_US, xs + 1.0)])
     for preset in (many, STRICT):  # one common time is enough in both
-        assert by_name(score(log, scene(TWO_LANES, log), preset))["plan_deviation"].valid.all()
+        assert scored(log, preset=preset)["plan_deviation"].valid.all()
 
 
 def test_d28_an_answer_between_two_logged_times_is_read_from_the_next_one():
@@ -332,7 +324,7 @@ def test_d24_nothing_in_a_log_is_ever_unpickled(tmp_path):
             out.write(entry)
     log = read_asl(armed)
     for preset in ("alpasim", "strict"):
-        found = by_name(score(log, scene(TWO_LANES, log), preset))
+        found = scored(log, preset=preset)
         assert (
             not found["safety_monitor_triggered"].value.any()
             if preset == "alpasim"

@@ -64,7 +64,7 @@ def ego_of(steps):
     x, y, yaw = (
         np.array([row["value"] for row in rows if row["metric"] == name]) for name in POSES
     )
-    t_us = np.array([row["t_us"] for row in rows if row["metric"] == POSES[0]], dtype=np.int64)
+    t_us = np.array([row["t_us"] for row in rows if row["metric"] == POSES[0]], np.int64)
     return Trajectory(t_us, np.column_stack([x, y, np.zeros_like(x)]), quat_from_yaw(yaw))
 
 
