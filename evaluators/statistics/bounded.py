@@ -80,10 +80,10 @@ def upper_bound(values: F64, most: float) -> float:
         return most
     # The different values, with the worst as one more. Many are put into bins that keep their mean:
     # one between two edges counts in shares for both, which widens the bounds and never narrows.
-    distinct, counts = np.unique(
+    distinct, found = np.unique(
         np.append(np.asarray(values, np.float64) / scale, most / scale), return_counts=True
     )
-    counts = counts.astype(np.float64)
+    counts = found.astype(np.float64)
     if len(distinct) > BINS:
         edges = np.linspace(distinct[0], distinct[-2], BINS)
         place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])

@@ -282,13 +282,12 @@ def check_gate(
     base_sides = sides if stored is None else _sides(stored)
     is_paired = any(rule.is_paired for rule in spec.metrics.values())
     variants = list(sides)
+    base: Base | None = None
     if spec.baseline is not None:
         base = base_named(spec.baseline, list(base_sides), owner)
     else:
         is_one_renderer = len({variant.renderer for variant in variants}) == 1
-        if owner != "the run" or (is_one_renderer and not is_paired):
-            base = None
-        else:
+        if owner == "the run" and (is_paired or not is_one_renderer):
             base = usual_base(variants)
     compares = is_paired or stored is not None or spec.baseline is not None
     checks = []
