@@ -105,12 +105,14 @@ def test_a_network_that_sees_smaller_images_blends_at_full_size(references):
 
 def test_a_large_image_is_not_bent_by_small_offsets_and_takes_more_of_its_references():
     offset = torch.tensor([0.5, 1.6]).view(1, 1, 1, 2, 1) * torch.tensor([0.6, 0.8])
-    heads = BlendHeads(torch.zeros(1, 1, 1, 2, 4), offset, torch.zeros(1, 1, 1, 2, 12))
+    heads = BlendHeads(torch.zeros(1, 1, 1, 2, 4), offset, torch.ones(1, 1, 1, 2, 12))
     half, tenth = enlarged(heads, 2), enlarged(heads, 10)
     assert torch.allclose(half.offset_px[..., 0, :], torch.zeros(2))
     assert torch.allclose(half.offset_px[..., 1, :].norm(), torch.tensor(1.0))
     assert torch.equal(half.weight, heads.weight)
+    assert torch.equal(half.correction, heads.correction)
     assert torch.allclose(tenth.weight.exp(), torch.tensor(5.0))
+    assert torch.allclose(tenth.correction, heads.correction / 5)
 
 
 def test_offsets_look_up_whole_pixels_exactly_and_the_border_goes_on():

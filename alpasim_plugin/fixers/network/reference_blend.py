@@ -195,12 +195,18 @@ def enlarged(heads: BlendHeads, scale: int) -> BlendHeads:
 
     Errors of an offset grow with the image and bend its lines, so offsets are shortened by
     `SMALL_OFFSET_PX`, down to none. The blur of a render is not seen in a smaller image, so
-    references weigh more, the more the smaller it was; at half the size the network is right.
+    references weigh more, the more the smaller it was; at half the size the network is right. What
+    it adds to the colour of a thin line is as blurred as its image, and tints the line, so it counts
+    for less.
     """
     length = heads.offset_px.norm(dim=-1, keepdim=True)
     kept = 1 - SMALL_OFFSET_PX / length.clamp(min=SMALL_OFFSET_PX)
-    more = math.log(max(scale / USUAL_SCALE, 1.0))
-    return heads._replace(weight=heads.weight + more, offset_px=heads.offset_px * kept)
+    smaller_by = max(scale / USUAL_SCALE, 1.0)
+    return BlendHeads(
+        heads.weight + math.log(smaller_by),
+        heads.offset_px * kept,
+        heads.correction / smaller_by,
+    )
 
 
 class Sources(NamedTuple):
