@@ -231,7 +231,8 @@ def _gradients(
     out = rasterize_gradient(Splats(*splats), camera, compositor=compositor)
     planes = torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], dim=2)
     planes.square().sum().backward()  # type: ignore[no-untyped-call]
-    pairs, *found = download(out.pairs, *(part.grad for part in splats))
+    leaves = [part.grad for part in splats if part.grad is not None]
+    pairs, *found = download(out.pairs, *leaves)
     if compositor is None or compositor.had_room(compositor.capacity, int(pairs)):
         return [part.ravel() for part in found]
     return _gradients(cloud, camera, compositor)

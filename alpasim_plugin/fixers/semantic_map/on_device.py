@@ -47,7 +47,7 @@ def draw_tiles(
 
     Args:
         scene: Its static part is sent once.
-        view, pose: See `draw.view_of`.
+        view, pose: See `draw.seen_from`.
         faces, edges: Of road users.
         rows: Of the image.
         device: Where to draw.
@@ -105,8 +105,8 @@ def _strokes(rows: Tensor, camera: Tensor) -> Tensor:
         camera: A pose, a view as of `kernels`, and by what x and y are multiplied so that a stroke
             is as wide as it is high.
     """
-    size, pixels, scale = camera[17:].split([2, 1, 2])
-    ends, style = _seen_at(rows[:, :6].unflatten(1, (2, 3)), camera), rows[:, 6:]
+    size, pixels, scale = torch.split(camera[17:], [2, 1, 2])
+    ends, style = _seen_at(rows[:, :6].reshape(-1, 2, 3), camera), rows[:, 6:]
     begin, end, depth = ends[:, :1], ends[:, 1:], ends[..., 2:]
     # Where a segment meets the near plane; beyond the far one the kernel draws nothing of it.
     met = begin + (NEAR_M - begin[..., 2:]) / (end - begin)[..., 2:] * (end - begin)
@@ -142,8 +142,8 @@ def _shapes(rows: Tensor, camera: Tensor) -> Tensor:
     """Return the primitives of triangles ``(T, COLUMNS)``, 0 where nothing is seen; see `_strokes`.
     Of a triangle that crosses the near plane the kernel draws what lies beyond.
     """
-    corners, closed, shade, style = rows.split([9, 1, 3, 7], dim=1)
-    seen_at = _seen_at(corners.unflatten(1, (3, 3)), camera)
+    corners, closed, shade, style = torch.split(rows, [9, 1, 3, 7], dim=1)
+    seen_at = _seen_at(corners.reshape(-1, 3, 3), camera)
     planes = torch.linalg.cross(seen_at.roll(-1, 1), seen_at.roll(-2, 1))
     volume = (planes * seen_at)[:, :1].sum(2)  # negative where the front is seen
     planes = planes / volume[..., None]  # each 1/depth in a corner, and 0 on the opposite edge
