@@ -23,8 +23,6 @@ EPILOG = """
 Examples:
 
 - `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2 --renderer clean`
-
-- `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2`: continue unchanged and check that the result equals the log
 """
 
 

@@ -22,7 +22,7 @@ CORRECTION = 0.05  # of the codec's last layers, on the scale of their inputs
 NOTE = "random weights, small corrections"
 
 
-def save_stand_in(path, settings, seed=0):
+def save_stand_in(path, settings):
     """Write a bundle with stand-in weights for the tiny autoencoder and a transformer, both of the
     settings' sizes.
 
@@ -31,16 +31,16 @@ def save_stand_in(path, settings, seed=0):
         settings: Sizes, and what the bundle says it was made for.
         seed: Of all weights.
     """
-    key = derive_seed("fixer-stand-in", seed, settings.name)
+    key = derive_seed("fixer-stand-in", 0, settings.name)
     dit = initial_weights(DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings)), key)
     for name in (name for name in dit if name.endswith("opacity_embed.weight")):
-        draw = stream("fixer-stand-in", seed, name).standard_normal(tuple(dit[name].shape))
+        draw = stream("fixer-stand-in", 0, name).standard_normal(tuple(dit[name].shape))
         dit[name] = torch.from_numpy(draw).float() / dit[name].shape[1] ** 0.5
     dit["final_layer.linear.weight"] *= (
         VELOCITY  # its input is normalised, so this is the spread of its output
     )
     last = dit["final_layer.adaln_modulation.2.weight"]
-    draw = stream("fixer-stand-in", seed, "modulation").standard_normal(tuple(last.shape))
+    draw = stream("fixer-stand-in", 0, "modulation").standard_normal(tuple(last.shape))
     dit["final_layer.adaln_modulation.2.weight"] = torch.from_numpy(draw).float() * (
         MODULATION / last.shape[1] ** 0.5
     )
@@ -48,8 +48,6 @@ def save_stand_in(path, settings, seed=0):
     with torch.no_grad():
         for name, head in (("encoder", vae.encoder.head), ("decoder", vae.decoder.head)):
             weight = head.weight
-            noise = stream("fixer-stand-in", seed, f"vae.{name}").standard_normal(
-                tuple(weight.shape)
-            )
+            noise = stream("fixer-stand-in", 0, f"vae.{name}").standard_normal(tuple(weight.shape))
             weight.copy_(torch.from_numpy(noise).float() * (CORRECTION / weight[0].numel() ** 0.5))
     save_bundle(path, {"dit": dit, "vae": vae.state_dict()}, settings, trained=False, note=NOTE)

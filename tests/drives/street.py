@@ -173,9 +173,9 @@ def write_transforms(
     return folder
 
 
-def write_kitti(folder, street=None, spare_pictures=0, stereo=True):
+def write_kitti(folder, spare_pictures=0, stereo=True):
     """Write the street as a KITTI odometry folder; ``spare_pictures`` have no pose."""
-    chosen = street or Street()
+    chosen = Street()
     base = 0.54
     for name, lateral_m in (("image_l", 0.0), ("image_r", base))[: 2 if stereo else 1]:
         (folder / name).mkdir(parents=True)

@@ -22,12 +22,12 @@ def path():
     return np.column_stack([PATH_X, 0 * PATH_X, road(PATH_X, 0 * PATH_X) + HEIGHT_M])
 
 
-def points_on(xy, lift=0.0, spread_m=0.01):
+def points_on(xy, lift=0.0):
     z = road(xy[:, 0], xy[:, 1]) + lift
     return Points(
         np.column_stack([xy, z]),
         np.full((len(xy), 3), 0.5),
-        np.tile(np.eye(3) * spread_m**2, (len(xy), 1, 1)),
+        np.tile(np.eye(3) * 0.01**2, (len(xy), 1, 1)),
     )
 
 

@@ -24,9 +24,9 @@ def opened(folder):
     return drive, place(drive, _points(drive, folder, told), camera_height_m=1.5)
 
 
-def assert_is_the_street(placed, rel=0.03):
+def assert_is_the_street(placed):
     ego = placed.ego.xyz
-    assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx(WAY_M, rel=rel)
+    assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx(WAY_M, rel=0.03)
     assert np.abs(placed.strip.section_errors).max() < 0.05
     mount = placed.mounts[next(iter(placed.mounts))]
     assert mount[2, 3] == pytest.approx(1.5, abs=0.08)

@@ -229,13 +229,13 @@ def test_a_verdict_counts_and_names_what_changed():
 # --- policies that are not repeatable
 
 
-def often(share, key, metric="collision_at_fault"):
+def often(share, key):
     """Return rows in which an event happens at random."""
 
     def changed(candidate):
         rng = np.random.Generator(np.random.Philox(key))
         for row in candidate:
-            row[metric] = float(rng.random() < share)
+            row["collision_at_fault"] = float(rng.random() < share)
             row["lateral_distance_m"] += rng.normal(0.0, 0.05)
         return candidate
 

@@ -74,8 +74,8 @@ def signalled(*phases, offset_us=0, heading_rad=0.0, y=0.0, z=0.0):
     return replace(TWO_LANES, signals=(Signal(stop, heading_rad, phases, offset_us),))
 
 
-def ran_red(lane_map, y=0.0):
-    log = rollout(track(CRUISE, y))  # 8 m/s; the front is at the line after 3.4 s
+def ran_red(lane_map):
+    log = rollout(track(CRUISE, 0.0))  # 8 m/s; the front is at the line after 3.4 s
     one = scored(log, lane_map)["red_light"]
     navsim = scored(log, lane_map, "navsim")["navsim_tlc"]
     assert navsim.value.tolist() == [1.0 - one.value.max()] * N

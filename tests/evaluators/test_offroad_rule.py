@@ -35,8 +35,8 @@ PAPER = PRESETS["paper"]
 HALF_W = 0.94
 
 
-def offroad_of(log, lane_map, preset="paper"):
-    return scored(log, lane_map, preset)["offroad"]
+def offroad_of(log, lane_map):
+    return scored(log, lane_map, "paper")["offroad"]
 
 
 def held(log, lane_map, preset=PAPER):
@@ -46,8 +46,8 @@ def held(log, lane_map, preset=PAPER):
     return containment(road, ego_footprints(log, preset, origin), log.ego.xyz - origin)
 
 
-def edge_line(y, x0=-50.0, x1=200.0, z=0.0):
-    return np.array([[x0, y, z], [x1, y, z]])
+def edge_line(y, x0=-50.0, z=0.0):
+    return np.array([[x0, y, z], [200.0, y, z]])
 
 
 def test_ego_inside_one_lane_is_on_road():

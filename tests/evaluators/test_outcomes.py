@@ -75,8 +75,8 @@ def fired(*of):
     }
 
 
-def slowing(to=0.4, after_s=3.0):
-    return np.where(after_s > T, V, np.maximum(V - 3.0 * (T - after_s), to))
+def slowing(to=0.4):
+    return np.where(T < 3.0, V, np.maximum(V - 3.0 * (T - 3.0), to))
 
 
 def test_a_drive_like_the_recording_has_no_outcome():

@@ -57,10 +57,10 @@ def colmap(model, names, points=True, camera="", places=None):
     (model / "points3D.txt").write_text("1 1.0 0.0 0.0 90 90 90 0.5 1 0\n")
 
 
-def kitti(folder, calib, pair="image_2", times=None):
-    (folder / pair).mkdir(parents=True)
+def kitti(folder, calib, times=None):
+    (folder / "image_2").mkdir(parents=True)
     for i in range(8):
-        cv2.imwrite(str(folder / pair / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
+        cv2.imwrite(str(folder / "image_2" / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
     rows = [" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses(8)]
     (folder / "poses.txt").write_text("\n".join(rows))
     (folder / "calib.txt").write_text(calib)

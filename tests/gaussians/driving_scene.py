@@ -7,7 +7,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 
 
-def driving_like_scene(n, seed=0, sh_degree=3):
+def driving_like_scene(n, seed=0):
     """Return n flat Gaussians of a straight road along x, world axes ENU, and of the facades beside
     it, seen well from (0, 0, 1.6) towards +x; every twentieth lies on a far shell.
 
@@ -23,24 +23,17 @@ def driving_like_scene(n, seed=0, sh_degree=3):
     scales = 0.25 * np.sqrt(100_000 / n) * np.exp(rng.normal(0, 0.4, (n, 3)))
     scales[np.arange(n), np.where(is_road, 2, 1)] = 0.02
     scales[is_far] = 20
-    sh = rng.normal(0, 0.03, (n, (sh_degree + 1) ** 2, 3))
+    sh = rng.normal(0, 0.03, (n, 16, 3))
     sh[:, 0] = rng.uniform(-1.2, 1.2, (n, 3))
     opacities = np.clip(rng.beta(4.0, 1.2, n), 0.02, 0.999)
     turned = np.eye(4)[0] + rng.normal(0, 0.1, (n, 4))
     return GaussianCloud(means, *(x.astype(np.float32) for x in (turned, scales, opacities, sh)))
 
 
-def driving_camera(width, height, yaw_rad=0.0):
-    """Return a camera at (0, 0, 1.6), looking along +x turned left by the yaw, horizontal field of
-    view 65 degrees.
-    """
+def driving_camera(width, height):
+    """Return a camera at (0, 0, 1.6), looking along +x, horizontal field of view 65 degrees."""
     T_world_camera = np.eye(4)
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    T_world_camera[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ [
-        [0, 0, 1],
-        [-1, 0, 0],
-        [0, -1, 0],
-    ]
+    T_world_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     focal = width / (2 * np.tan(np.deg2rad(65) / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

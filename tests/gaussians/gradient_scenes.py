@@ -151,14 +151,14 @@ def central_differences(function, value, step):
     return out
 
 
-def numeric_gradients(s, step=1e-6):
+def numeric_gradients(s):
     """Return central finite differences of the float64 reference."""
     values = {
         **{k: a.copy() for k, a in s.arrays().items()},
         "background": np.array(s.background, float),
     }
     return {
-        name: central_differences(lambda: reference_loss(s, values), array, step)
+        name: central_differences(lambda: reference_loss(s, values), array, 1e-6)
         for name, array in values.items()
     }
 

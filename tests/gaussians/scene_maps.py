@@ -29,9 +29,9 @@ from alpasim_plugin.world.markings import with_default_markings
 LANE_M = 3.6
 
 
-def camera_spec(width=256, height=144, hfov_rad=1.2):
+def camera_spec(width=256, height=144):
     """A forward camera 1.5 m above the ground, 1.7 m ahead of the rear axle."""
-    f = width / (2 * np.tan(hfov_rad / 2))
+    f = width / (2 * np.tan(1.2 / 2))
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
     T = np.eye(4)
     T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
@@ -54,7 +54,6 @@ def road_lanes(
     name,
     lanes_each_way=2,
     is_intersection=False,
-    paint=False,
 ):
     """Lanes on both sides of a road's axis ``(N, 3)``; those on its right run along it."""
     out = {}
@@ -64,16 +63,8 @@ def road_lanes(
             if way == "b":
                 inner, outer = inner[::-1].copy(), outer[::-1].copy()
             lane_id = f"{name}-{way}{i}"
-            known = (
-                {
-                    "left_mark_type": "double_yellow" if i == 0 else "dashed_white",
-                    "right_mark_type": "solid_white",
-                }
-                if paint
-                else {}
-            )
             out[lane_id] = Lane(
-                lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection, **known
+                lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection
             )  # type: ignore[arg-type]
     return out
 

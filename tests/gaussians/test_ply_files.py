@@ -15,8 +15,8 @@ from alpasim_plugin.gaussians.files.ply import (
 )
 
 
-def make_cloud(n=5, k=16, seed=3):
-    rng = np.random.default_rng(seed)
+def make_cloud(n=5, k=16):
+    rng = np.random.default_rng(3)
     quats = rng.normal(size=(n, 4))
     return GaussianCloud(
         means=rng.normal(size=(n, 3)).astype(np.float32),

@@ -34,8 +34,8 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, UploadedClouds
 
 
-def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0), near_m=0.1):
-    return UploadedClouds([cloud], "cpu").draw([(0, None)], cam, behind, near_m).on_host()
+def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0)):
+    return UploadedClouds([cloud], "cpu").draw([(0, None)], cam, behind, 0.1).on_host()
 
 
 def moved(cloud, offset):

@@ -94,7 +94,6 @@ def close_loop(
     road,
     speed_mps,
     seconds,
-    offset_m=0.0,
     route_off_m=0.0,
     with_route=True,
     camera=CAMERA,
@@ -104,7 +103,7 @@ def close_loop(
     road_at = road if callable(road) else lambda _: road
     first = road_at(0.0)
     controller = make_controller("bicycle", Vehicle())
-    ego = EgoState(0, first.pose(0.0, offset_m), speed_mps)
+    ego = EgoState(0, first.pose(0.0, 0.0), speed_mps)
     policy.reset(seed, Route(np.array([first.pose(float(s))[:3, 3] for s in range(200)])))
     seen = []
     plans = []

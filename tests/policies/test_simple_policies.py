@@ -68,10 +68,10 @@ def test_constant_velocity_goes_straight_on(speed):
     assert not plan.yaw.any()
 
 
-def arc_route(radius, offset=0.0):
+def arc_route(radius):
     a = np.arange(20) * 80 / 19 / abs(radius)
     return np.column_stack(
-        [abs(radius) * np.sin(a), np.sign(radius) * abs(radius) * (1 - np.cos(a)) + offset, 0 * a]
+        [abs(radius) * np.sin(a), np.sign(radius) * abs(radius) * (1 - np.cos(a)), 0 * a]
     )
 
 

@@ -49,10 +49,9 @@ def straight_track(
     z_m,
     speed_mps,
     duration_s,
-    period_us=10_000,
 ):
     """Return a track along x at constant speed."""
-    t_us = np.arange(0, int(duration_s * 1e6) + 1, period_us, dtype=np.int64)
+    t_us = np.arange(0, int(duration_s * 1e6) + 1, 10_000, dtype=np.int64)
     x = x0_m + speed_mps * t_us * 1e-6
     xyz = np.stack([x, np.full_like(x, y_m), np.full_like(x, z_m)], axis=1)
     return Trajectory(t_us, xyz, quat_from_yaw(np.zeros(len(t_us))))

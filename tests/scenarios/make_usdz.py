@@ -20,9 +20,9 @@ def rail(y, n=5, as_struct=False):
     return [{"x": float(x), "y": y, "z": 0.0} for x in xs]
 
 
-def parquet(rows, schema=None):
+def parquet(rows):
     sink = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), sink)
+    pq.write_table(pa.Table.from_pylist(rows), sink)
     return sink.getvalue()
 
 

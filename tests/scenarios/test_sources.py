@@ -17,13 +17,13 @@ FOLDERS = {
 }
 
 
-def drive_with_the_log(s, step_us=100_000):
+def drive_with_the_log(s):
     """Run the actors beside an ego on its log and return how far each reactive one strayed from its
     track.
     """
     actors, strayed = make_actors(s), {}
     tracks = {a.actor_id: a.track for a in s.actors if a.behaviour.kind == "idm"}
-    for t in range(s.start_us, s.end_us, step_us):
+    for t in range(s.start_us, s.end_us, 100_000):
         for name, pose in actors.step(t, ego_state_from_log(s.ego_log, t, s.vehicle)).items():
             assert np.isfinite(pose).all()
             if name in tracks and tracks[name].t_us[0] <= t <= tracks[name].t_us[-1]:

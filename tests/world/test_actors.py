@@ -31,9 +31,8 @@ def line_track(
     seconds=10.0,
     y=0.0,
     t0=0,
-    step_us=100_000,
 ):
-    t = t0 + np.arange(0, round(seconds * 1e6) + 1, step_us, dtype=np.int64)
+    t = t0 + np.arange(0, round(seconds * 1e6) + 1, 100_000, dtype=np.int64)
     x = x0 + speed * (t - t0) * 1e-6
     return Trajectory(
         t,

@@ -68,20 +68,6 @@ def fade_in(window: range, previous: range | None, overlap: int) -> F32:
     return weights
 
 
-def fade_weights(parts: Sequence[range], overlap: int) -> F32:
-    """Return the weight of every window at every frame of the clip, ``(windows, frames)``; the
-    columns sum to 1.
-
-    The same as fading in one window after another (`fade_in`), written as a matrix.
-    """
-    weights = np.zeros((len(parts), parts[-1].stop), np.float32)
-    for i, window in enumerate(parts):
-        share = fade_in(window, parts[i - 1] if i else None, overlap)
-        weights[:i, window.start : window.stop] *= 1 - share
-        weights[i, window.start : window.stop] = share
-    return weights
-
-
 class WindowFixer(MaplessFixer):
     """Repair a whole clip in overlapping windows.
 

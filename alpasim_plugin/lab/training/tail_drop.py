@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from alpasim_plugin.block_fixers.clips import GROUP
 from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
@@ -47,16 +46,3 @@ class TailDrop:
             m[b, :, latents:] = 0
             condition[b, -OPACITY_CHANNELS:, latents:] = 0
         return replace(s, m=m, condition=condition)
-
-
-def visible_share(drop: TailDrop, frames: int, draws: int, seed: int = 0) -> float:
-    """Return the mean share of frames that stay in sight."""
-    rng = stream("training", seed, "artifixer.tail", 0)
-    return (
-        float(
-            torch.tensor(
-                [drop.shown_frames(frames, rng) for _ in range(draws)], dtype=torch.float64
-            ).mean()
-        )
-        / frames
-    )

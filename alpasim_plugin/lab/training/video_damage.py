@@ -23,7 +23,6 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize import rasterize
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.lab.training.distortions import smooth_field
 
 Rng = np.random.Generator
 MARGIN_PX = 12.0  # splats live this far outside the image
@@ -146,6 +145,19 @@ def damage_video(
         image = np.rint(np.clip(out.rgb * exposure, 0, 1) * 255).astype(np.uint8)
         yield image, np.rint(np.clip(out.alpha, 0, 1) * 255).astype(np.uint8)
         before = now
+
+
+def smooth_field(rng: Rng, shape: tuple[int, ...], channels: int, scale_px: float) -> F32:
+    """Draw a smooth random field ``(H, W, channels)`` with a scale of ``scale_px`` pixels and unit
+    root mean square.
+    """
+    h, w = shape[:2]
+    knots = rng.standard_normal(
+        (max(2, round(h / scale_px) + 1), max(2, round(w / scale_px) + 1), channels),
+        dtype=np.float32,
+    )
+    field = cv2.resize(knots, (w, h), interpolation=cv2.INTER_CUBIC).reshape(h, w, channels)
+    return (field / (np.sqrt((field**2).mean()) + 1e-6)).astype(np.float32)
 
 
 def _thin_ground(rng: Rng, shape: tuple[int, int], damage: SplatDamage) -> F32:

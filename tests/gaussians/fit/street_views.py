@@ -12,13 +12,13 @@ from tests.drives.street import CAMERA_M, HEIGHT, STEP_M, WALL_M, WIDTH, K, Stre
 STREET = Street(bow_m=0.0)
 
 
-def street_views(count=10, aside_m=0.0, first=0):
+def street_views(count=10):
     """Return photographs every 0.6 m along the street, the world's z up, named ``front-000000`` and
     on.
     """
     views = []
-    for i in range(first, first + count):
-        T = STREET.pose(STEP_M * i, aside_m)
+    for i in range(count):
+        T = STREET.pose(STEP_M * i, 0.0)
         rgb = np.ascontiguousarray(STREET.photograph(T)[..., ::-1])
         views.append(PosedView(PinholeCamera.from_pose(WIDTH, HEIGHT, K, T), rgb, f"front-{i:06d}"))
     return views
