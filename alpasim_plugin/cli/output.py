@@ -211,9 +211,11 @@ def size_lines(plan: RunPlan) -> list[str]:
     cost = f"{drawn / PX_PER_S:.1f} CPU seconds"
     if largest.background is None and largest.model is None:
         cost += f" and {memory_mb(largest, drawn) / 1e3:.1f} GB"
+    line = f"{largest.scene_id}: {size}, {by}, {cost} behind clean"
     fit_min = fit_cpu_s(largest, pinholes) / 60
-    fitted = f"; {fit_min:.0f} CPU minutes to fit its model once" if fit_min else ""
-    return [f"{largest.scene_id}: {size}, {by}, {cost} behind clean{fitted}"]
+    if fit_min and any(spec.base.name == "3dgs" for spec in plan.renderers):
+        line += f"; about {fit_min:.1f} CPU minutes to fit its model once"
+    return [line]
 
 
 def background_lines(plan: RunPlan) -> list[str]:

@@ -21,6 +21,7 @@ from alpasim_plugin.core.shutter import Along
 from alpasim_plugin.core.types import (
     F32,
     F64,
+    U8,
     Bool,
     CameraSpec,
     Frame,
@@ -257,6 +258,20 @@ def joined_image(
         shown[lens.part] += weight
     out[shown == 0] = outside
     return out
+
+
+def blind_of(sides: Sequence[Lens]) -> Bool | None:
+    """Return where a lens sees nothing ``(height, width)``; None where it sees everywhere."""
+    if sides[0].resample is None:
+        return None
+    white = np.full((1, 1), 255, np.uint8)
+    blind = joined_image(sides, [white] * len(sides)) == 0
+    return blind if blind.any() else None
+
+
+def blackened(image: U8, blind: Bool | None) -> U8:
+    """Return an image ``(height, width, 3)`` that is black where its lens sees nothing."""
+    return image if blind is None else np.where(blind[..., None], np.uint8(0), image)
 
 
 def rays_of(camera: CameraSpec) -> Rays:

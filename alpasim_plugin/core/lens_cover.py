@@ -5,15 +5,17 @@ their frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from alpasim_plugin.core.lens import (
+    blind_of,
     check_lens,
     joined,
     lens_shares,
     part_of,
     sides_of,
 )
-from alpasim_plugin.core.types import F32, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.core.types import F32, CameraSpec, Frame, RenderRequest, Scenario
 
 
 class LensCover:
@@ -24,6 +26,7 @@ class LensCover:
 
     Attributes:
         sides: The pinholes of each camera with a lens, by its name.
+        blind: See `blind_of`, likewise.
 
     Raises:
         InputError: See `check_lens`.
@@ -35,7 +38,13 @@ class LensCover:
         self.sides = {
             camera.name: sides_of(camera) for camera in cameras if camera.lens is not None
         }
+        self.blind = {name: blind_of(sides) for name, sides in self.sides.items()}
         self._shares: dict[tuple[str, str], F32] = {}
+
+    def drawn(self, scenario: Scenario) -> Scenario:
+        """Return a scenario with the pinholes in place of its cameras."""
+        pinholes = [one for camera in scenario.cameras for one in self.pinholes(camera)]
+        return replace(scenario, cameras=tuple(pinholes))
 
     def pinholes(self, camera: CameraSpec) -> list[CameraSpec]:
         """Return the pinholes of a camera."""

@@ -19,6 +19,7 @@ import numpy as np
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.lens import blackened
 from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
@@ -130,7 +131,12 @@ class BlockRunner:
                 f"{name}: {problem}",
                 "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
             )
-        return [frame.changed(references=()) for frame in fixed]
+        out = []
+        for frame in fixed:
+            blind = self.cover.blind.get(frame.camera)
+            image = {} if blind is None else {"rgb": blackened(frame.rgb, blind)}
+            out.append(frame.changed(references=(), **image))
+        return out
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

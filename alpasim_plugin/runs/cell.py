@@ -412,8 +412,7 @@ def make_renderer(
     require_kernels()
     spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
     cover = LensCover(scenario.cameras)
-    pinholes = [one for camera in scenario.cameras for one in cover.pinholes(camera)]
-    drawn = replace(scenario, cameras=tuple(pinholes))
+    drawn = cover.drawn(scenario)
     session = {"seed": seed, "device": device, "threads": threads}
     built: Renderer = build(spec.base, scenario=drawn, **session)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from alpasim_plugin.cli.output import size_lines
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import rays_of, sides_of
+from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.types import LensModel
 from alpasim_plugin.runs.lenses import drawn_pixels
 from scenarios.load import load_scenario
@@ -60,7 +61,10 @@ def test_a_run_says_before_the_first_frame_what_large_cameras_cost(tmp_path):
     scenarios = [
         load_scenario(written(tmp_path, f"{{rig: alpasim-4, width: {w}}}")) for w in (192, 1900)
     ]
-    small, large = (size_lines(SimpleNamespace(scenarios={"a": one})) for one in scenarios)
+    renderers = [resolve_renderer("onefixer")]
+    small, large = (
+        size_lines(SimpleNamespace(scenarios={"a": one}, renderers=renderers)) for one in scenarios
+    )
     assert small == []
     assert "8.2 megapixels" in large[0]
     assert "drawn as 11.5 by 10" in large[0]

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
+from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
@@ -218,8 +219,9 @@ class SceneCache:
         scenario = load_scenario(source)
         renderer, references, reads_device = None, None, False
         if self._spec is not None:
-            built = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
-            renderer = in_weather(built, scenario, self._session["seed"])
+            drawn = LensCover(scenario.cameras).drawn(scenario)
+            built = complete(build(self._spec.base, scenario=drawn, **self._session), Renderer)
+            renderer = in_weather(built, drawn, self._session["seed"])
             settings = self._spec.fixer and self._spec.fixer.settings
             reads_device = isinstance(settings, PixelFixerSettings)
             if isinstance(settings, FixerSettings):

@@ -17,6 +17,7 @@ from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import MAX_PIXELS, View, read_view
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import blackened
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -126,7 +127,7 @@ class FrameServer:
             past = None if parent is None else parent.state.past
             frame, after = self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, past)
             self.events.update(frame.events)
-            answered = Answered(frame.rgb, after)
+            answered = Answered(blackened(frame.rgb, item.blind), after)
             size = size_of(answered) + NODE_BYTES + OBJECT_BYTES * len(view.objects)
             return self.tree.add(view, answered, size, parent)
 

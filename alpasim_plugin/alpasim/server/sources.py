@@ -30,10 +30,10 @@ from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, read_sides, straight_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.geometry import interpolate, inverse, project
-from alpasim_plugin.core.lens import Lens
+from alpasim_plugin.core.lens import Lens, blind_of
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.shutter import at_share
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
@@ -94,6 +94,7 @@ class Rendered:
 
     frame: Frame
     sdmap: Any  # (H, W, 3) uint8, of the host or of a device
+    blind: Bool | None = None  # (H, W) where the lens sees nothing
 
 
 class FrameSource(Protocol):
@@ -206,7 +207,8 @@ def gated(
         found.there,
         found_at,
     )
-    return Rendered(rendered.frame.changed(events=(*rendered.frame.events, MAP_OFF)), None)
+    frame = rendered.frame.changed(events=(*rendered.frame.events, MAP_OFF))
+    return replace(rendered, frame=frame, sdmap=None)
 
 
 class LocalSource:
@@ -247,7 +249,7 @@ class LocalSource:
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
         with left.holding(self._busy):
             sdmap = drawn_map(entry, asked, sides, frames[0].device if entry.reads_device else None)
-        rendered = Rendered(joined(view.camera, sides, frames), sdmap)
+        rendered = Rendered(joined(view.camera, sides, frames), sdmap, blind_of(sides))
         if sdmap is None:
             return rendered
         ahead = max(range(len(sides)), key=lambda i: float(sides[i].T_lens_pinhole[2, 2]))

@@ -182,13 +182,17 @@ def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Stra
 
 
 def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
-    lens = lens_of(camera_of(spec, width, height))
+    camera = camera_of(spec, width, height)
+    if camera.lens is not None and camera.lens.kind == "fisheye":
+        widest_rad = min(camera.lens.max_angle_rad or WIDEST_RAD, WIDEST_RAD)
+        camera = replace(camera, lens=replace(camera.lens, max_angle_rad=widest_rad))
+    lens = lens_of(camera)
     if lens.resample is None:
         return Straight(lens.K, lens.cover, None)
     size = width, max(round(lens.cover[1] * width / lens.cover[0]), 1)
     K = np.diag([*(np.array(size) / lens.cover), 1.0]) @ lens.K
     pinhole = replace(lens, K=K, cover=size)
-    place, shown = place_in_lens(camera_of(spec, width, height), pinhole)
+    place, shown = place_in_lens(camera, pinhole)
     place[~shown] = -1e6
     return Straight(K, size, place)
 
@@ -242,7 +246,7 @@ def _opencv(p: Any, what: str) -> LensModel | None:
 
 
 def _fisheye(p: Any, what: str) -> LensModel:
-    return LensModel("fisheye", tuple(p.radial_coeffs), max_angle_rad=p.max_angle or WIDEST_RAD)
+    return LensModel("fisheye", tuple(p.radial_coeffs), max_angle_rad=p.max_angle)
 
 
 def _ftheta(p: Any, what: str) -> LensModel:

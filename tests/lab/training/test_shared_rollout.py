@@ -14,7 +14,6 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers.network.schedule import interpolant
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
-from tests.examples import first_of
 
 N = 8
 H = 4
@@ -112,31 +111,6 @@ def test_rollout_and_flow_matching_are_the_equations(net):
     assert_close(result.flow, expected, atol=1e-5, rtol=0)
     assert result.perceptual is None
     assert torch.equal(result.total, result.flow)
-
-
-@pytest.mark.parametrize("k", first_of([2, 8, 1, 4], 2))
-@pytest.mark.parametrize("w", first_of([5, 0, 4, 7], 2))
-def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net, k, w):
-    result = losses(net, sample(w), TEXT, Objectives(flow=None, horizon=k), at_w)
-    live = [z for z in result.predictions if z.requires_grad]
-    grads = torch.autograd.grad(result.total, [*live, *net.parameters()], allow_unused=True)
-    by_block = {id(z): g for z, g in zip(live, grads, strict=False)}
-    reached = torch.cat(
-        [
-            torch.zeros_like(z) if by_block.get(id(z)) is None else by_block[id(z)]
-            for z in result.predictions
-        ],
-        dim=2,
-    )
-    for position in range(w + 1):
-        size = reached[:, :, position].abs().max()
-        assert torch.isfinite(size)
-        in_history = (
-            position < w // 2 * 2
-        )  # w's own block is made at once: its other prediction is nobody's history yet
-        assert (size > 0) == (position > w - k and (in_history or position == w))
-    assert (reached[:, :, w + 1 :] == 0).all()
-    assert all(g is None or torch.isfinite(g).all() for g in grads)
 
 
 def test_history_of_every_kind_is_what_its_name_says(net):
