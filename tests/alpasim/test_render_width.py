@@ -16,6 +16,7 @@ def frames(requests, **settings):
     return [made.service.frames.answers([asked], CallTime())[0] for asked in requests]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", first_of(["clean", "onefixer+clean"]))
 def test_a_smaller_picture_is_enlarged_to_the_size_asked_for(renderer, overrides):
     given = {} if renderer == "clean" else {"overrides": overrides}

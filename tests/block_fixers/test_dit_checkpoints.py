@@ -131,6 +131,7 @@ def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
     assert_equal(back, sd)
 
 
+@pytest.mark.slow
 def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
     sd, folder = random_weights(SMALL), tmp_path / "shards"
     distributed.save({f"net.{key}": value for key, value in sd.items()}, checkpoint_id=folder)

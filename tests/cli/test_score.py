@@ -89,6 +89,7 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
 
 
+@pytest.mark.slow
 def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
     presets = "strict,nuplan,navsim"

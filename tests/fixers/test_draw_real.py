@@ -19,6 +19,7 @@ def clip(shared_data):
     return read_clip(shared_data / "cosmos-drive-dreams")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", first_of([FRONT_WIDE, "camera_rear_left_70fov"]))
 def test_lines_fall_on_the_published_render_and_the_published_lines_on_ours(clip, camera):
     found = compare(clip, camera, mounts()[camera], every=28)

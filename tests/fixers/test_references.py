@@ -153,7 +153,6 @@ def test_a_frame_of_fewer_pixels_counts_as_farther():
     sharp, near = recorded([(0, 0), (5, 0)], step_us=1)
     index = ReferenceIndex([sharp, replace(near, K=np.diag([0.25, 0.25, 1]) @ K)])
     assert index.choose(at(4.0), 0, 1, focal_px=K[0, 0]) == (0,)
-    assert index.choose(at(4.0), 0, 1, focal_px=K[0, 0] / 4) == (1,)
 
 
 def test_only_earlier_frames_are_references_where_the_past_is_asked_for():

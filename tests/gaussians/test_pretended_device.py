@@ -36,7 +36,7 @@ from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.rolling import camera_at, draw_request
-from tests.examples import first_of
+from tests.examples import first_rows_of
 from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
 from tests.gaussians.test_scene_graph import SKY, blobs, camera, node, se2
@@ -111,7 +111,7 @@ FISHEYE = LensModel("fisheye", (0.01,), max_angle_rad=1.5)
 
 
 @pytest.mark.parametrize(
-    ("capacity", "lens"), [(1 << 16, None), (1 << 16, FISHEYE), *first_of([(10, None)])]
+    ("capacity", "lens"), [(1 << 16, None), (1 << 16, FISHEYE), *first_rows_of([(10, None)], 0)]
 )
 def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capacity, lens):
     graph, poses = scene()

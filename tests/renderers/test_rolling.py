@@ -116,6 +116,7 @@ def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
     assert np.median(np.abs(rolled.depth - truth.depth)[both]) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("along", "backwards"), [("rows", True), ("columns", False)])
 def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(scenario, draw, along, backwards):
     request = case(with_camera(scenario, 128, 72), **HARD["all"])

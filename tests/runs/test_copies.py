@@ -103,6 +103,7 @@ def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path):
     assert inspect_run(tmp_path, full=True).damage == ()
 
 
+@pytest.mark.slow
 def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path):
     plan = plan_of(video="all")
     drive(plan, tmp_path / "all")

@@ -100,6 +100,7 @@ def test_the_order_depends_on_the_names_alone():
     assert sorted(drawing_order(names)) == sorted(names)
 
 
+@pytest.mark.slow
 def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp_path):
     before = read_decision(decided_run[0])
     root = tmp_path / "again"

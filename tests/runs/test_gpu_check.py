@@ -9,6 +9,7 @@ from alpasim_plugin.runs import gpu_check
 from tests.pretended_device import pretended_device
 
 
+@pytest.mark.slow
 def test_what_fails_says_why_and_the_rest_goes_on(monkeypatch):
     monkeypatch.setattr(gpu_check, "SECTIONS", {"unknown": gpu_check.card, "card": gpu_check.card})
     facts = dict(gpu_check.check_gpu("cpu", 100.0))

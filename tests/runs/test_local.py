@@ -48,6 +48,7 @@ def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_pat
     assert found == {item: item.upper() for item in ("a", "b", "c", "d", once)}
 
 
+@pytest.mark.slow
 def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not():
     found = dict(run_jobs(work, ["hangs", "a"], 1, limit_s=0.5))
     assert found["a"] == "A"

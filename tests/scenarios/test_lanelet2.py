@@ -124,9 +124,6 @@ def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_pa
 
 
 def test_latitude_and_longitude_become_east_and_north(tmp_path):
-    def globe(text):
-        return text.replace('lat="" lon=""', 'lat="{}" lon="{}"')
-
     nodes = [
         f'<node id="{10 * row + c}" lat="{49.0 + 4e-5 * row}" lon="{8.4 + 2e-3 * c}"/>'
         for row in (1, 2, 3)

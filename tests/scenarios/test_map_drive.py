@@ -276,6 +276,7 @@ def test_the_front_of_the_car_stays_on_the_road_in_a_tight_bend(tmp_path):
         assert shapely.distance(surface, shapely.points(corners[:, :2])).max() < 0.01
 
 
+@pytest.mark.slow
 def test_people_cross_where_the_route_passes_and_the_expert_lets_them(tmp_path):
     outline = "".join(
         f'<cornerLocal u="{u}" v="{v}"/>' for u, v in ((-2, -4), (2, -4), (2, 4), (-2, 4))
@@ -300,6 +301,7 @@ def test_people_cross_where_the_route_passes_and_the_expert_lets_them(tmp_path):
     assert not scenario(tmp_path, parts, *named("1:20", "2:150"), "map.pedestrians=0").actors
 
 
+@pytest.mark.slow
 def test_the_expert_and_vehicles_keep_the_posted_speed(tmp_path):
     first, second = two_roads()
     posted = '<type s="0" type="town"><speed max="18" unit="km/h"/></type>'

@@ -35,6 +35,7 @@ def begun(case, device, folder=None):
     return SplatFit(*case, RECIPE, "s", 1, folder, device)
 
 
+@pytest.mark.slow
 def test_every_view_gives_the_processors_gradients(case, monkeypatch):
     host = begun(case, "cpu")
     with pretended_device(monkeypatch):
