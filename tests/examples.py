@@ -9,7 +9,7 @@ import os
 import pytest
 
 PROFILE = os.environ.get("SIMRUN_HYPOTHESIS", "quick")
-SHARE = {"quick": 0.1, "nightly": 1.0}[PROFILE]
+SHARE = {"quick": 0.05, "nightly": 1.0}[PROFILE]
 FEWEST = 4
 
 

@@ -63,7 +63,7 @@ def grid(log):
     return np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1] + 1, 100_000)
 
 
-@pytest.mark.parametrize("name", first_of(LOGS[::-1], 3))
+@pytest.mark.parametrize("name", first_of(LOGS[::-1], 2))
 def test_the_human_drive_hits_nobody_stays_on_the_road_and_on_its_path(shared_data, name):
     rollout, scene = replayed(*(log := read(shared_data, name), grid(log)))
     series = score(rollout, scene)

@@ -67,7 +67,6 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
     ("vary", "named"),
     [
         ("actors.cuter.s_m=4..14", "cutter"),
-        ("actors.cutter.s_mm=4..14", "s_m"),
         ("actors.cutter.s_m=14..4", "14..4"),
         ("actors.cutter.s_m=a..b", "a..b"),
         ("actors.cutter.at_us=0..3", "0..3"),  # four values

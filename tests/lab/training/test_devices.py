@@ -13,6 +13,7 @@ from alpasim_plugin.lab.training.clips import CropSize
 from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.trainer import Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
+from tests.examples import first_of
 from tests.lab.training.test_generator import brightness, data, run_of  # noqa: F401 - data is a fixture
 from tests.pretended_device import pretended_device, traffic
 
@@ -48,7 +49,7 @@ def trained(recipe, data, folder, device, monkeypatch):
     return train_fixer(run, folder / "run", distance)
 
 
-@pytest.mark.parametrize("recipe", ["V9", "vae", pytest.param("base", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("recipe", first_of(["vae", "V9", "base"]))
 def test_a_recipe_on_a_device_equals_the_processors(recipe, data, tmp_path, monkeypatch, waits):
     with pretended_device(monkeypatch):
         found = load_weights(trained(recipe, data, tmp_path / "device", "cuda", monkeypatch))
