@@ -242,7 +242,7 @@ def moments(
                         break
             text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
         found.append({"t": t_ms, "kind": event.kind, "text": text})
-    # An event of the frames, such as a replaced frame, is told once where it goes on.
+    # Consecutive frames with the same event, such as replaced frames, make one event at the first.
     began = []
     before: set[str] = set()
     for row in frames:

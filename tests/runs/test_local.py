@@ -30,7 +30,7 @@ def work(item):
     if item == "leaves":
         os._exit(3)
     if item == "hangs":
-        time.sleep(60)
+        time.sleep(3600)
     if item == "stops":
         os.kill(os.getpid(), signal.SIGSTOP)
     if item == "raises":
@@ -103,9 +103,7 @@ def test_an_error_ends_the_work_and_reaches_the_parent(item, error):
 def test_work_that_is_left_early_ends_its_workers(item):
     outcomes = run_jobs(work, [item, "a"], 2)
     assert next(outcomes) == ("a", "A")
-    began_s = time.monotonic()
-    outcomes.close()
-    assert time.monotonic() - began_s < 30.0
+    outcomes.close()  # would outlast the test's time limit if it waited for the item
     assert multiprocessing.active_children() == []
 
 
