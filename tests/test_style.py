@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 
 from tests.test_layers import PACKAGES, modules
@@ -197,11 +198,21 @@ def makes_the_host_wait(call):
     return sends and inner & set(MAKES) and not dotted(call.args[0]).startswith("torch.")
 
 
-def test_tensors_of_the_host_are_sent_in_one_place_which_does_not_wait():
+def asks_for_the_device(node):
+    """Return whether code decides by the device that it runs on."""
+    if isinstance(node, ast.Compare):
+        return re.search(r"'(cpu|cuda)", ast.unparse(node))
+    return isinstance(node, ast.Attribute) and re.search(
+        r"device\.type$|\.is_(cuda|cpu)$", ast.unparse(node)
+    )
+
+
+def test_one_place_chooses_by_device_and_sends_tensors_of_the_host_without_waiting():
     found = {
         f"{module.name}:{node.lineno}"
         for module in modules()
+        if module.name != "alpasim_plugin.core.devices"
         for node in module.nodes
-        if isinstance(node, ast.Call) and makes_the_host_wait(node)
+        if asks_for_the_device(node) or (isinstance(node, ast.Call) and makes_the_host_wait(node))
     }
     assert found == set()

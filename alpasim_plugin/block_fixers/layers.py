@@ -22,6 +22,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.core.devices import autocast
+
 NORM_EPS = 1e-6
 PATCH = 2  # latent pixels per token side; one latent frame per token in time
 TIME_SCALE = 0.001
@@ -36,7 +38,7 @@ class Float32Linear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
-        with torch.autocast(input.device.type, enabled=False):
+        with autocast(input.device):
             return F.linear(input.float(), self.weight.float())
 
 

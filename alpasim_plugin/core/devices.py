@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from functools import partial
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy.typing as npt
 
@@ -14,6 +16,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 if TYPE_CHECKING:
     from torch import Tensor, device, dtype
 
+T = TypeVar("T")
 WARM_UP = 3  # calls before a function is recorded
 
 
@@ -43,9 +46,38 @@ def require_device(name: str) -> str:
     return f"cuda:{number}"
 
 
+def implementation(place: device | str, host: T, card: T) -> T:
+    """Return what serves a device: the CPU's own or that of cards. Nobody else compares devices."""
+    return host if str(place) == "cpu" else card
+
+
+def facts_of(place: str) -> dict[str, Any]:
+    """Return a card's name, memory, compute capability and version of CUDA; nothing of the CPU."""
+    return implementation(place, dict[str, Any], partial(_card_facts, place))()
+
+
+def _card_facts(place: str) -> dict[str, Any]:
+    import torch
+
+    properties = torch.cuda.get_device_properties(place)
+    return {
+        "card": properties.name,
+        "memory_gib": round(properties.total_memory / 2**30, 1),
+        "compute_capability": f"{properties.major}.{properties.minor}",
+        "cuda": torch.version.cuda,
+    }
+
+
+def autocast(place: device, dtype: dtype | None = None) -> AbstractContextManager[Any]:
+    """Return a context in which products of a device are rounded to a type; None: they are not."""
+    import torch
+
+    return torch.autocast(place.type, dtype or torch.bfloat16, enabled=dtype is not None)
+
+
 def share_card(device: str, workers: int) -> None:
     """Leave every worker of a card an equal share of its memory."""
-    if device != "cpu" and workers > 1:
+    if implementation(device, False, workers > 1):
         import torch
 
         torch.cuda.set_per_process_memory_fraction(1 / workers, device)
@@ -120,14 +152,9 @@ class CapturedFunction:
             return [part.clone() for part in self._made]
 
 
-def is_on_host(tensor: Tensor) -> bool:
-    """Return whether the host reads a tensor without waiting for a device."""
-    return tensor.device.type == "cpu"
-
-
 def known_false(mask: Tensor) -> bool:
     """Return whether a mask is false everywhere, where that is known without waiting."""
-    return is_on_host(mask) and not bool(mask.any())
+    return implementation(mask.device, True, False) and not bool(mask.any())
 
 
 def true_rows(mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,7 +163,7 @@ def true_rows(mask: Tensor) -> tuple[Tensor, Tensor]:
     """
     import torch
 
-    if is_on_host(mask):
+    if implementation(mask.device, True, False):
         rows = torch.nonzero(mask)[:, 0]
         return rows, torch.ones(len(rows))
     return torch.arange(len(mask), device=mask.device), mask.float()

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import torch
 
-from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.devices import implementation, require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
@@ -65,6 +65,6 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
         trained = False
         note = f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[settings.precision])
-    operations = CPU if device == "cpu" else TORCH
+    operations = implementation(device, CPU, TORCH)
     captured = operations is TORCH
     return LoadedGenerator(net, operations, trained, note, torch.device(device), captured)

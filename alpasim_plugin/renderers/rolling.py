@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
+from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.shutter import at_share, bands, motion_px
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
@@ -42,7 +43,7 @@ def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutpu
     spec = request.camera
     if request.exposure is None:
         return draw(camera_at(request, request.T_world_camera[1]), request.actors)
-    if device == "cpu" and 1 in request.exposure.share.shape:
+    if implementation(device, 1 in request.exposure.share.shape, False):
         return draw(*_rolling(request))
     exposed = bands(request)
     parts = [

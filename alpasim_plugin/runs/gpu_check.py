@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from alpasim_plugin.core.devices import download, require_device, upload
+from alpasim_plugin.core.devices import download, facts_of, implementation, require_device, upload
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
@@ -30,7 +30,7 @@ from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
+from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, compositor_of
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
@@ -82,13 +82,7 @@ def card(device: str) -> Facts:
     name = require_device(device)
     ones = torch.ones(64, 64, device=name)
     facts: Facts = {"ok": float((ones @ ones).sum()) == 64.0**3, "torch": torch.__version__}
-    if name != "cpu":
-        properties = torch.cuda.get_device_properties(name)
-        facts["card"] = properties.name
-        facts["memory_gib"] = round(properties.total_memory / 2**30, 1)
-        facts["compute_capability"] = f"{properties.major}.{properties.minor}"
-        facts["cuda"] = torch.version.cuda
-    return facts
+    return facts | facts_of(name)
 
 
 def rasteriser(device: str) -> Facts:
@@ -110,9 +104,9 @@ def semantic_map(device: str) -> Facts:
 
     def draws(width: int, height: int, name: str) -> Call:
         request = frame_request(scenario, width, height)
-        draw = partial(draw_exposed_map, scene, request, scenario.actors)
-        on_card = partial(draw, device=torch.device(name))
-        return draw if name == "cpu" else lambda: download(on_card())[0]
+        place = implementation(name, None, torch.device(name))
+        draw = partial(draw_exposed_map, scene, request, scenario.actors, device=place)
+        return lambda: torch.as_tensor(draw()).cpu().numpy()
 
     return compared(device, draws)
 
@@ -139,7 +133,7 @@ def gradient(device: str) -> Facts:
         K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
         view = cloud, PinholeCamera(width, height, K, np.eye(4))
         units = [1e-3 * np.abs(part).max() for part in _gradients(*view, None)]
-        compositor = None if name == "cpu" else TileCompositor(name)
+        compositor = compositor_of(name)
         return lambda: np.concatenate(
             [part / unit for part, unit in zip(_gradients(*view, compositor), units, strict=True)]
         )

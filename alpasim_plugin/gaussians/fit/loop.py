@@ -42,7 +42,7 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor
+from alpasim_plugin.gaussians.raster.rasterize_triton import compositor_of
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
@@ -146,7 +146,7 @@ class SplatFit:
         device: str = "cpu",
     ) -> None:
         self.device = require_device(device)
-        self.compositor = None if self.device == "cpu" else TileCompositor(self.device)
+        self.compositor = compositor_of(self.device)
         centres = np.array([view.camera.centre_world for view in views])
         origin = centres.mean(axis=0)
         self.recipe, self.scene_id, self.threads, self.folder = recipe, scene_id, threads, folder

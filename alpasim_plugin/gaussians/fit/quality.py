@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.devices import is_on_host, upload
+from alpasim_plugin.core.devices import implementation, upload
 from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, gaussian_blur
 from alpasim_plugin.core.types import U8
 
@@ -65,13 +65,19 @@ class SsimTarget:
 
     def blur(self, image: Tensor) -> Tensor:
         """Return local means ``(H, W, C)``."""
-        if is_on_host(image):
-            return torch.from_numpy(gaussian_blur(image.numpy()))
-        planes = image.permute(2, 0, 1)[:, None]
-        pad = WINDOW_PX // 2
-        across = F.conv2d(planes, self.window.view(1, 1, 1, -1), padding=(0, pad))
-        both = F.conv2d(across, self.window.view(1, 1, -1, 1), padding=(pad, 0))
-        return both[:, 0].permute(1, 2, 0)
+        return implementation(image.device, _blurred_on_host, _blurred_on_card)(image, self.window)
+
+
+def _blurred_on_host(image: Tensor, _: Tensor) -> Tensor:
+    return torch.from_numpy(gaussian_blur(image.numpy()))
+
+
+def _blurred_on_card(image: Tensor, window: Tensor) -> Tensor:
+    planes = image.permute(2, 0, 1)[:, None]
+    pad = WINDOW_PX // 2
+    across = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, pad))
+    both = F.conv2d(across, window.view(1, 1, -1, 1), padding=(pad, 0))
+    return both[:, 0].permute(1, 2, 0)
 
 
 class _Ssim(torch.autograd.Function):

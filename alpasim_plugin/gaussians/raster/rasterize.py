@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from importlib import import_module
+from typing import Literal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -11,6 +12,13 @@ from alpasim_plugin.gaussians.constants import NEAR_M
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput
 
 Backend = Literal["cpu", "reference", "torch", "triton"]
+# The module of each backend, imported on use: each brings its own heavy library.
+MODULES = {
+    "cpu": "rasterize_cpu",
+    "reference": "rasterize_reference",
+    "torch": "rasterize_gradient",
+    "triton": "rasterize_triton",
+}
 
 
 def rasterize(
@@ -47,24 +55,12 @@ def rasterize(
         >>> out.rgb.shape, round(float(out.depth[8, 16]), 3)
         ((16, 32, 3), 5.0)
     """
-    # Imported on use: each backend brings its own heavy library.
-    if backend == "cpu":
-        from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_cpu
-
-        return rasterize_cpu(cloud, camera, background, near_m=near_m)
-    if backend == "reference":
-        from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-
-        return rasterize_reference(cloud, camera, background, near_m=near_m)
-    if backend == "torch":
-        from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_torch
-
-        return rasterize_torch(cloud, camera, background, near_m=near_m)
-    if backend == "triton":
-        from alpasim_plugin.gaussians.raster.rasterize_triton import rasterize_triton
-
-        return rasterize_triton(cloud, camera, background, near_m=near_m)
-    raise InputError(
-        f"backend {backend!r}: no such backend",
-        f"choose one of {', '.join(get_args(Backend))}",
+    if backend not in MODULES:
+        raise InputError(
+            f"backend {backend!r}: no such backend", f"choose one of {', '.join(MODULES)}"
+        )
+    module = import_module(f"{__package__}.{MODULES[backend]}")
+    drawn: RasterOutput = getattr(module, f"rasterize_{backend}")(
+        cloud, camera, background, near_m=near_m
     )
+    return drawn

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.devices import require_device, upload
+from alpasim_plugin.core.devices import implementation, require_device, upload
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -179,6 +179,11 @@ class TileCompositor:
 
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=self.device)
+
+
+def compositor_of(device: str) -> TileCompositor | None:
+    """Return what blends splats on a card; None on the CPU, whose kernels share no memory."""
+    return implementation(device, lambda _: None, TileCompositor)(device)
 
 
 def tile_grid(camera: PinholeCamera) -> tuple[int, int]:

@@ -22,12 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from alpasim_plugin.core.detail import halvings_of
+from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -130,6 +131,7 @@ def nodes_by_tile(
 
 
 CELL_PX = 3.5  # larger is faster and coarser
+Chosen = tuple[SceneNode, int, F64 | None]  # a node, its level, and where it is if it moves
 
 
 class SceneGraph:
@@ -196,24 +198,9 @@ class SceneGraph:
             camera if rolling is None else camera.widened(rolling.reach_px), actor_poses, sharp
         )
         antialiased = [sharp > 0 and node.is_built for node, _, _ in chosen]
-        if device == "cpu":
-            prepared = [self._prepare(node, level) for node, level, _ in chosen]
-            nodes: list[Node] = [
-                (replace(one, antialias_px2=MIP_PX2) if filtered else one, T)
-                for one, filtered, (_, _, T) in zip(prepared, antialiased, chosen, strict=True)
-            ]
-            starts = (
-                []
-                if rolling is None
-                else [rolling.actors_start.get(node.name) for node, _, _ in chosen]
-            )
-            behind = self.sky.image(camera)
-            out = rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
-        else:
-            clouds, place = self._upload(device)
-            placed = [(place[node.name, i], T) for node, i, T in chosen]
-            sky = self.sky.on_device(camera, device)
-            out = clouds.draw(placed, camera, sky, antialiased=antialiased)
+        on_host = partial(self._draw_on_host, threads)
+        draw = implementation(device, on_host, partial(self._draw_on_card, device))
+        out = draw(chosen, antialiased, camera)
         stats = {
             **out.stats,
             "nodes": len(chosen),
@@ -221,9 +208,39 @@ class SceneGraph:
         }
         return replace(out, stats=stats)
 
+    def _draw_on_host(
+        self,
+        threads: int | None,
+        chosen: Sequence[Chosen],
+        antialiased: Sequence[bool],
+        camera: PinholeCamera,
+    ) -> RasterOutput:
+        prepared = [self._prepare(node, level) for node, level, _ in chosen]
+        nodes: list[Node] = [
+            (replace(one, antialias_px2=MIP_PX2) if filtered else one, T)
+            for one, filtered, (_, _, T) in zip(prepared, antialiased, chosen, strict=True)
+        ]
+        starts: list[F64 | None] = []
+        if camera.rolling is not None:
+            starts = [camera.rolling.actors_start.get(node.name) for node, _, _ in chosen]
+        behind = self.sky.image(camera)
+        return rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
+
+    def _draw_on_card(
+        self,
+        device: str,
+        chosen: Sequence[Chosen],
+        antialiased: Sequence[bool],
+        camera: PinholeCamera,
+    ) -> RasterOutput:
+        clouds, place = self._upload(device)
+        placed = [(place[node.name, i], T) for node, i, T in chosen]
+        sky = self.sky.on_device(camera, device)
+        return clouds.draw(placed, camera, sky, antialiased=antialiased)
+
     def _choose(
         self, camera: PinholeCamera, actor_poses: Mapping[str, F64], sharp: int
-    ) -> list[tuple[SceneNode, int, F64 | None]]:
+    ) -> list[Chosen]:
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
             raise RendererError(

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.core.atomic import atomic_file, disk_error, write_safetensors, write_text
-from alpasim_plugin.core.devices import upload
+from alpasim_plugin.core.devices import autocast, upload
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.reading import parse_json, parsing, read_text
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
@@ -278,11 +278,7 @@ class Trainer(Generic[Batch]):
         for part in range(n):
             index = self.step * n + part
             batch = self._batch(index)
-            with torch.autocast(
-                self.device.type,
-                self._autocast or torch.bfloat16,
-                enabled=self._autocast is not None,
-            ):
+            with autocast(self.device, self._autocast):
                 loss, numbers = self._loss(moved(batch, self.device), index)
             (loss / n).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": loss.detach(), **numbers}.items():
