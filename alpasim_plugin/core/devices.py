@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from threading import Lock
@@ -16,7 +16,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 if TYPE_CHECKING:
     from torch import Tensor, device, dtype
 
-T = TypeVar("T")
+S, T = TypeVar("S"), TypeVar("T")
 WARM_UP = 3  # calls before a function is recorded
 
 
@@ -49,6 +49,21 @@ def require_device(name: str) -> str:
 def implementation(place: device | str, host: T, card: T) -> T:
     """Return what serves a device: the CPU's own or that of cards. Nobody else compares devices."""
     return host if str(place) == "cpu" else card
+
+
+def batched(
+    items: Sequence[S], key: Callable[[S], Hashable], make: Callable[[list[S]], Sequence[T]]
+) -> list[T]:
+    """Return what a function makes of each item, in order; it is called once for all that share a
+    key, such as their size.
+    """
+    groups: dict[Hashable, list[int]] = {}
+    for index, item in enumerate(items):
+        groups.setdefault(key(item), []).append(index)
+    made: dict[int, T] = {}
+    for mine in groups.values():
+        made |= zip(mine, make([items[index] for index in mine]), strict=True)
+    return [made[index] for index in range(len(items))]
 
 
 def facts_of(place: str) -> dict[str, Any]:

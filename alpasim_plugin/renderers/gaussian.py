@@ -7,7 +7,7 @@ A frame is drawn at the shutter's end, unless its request says when its pixels a
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -15,15 +15,13 @@ import numpy as np
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import F64, Frame, RenderRequest, Scenario
-from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView
 from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
-from alpasim_plugin.renderers.rolling import draw_frame
+from alpasim_plugin.renderers.rolling import SplatRenderer
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
@@ -33,14 +31,12 @@ T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()
 
 
-class CleanRenderer(Renderer):
+class CleanRenderer(SplatRenderer):
     """Render the scene as built; its sky counts as opaque.
 
     Raises:
         InputError: Nothing was built: the scenario is an imported drive.
     """
-
-    has_history = False
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         if scenario.model is not None:
@@ -52,14 +48,13 @@ class CleanRenderer(Renderer):
         self.device = require_device(device)
         self.scene = scene_of(scenario)
 
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame."""
-        return draw_frame(request, self._drawn, self.device)
-
-    def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-        out = self.scene.render(camera, actors, self.threads, self.device)
-        surface = out.surface()  # before what is seen through it counts as opaque
-        return surface.covered(ALL) if self.scenario.background is None else surface
+    def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
+        """Draw images; what is seen through the scene counts as opaque, and has no depth."""
+        outs = self.scene.render_all(views, self.threads, self.device)
+        surfaces = [out.surface() for out in outs]
+        if self.scenario.background is not None:
+            return surfaces
+        return [surface.covered(ALL) for surface in surfaces]
 
 
 def scene_of(scenario: Scenario) -> SceneGraph:

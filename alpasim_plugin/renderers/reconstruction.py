@@ -12,7 +12,7 @@ that the recording's camera had near by: frames look as the drive's own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,13 +27,11 @@ from alpasim_plugin.core.types import (
     F32,
     F64,
     STANDING_ID,
-    Frame,
     Photograph,
     RecordedFrame,
     RenderRequest,
     Scenario,
 )
-from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.lens import gain_between
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.raster.output import RasterOutput
@@ -44,6 +42,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
     Level,
     SceneGraph,
     SceneNode,
+    SceneView,
     nodes_by_tile,
     tile_numbers,
 )
@@ -56,7 +55,7 @@ from alpasim_plugin.renderers.reconstruction_key import (
     reconstruction_key,
 )
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
-from alpasim_plugin.renderers.rolling import camera_at, draw_frame
+from alpasim_plugin.renderers.rolling import SplatRenderer
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size
@@ -70,12 +69,10 @@ class Model:
     sky: SkyMask
 
 
-class ReconstructionRenderer(Renderer):
+class ReconstructionRenderer(SplatRenderer):
     """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in
     the cache.
     """
-
-    has_history = False
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
@@ -83,13 +80,13 @@ class ReconstructionRenderer(Renderer):
         self.recipe = recipe_of(scenario, device)
         self.model = model_of(scenario, self.recipe, threads, device)
 
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame."""
-        return draw_frame(request, self._drawn, self.device)
-
-    def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-        out = self.model.graph.render(camera, actors, self.threads, self.device)
-        return out.surface().covered(self.model.sky.share(camera))
+    def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
+        """Draw images; the sky counts as opaque where the views of the fit showed it."""
+        outs = self.model.graph.render_all(views, self.threads, self.device)
+        return [
+            out.surface().covered(self.model.sky.share(camera))
+            for out, (camera, _) in zip(outs, views, strict=True)
+        ]
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return what the scenario's cameras saw along the log, at the believed poses; the drives
@@ -183,14 +180,12 @@ def _graph(model: Reconstruction, scenario: Scenario) -> SceneGraph:
     )
 
 
-class ImportedRenderer(Renderer):
+class ImportedRenderer(SplatRenderer):
     """Render the reconstruction of an imported drive.
 
     Raises:
         InputError: The folder of the scenario's model holds no finished reconstruction.
     """
-
-    has_history = False
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
         self.scenario, self.threads = scenario, threads
@@ -203,27 +198,30 @@ class ImportedRenderer(Renderer):
         )
         self.fitted = [one for one in scenario.recording if one.use == "fitted"]
 
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame."""
-        place = camera_at(request, request.T_world_camera[1]).centre_world
-        gain = exposure_near(self.fitted, request.camera.name, place)
-        return draw_frame(
-            request, lambda camera, actors: self._drawn(camera, actors).exposed(gain), self.device
-        )
+    def developed(self, request: RenderRequest, out: RasterOutput) -> RasterOutput:
+        """Return the image with the exposure that the recording's camera had near by."""
+        place = request.T_world_camera[1][:3, 3]
+        return out.exposed(exposure_near(self.fitted, request.camera.name, place))
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the photographs that the model was fitted to, with the depth that the model has
         there.
         """
         return photograph_recording(
-            self.scenario, lambda camera, actors: self._drawn(camera, actors).on_host().depth
+            self.scenario, lambda camera, actors: self.draw([(camera, actors)])[0].on_host().depth
         )
 
-    def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-        """Render with the sky as an opaque layer without depth."""
-        known = {name: T for name, T in actors.items() if name in self.graph.actors}
-        out = self.graph.render(camera, known, self.threads, self.device)
-        return out.with_sky(camera.above_horizon())
+    def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
+        """Draw images with the sky as an opaque layer without depth."""
+        known = [
+            (camera, {name: T for name, T in actors.items() if name in self.graph.actors})
+            for camera, actors in views
+        ]
+        outs = self.graph.render_all(known, self.threads, self.device)
+        return [
+            out.with_sky(camera.above_horizon())
+            for out, (camera, _) in zip(outs, known, strict=True)
+        ]
 
 
 def exposure_near(fitted: Sequence[Photograph], camera: str, place: F64) -> F32:

@@ -1,64 +1,101 @@
-"""Draw a frame of a rolling shutter: each of its bands from the pose, and with the road users, of
+"""Draw the frames of an instant; of a rolling shutter each of its bands from the pose, and with the road users, of
 the band's instant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.shutter import at_share, bands, motion_px
+from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.shutter import Band, at_share, bands, motion_px
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
 from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.scene.scene_graph import SceneView
 
 NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still looked for in full
-Draw = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
+Draw = Callable[[Sequence[SceneView]], Sequence[RasterOutput]]
 
 
-def draw_frame(request: RenderRequest, draw: Draw, device: str) -> Frame:
-    """Return the frame of a request; see `draw_request`. What a device drew stays there."""
-    return draw_request(request, draw, device).frame(request.t_us, request.camera.name)
+class SplatRenderer(Renderer):
+    """A renderer of Gaussians: the views of all cameras of an instant are drawn in one call."""
+
+    has_history = False
+    device: str
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame."""
+        return self.render_batch([request])[0]
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Render the frames of an instant. What a device drew stays there."""
+        outs = draw_requests(requests, self.draw, self.device)
+        return [
+            self.developed(request, out).frame(request.t_us, request.camera.name)
+            for request, out in zip(requests, outs, strict=True)
+        ]
+
+    @abstractmethod
+    def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
+        """Draw images with the road users at their boxes."""
+
+    def developed(self, request: RenderRequest, out: RasterOutput) -> RasterOutput:
+        """Return the image with the exposure of the request's camera."""
+        return out
 
 
-def draw_request(request: RenderRequest, draw: Draw, device: str) -> RasterOutput:
-    """Draw a request's frame; without an exposure at the shutter's end.
+def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) -> list[RasterOutput]:
+    """Draw the frames of requests; those without an exposure at the shutter's end.
 
     Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
     time of its pixel. Otherwise the frame is drawn in `bands`, which are joined where they were
     drawn.
 
     Args:
-        request: What to draw.
-        draw: Draws a camera's image with the road users at their boxes.
+        requests: What to draw.
+        draw: Draws the views of all.
         device: That of ``draw``.
 
     Returns:
-        The image; a pixel that nobody looks at is black and opaque. Depth is along the axis of
+        The images; a pixel that nobody looks at is black and opaque. Depth is along the axis of
         the pose at the pixel's time.
     """
-    spec = request.camera
+    cuts = [_cut(request, device) for request in requests]
+    drawn = iter(draw([view for cut in cuts for _, view in cut]))
+    outs = []
+    for request, cut in zip(requests, cuts, strict=True):
+        out, *_ = parts = [next(drawn) for _ in cut]
+        again = partial(draw_requests, [request], draw, device)
+        if cut[0][0] is not None:
+            out = out.blank(request.camera.height, request.camera.width, parts, again)
+        for (band, _), part in zip(cut, parts, strict=True):
+            if band is not None:
+                band.put(out.rgb, part.rgb)
+                band.put(out.alpha, part.alpha)
+                band.put(out.depth, part.depth)
+        outs.append(out)
+    return outs
+
+
+def _cut(request: RenderRequest, device: str) -> list[tuple[Band | None, SceneView]]:
+    """Return the bands that are drawn of a request and their views; None: the whole image."""
     if request.exposure is None:
-        return draw(camera_at(request, request.T_world_camera[1]), request.actors)
+        return [(None, (camera_at(request, request.T_world_camera[1]), request.actors))]
     if implementation(device, 1 in request.exposure.share.shape, False):
-        return draw(*_rolling(request))
-    exposed = bands(request)
-    parts = [
-        draw(camera_at(request, band.T_world_camera).window(band.rows, band.columns), band.actors)
-        for band in exposed
-    ]
-    again = partial(draw_request, request, draw, device)
-    out = parts[0].blank(spec.height, spec.width, parts, again)
-    for band, part in zip(exposed, parts, strict=True):
-        for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
-            band.put(whole, drawn)
-    return out
+        return [(None, _rolling(request))]
+    cut: list[tuple[Band | None, SceneView]] = []
+    for band in bands(request):
+        camera = camera_at(request, band.T_world_camera).window(band.rows, band.columns)
+        cut.append((band, (camera, band.actors)))
+    return cut
 
 
-def _rolling(request: RenderRequest) -> tuple[PinholeCamera, Mapping[str, F64]]:
+def _rolling(request: RenderRequest) -> SceneView:
     """Return the camera of a shutter that rolls along rows or columns, and the road users, both at
     its middle.
     """

@@ -35,7 +35,7 @@ from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.renderers.rolling import camera_at, draw_request
+from alpasim_plugin.renderers.rolling import camera_at, draw_requests
 from tests.examples import first_rows_of
 from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
@@ -96,8 +96,8 @@ def test_bands_of_a_rolling_shutter_are_joined_where_they_are_drawn(monkeypatch)
     request = RenderRequest(0, spec, np.stack([se2(0.3, 0, 0) @ T, T]), {}, exposure=exposure)
 
     def drawn(device):
-        draw = partial(graph.render, device=device if "cuda" in device else "cpu")
-        return draw_request(request, draw, device).frame(0, "front")
+        draw = partial(graph.render_all, device=device if "cuda" in device else "cpu")
+        return draw_requests([request], draw, device)[0].frame(0, "front")
 
     wanted = drawn("bands")
     with pretended_device(monkeypatch) as traffic:

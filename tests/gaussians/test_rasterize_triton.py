@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
@@ -31,11 +32,21 @@ from tests.gaussians.gradient_scenes import assert_close, kernel_gradients, nume
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, UploadedClouds
+from alpasim_plugin.gaussians.raster.rasterize_triton import (
+    DrawnCloud,
+    TileCompositor,
+    UploadedClouds,
+)
 
 
 def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0)):
-    return UploadedClouds([cloud], "cpu").draw([(0, None)], cam, behind, 0.1).on_host()
+    return drawn(UploadedClouds([cloud], "cpu"), [(0, None)], cam, behind)
+
+
+def drawn(clouds, nodes, cam, behind=(0.0, 0.0, 0.0)):
+    return clouds.draw([(cam, [DrawnCloud(*node) for node in nodes])], torch.tensor(behind), 0.1)[
+        0
+    ].on_host()
 
 
 def moved(cloud, offset):
@@ -84,22 +95,27 @@ def test_coordinates_of_utm_size_cost_no_precision():
     assert_same_image(interpreted(moved(cloud, offset), far), interpreted(cloud, near), LSB)
 
 
-def test_nodes_at_poses_equal_the_processor():
+def test_nodes_at_poses_in_two_views_at_once_equal_the_processor():
     clouds = [random_cloud(60, 1), *(random_cloud(20, seed, degree=1) for seed in (2, 3))]
     clouds[1] = replace(clouds[1], antialias_px2=MIP_PX2)
     poses = [None, *(random_rigid(seed, 1.0) for seed in (2, 3))]
-    behind = np.random.default_rng(1).random((64, 96, 3)).astype(np.float32)
-    drawn = UploadedClouds(clouds, "cpu").draw(list(enumerate(poses)), camera(), behind)
-    nodes = [(prepare(cloud), T) for cloud, T in zip(clouds, poses, strict=True)]
-    wanted = rasterize_prepared(nodes, camera(), behind)
-    assert_same_image(drawn.on_host(), wanted, LSB)
+    behind = np.random.default_rng(1).random((60, 90, 3)).astype(np.float32)
+    nodes = [DrawnCloud(*pair) for pair in enumerate(poses)]
+    placed = list(zip(map(prepare, clouds), poses, strict=True))
+    aside = np.eye(4)
+    aside[0, 3] = 0.7
+    cameras = camera(90, 60), camera(90, 60, T_camera_world=aside)
+    views = list(zip(cameras, (nodes, nodes[1:]), strict=True))
+    both = UploadedClouds(clouds, "cpu").draw(views, torch.tensor(behind))
+    for found, cam, mine in zip(both, cameras, (placed, placed[1:]), strict=True):
+        assert_same_image(found.on_host(), rasterize_prepared(mine, cam, behind), LSB)
 
 
 def test_equal_depths_are_drawn_in_the_order_of_the_nodes():
     red, green = (splats([0, 0, 4.0], 3.0, 0.9, rgb) for rgb in ((1, 0, 0), (0, 1, 0)))
     clouds = UploadedClouds([red, green], "cpu")
-    first = clouds.draw([(0, None), (1, np.eye(4))], camera()).rgb[32, 48]
-    second = clouds.draw([(1, np.eye(4)), (0, None)], camera()).rgb[32, 48]
+    first = drawn(clouds, [(0, None), (1, np.eye(4))], camera()).rgb[32, 48]
+    second = drawn(clouds, [(1, np.eye(4)), (0, None)], camera()).rgb[32, 48]
     assert first == pytest.approx([0.9, 0.09, 0], abs=2e-3)
     assert second == pytest.approx([0.09, 0.9, 0], abs=2e-3)
 
@@ -108,7 +124,7 @@ def test_lists_that_outgrow_their_room_are_drawn_again():
     cloud = random_cloud(60, 9)
     small = UploadedClouds([cloud], "cpu")
     small.capacity = 10
-    found = small.draw([(0, None)], camera(48, 32, 40.0)).on_host()
+    found = drawn(small, [(0, None)], camera(48, 32, 40.0))
     assert small.capacity > 10
     assert_same_image(found, interpreted(cloud, camera(48, 32, 40.0)), 0.0)
 
@@ -129,8 +145,6 @@ def test_the_gradient_of_a_hard_case_is_that_of_the_reference(make):
 def test_bad_devices_are_refused():
     with pytest.raises(InputError):
         UploadedClouds([], "gpu")
-    import torch
-
     if not torch.cuda.is_available():
         with pytest.raises(InfrastructureError):
             rasterize(random_cloud(1), camera(), backend="triton")

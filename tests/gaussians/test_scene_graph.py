@@ -48,7 +48,7 @@ def node(name, cloud, kind="background", far_m=1e9):
 
 
 def joined(chosen):
-    clouds = [(node.levels[level].cloud, T) for node, level, T in chosen]
+    clouds = [(node.levels[level].cloud, T) for node, level, T, _ in chosen]
     return GaussianCloud.concatenate([c if T is None else c.transformed(T) for c, T in clouds])
 
 

@@ -16,7 +16,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
-from alpasim_plugin.renderers.rolling import camera_at, draw_request
+from alpasim_plugin.renderers.rolling import camera_at, draw_requests
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
 SHUTTER_S = 0.03
@@ -24,7 +24,7 @@ STANDS = se2(20.0, -1.8, 0.0)
 
 
 def plain_draw_request(request, draw):
-    """Return the same as `draw_request`, by the definition: for each time of exposure the whole
+    """Return the same as `draw_requests`, by the definition: for each time of exposure the whole
     picture, of which its pixels are taken.
     """
     spec = request.camera
@@ -35,7 +35,7 @@ def plain_draw_request(request, draw):
     )
     for time in np.unique(share[~np.isnan(share)]):
         T, actors = at_share(request, float(time))
-        part = draw(camera_at(request, T), actors)
+        (part,) = draw([(camera_at(request, T), actors)])
         mine = share == time
         for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
             whole[mine] = drawn[mine]
@@ -51,9 +51,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def draw(scenario):
-    def drawn(camera, actors):
-        out = scene_of(scenario).render(camera, actors, 1)
-        return out.covered(np.ones((1, 1), np.float32))
+    def drawn(views):
+        outs = scene_of(scenario).render_all(views, 1)
+        return [out.covered(np.ones((1, 1), np.float32)) for out in outs]
 
     return drawn
 
@@ -106,8 +106,8 @@ def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
     device,
 ):
     request = case(scenario, **HARD[name])
-    truth, rolled = truth_of(name), draw_request(request, draw, device)
-    at_end = draw_request(replace(request, exposure=None), draw, device)
+    truth, rolled = truth_of(name), draw_requests([request], draw, device)[0]
+    (at_end,) = draw_requests([replace(request, exposure=None)], draw, device)
     assert psnr(rolled, truth) > 34
     assert psnr(rolled, truth) > psnr(at_end, truth) + 8
     assert np.abs(rolled.rgb - truth.rgb).mean() < 1.5 / 255
@@ -124,7 +124,7 @@ def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(scenario, draw, alo
     share = rolling(request.camera.width, request.camera.height, along, backwards)
     request = replace(request, exposure=replace(request.exposure, share=share))
     truth = plain_draw_request(request, draw)
-    assert psnr(draw_request(request, draw, "cpu"), truth) > 32
+    assert psnr(*draw_requests([request], draw, "cpu"), truth) > 32
 
 
 def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
@@ -140,7 +140,7 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
             "alpasim_plugin.renderers.rolling.bands",
             partial(lambda r, n: list(bands_of(r, n)), n=count),
         )
-        errors.append(psnr(draw_request(request, draw, "bands"), truth))
+        errors.append(psnr(*draw_requests([request], draw, "bands"), truth))
     assert all(later > earlier + 6 for earlier, later in pairwise(errors)), errors
     assert (
         errors[-1] > 90
@@ -149,19 +149,16 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
 
 def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario, draw):
     request = case(scenario)
-    np.testing.assert_array_equal(
-        draw_request(request, draw, "cpu").rgb,
-        draw_request(replace(request, exposure=None), draw, "cpu").rgb,
-    )
+    both = draw_requests([request, replace(request, exposure=None)], draw, "cpu")
+    np.testing.assert_array_equal(*(one.rgb for one in both))
 
 
 def test_a_window_shows_what_the_whole_picture_does(scenario, draw):
     """Splats that reach into a window from far outside of it keep their shape."""
     spec = scenario.cameras[0]
     camera = PinholeCamera.from_pose(spec.width, spec.height, spec.K, STANDS @ spec.T_rig_camera)
-    whole = draw(camera, {})
     rows, columns = slice(100, 107), slice(60, 200)
-    part = draw(camera.window(rows, columns), {})
+    whole, part = draw([(camera, {}), (camera.window(rows, columns), {})])
     assert np.abs(part.rgb - whole.rgb[rows, columns]).max() < 2e-3
     assert (
         camera.window(rows, columns).window(slice(0, 2), slice(3, 9)).slope_limits()

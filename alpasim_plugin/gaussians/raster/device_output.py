@@ -67,7 +67,7 @@ class DeviceOutput(RasterOutput):
             alpha=self.alpha.new_ones((height, width)),
             depth=self.depth.new_zeros((height, width)),
             pairs=torch.stack([part.pairs for part in parts]).amax(),
-            again=again,
+            again=lambda: again()[0],
         )
 
     def surface(self) -> DeviceOutput:

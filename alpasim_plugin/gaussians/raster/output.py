@@ -45,14 +45,15 @@ class RasterOutput:
         height: int,
         width: int,
         parts: Sequence[RasterOutput],
-        again: Callable[[], RasterOutput],
+        again: Callable[[], Sequence[RasterOutput]],
     ) -> RasterOutput:
         """Return a black and opaque image without depth, into which parts are to be written.
 
         Args:
             height, width: Pixels.
             parts: Drawn where this one was.
-            again: Draws the image with all parts once more, where a device lacked room for one.
+            again: Draws the image with all parts once more, where a device lacked room for one;
+                alone in a list.
         """
         rgb, alpha = np.zeros((height, width, 3), np.float32), np.ones((height, width), np.float32)
         return RasterOutput(rgb, alpha, np.zeros_like(alpha))

@@ -391,7 +391,7 @@ def _on_gpu(
         by_pixel = torch.cat([by_colour, by_depth[..., None], by_alpha[..., None]], dim=2)
         return compositor.gradient(view, by_pixel, PAIR)
 
-    image = view.image
+    (image,) = view.image
     return (image[..., :3], 1 - image[..., 4], image[..., 3]), sums, counts.sum()
 
 

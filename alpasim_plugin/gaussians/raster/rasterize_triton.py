@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +57,7 @@ class TiledImage:
     """A view that a device composited, with what its gradient needs.
 
     Attributes:
-        image: ``(H, W, PIXEL)``, see `triton_kernels.composite`.
+        image: ``(V, H, W, PIXEL)``, see `triton_kernels.composite`.
         records: ``(N, RECORD)`` projected splats.
         order: ``(N,)`` splats, nearest first.
         ends: ``(N,)`` where the pairs of each end, in this order.
@@ -98,25 +98,30 @@ class TileCompositor:
         return count <= capacity
 
     def composite(
-        self, records: Tensor, depths: Tensor, boxes: Tensor, counts: Tensor, camera: PinholeCamera
+        self,
+        records: Tensor,
+        depths: Tensor,
+        boxes: Tensor,
+        counts: Tensor,
+        camera: PinholeCamera,
+        views: int = 1,
     ) -> TiledImage:
-        """Blend projected splats; the view is whole if their pairs are at most `capacity`.
+        """Blend projected splats; the views are whole if their pairs are at most `capacity`.
 
         Args:
             records: ``(N, RECORD)``.
             depths: ``(N,)``.
-            boxes: ``(N, BOX)``.
+            boxes: ``(N, BOX)``; the tiles of a view stand below those of the view before.
             counts: ``(N,)`` int32, tiles of each; 0 for what is not drawn.
-            camera: Gives the image's size.
+            camera: Gives the images' size.
+            views: Their number.
         """
         kernels, width, height = self.kernels, camera.width, camera.height
         tiles_x, tiles_y = tile_grid(camera)
-        total = len(records)
+        total, tile_count = len(records), views * tiles_x * tiles_y
         order = torch.sort(depths, stable=True).indices
         ends = torch.cumsum(counts[order], dim=0)
-        tiles = torch.full(
-            (self.capacity,), tiles_x * tiles_y, dtype=torch.int32, device=self.device
-        )
+        tiles = torch.full((self.capacity,), tile_count, dtype=torch.int32, device=self.device)
         splats = torch.zeros_like(tiles)
         if total:
             kernels.list_tiles[(-(-total // BLOCK),)](
@@ -132,11 +137,11 @@ class TileCompositor:
                 BLOCK=BLOCK,
             )
         sorted_tiles, places = torch.sort(tiles, stable=True)
-        every = torch.arange(tiles_x * tiles_y + 1, dtype=torch.int32, device=self.device)
+        every = torch.arange(tile_count + 1, dtype=torch.int32, device=self.device)
         starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
         splats = splats[places]
-        image = self._empty((height, width, kernels.PIXEL), torch.float32)
-        kernels.composite[(tiles_x * tiles_y,)](
+        image = self._empty((views, height, width, kernels.PIXEL), torch.float32)
+        kernels.composite[(tile_count,)](
             records,
             splats,
             starts,
@@ -144,6 +149,7 @@ class TileCompositor:
             width,
             height,
             tiles_x,
+            tiles_y,
             TILE=TILE,
             CHUNK=CHUNK,
         )
@@ -154,11 +160,11 @@ class TileCompositor:
         each splat, always added in one order.
 
         Args:
-            view: What was composited.
+            view: What was composited, one view.
             by_pixel: ``(H, W, 5)`` gradients of colour, weighted depth and opacity.
             columns: Numbers per pair.
         """
-        height, width = view.image.shape[:2]
+        height, width = view.image.shape[1:3]
         pairs = by_pixel.new_zeros(len(view.splats), columns)
         self.kernels.composite_backward[(len(view.starts) - 1,)](
             view.records,
@@ -189,6 +195,18 @@ def compositor_of(device: str) -> TileCompositor | None:
 def tile_grid(camera: PinholeCamera) -> tuple[int, int]:
     """Return how many tiles an image has in a row and in a column."""
     return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+class DrawnCloud(NamedTuple):
+    """An uploaded cloud in a view."""
+
+    cloud: int  # its place among those uploaded
+    T_world_node: FloatArray | None = None  # (4, 4); None: the identity
+    antialiased: bool = False  # drawn with a filter that it may lack
+
+
+# From where, and what; equal depths are drawn in this order.
+CloudView = tuple[PinholeCamera, Sequence[DrawnCloud]]
 
 
 class UploadedClouds(TileCompositor):
@@ -231,59 +249,55 @@ class UploadedClouds(TileCompositor):
         )
 
     def draw(
-        self,
-        nodes: Sequence[tuple[int, FloatArray | None]],
-        camera: PinholeCamera,
-        background: Background | Tensor = (0.0, 0.0, 0.0),
-        near_m: float = NEAR_M,
-        antialiased: Sequence[bool] = (),
-    ) -> DeviceOutput:
-        """Render clouds at rigid poses in one image, which stays on the device.
+        self, views: Sequence[CloudView], behind: Tensor, near_m: float = NEAR_M
+    ) -> list[DeviceOutput]:
+        """Render views of one size, whose images stay on the device.
 
         Args:
-            nodes: Position of the cloud among those uploaded, and ``T_world_node`` or None for the
-                identity. Equal depths are drawn in the order of the nodes.
-            camera: From where.
-            background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything; a tensor is
-                the device's.
+            views: Cameras, and clouds at rigid poses.
+            behind: What is behind everything, ``(V, H, W, 3)`` or of shapes that broadcast to it.
             near_m: Gaussians whose centre is nearer are left out.
-            antialiased: Which nodes are drawn with a filter that their clouds may lack.
 
         Raises:
-            InputError: A transform is not rigid or the background does not fit.
+            InputError: A transform is not rigid.
         """
-        behind = background
-        if not isinstance(behind, Tensor):
-            behind = self._upload(background_image(behind, camera), np.float32)
-        spans = self._spans([cloud for cloud, _ in nodes])
-        poses = node_poses([T for _, T in nodes], camera, near_m)[:, : self.kernels.POSE]
-        poses[:, POSE_ANTIALIAS] = [self.antialias_px2[cloud] for cloud, _ in nodes]
-        poses[np.flatnonzero(antialiased), POSE_ANTIALIAS] = MIP_PX2
         had_room = partial(self.had_room, self.capacity)
-        image, pairs = self._image(spans, poses, camera, near_m)
+        image, pairs = self._image(views, near_m)
         transmittance = image[..., 4]
         alpha = 1 - transmittance
         rgb = (image[..., :3] + transmittance[..., None] * behind).clamp(0, 1)
         depth = torch.where(alpha > 0, image[..., 3] / alpha, 0.0)
+        backgrounds = behind.expand(rgb.shape)
 
-        def again() -> DeviceOutput:
-            return self.draw(nodes, camera, background, near_m, antialiased)
+        def again(index: int) -> DeviceOutput:
+            return self.draw([views[index]], backgrounds[index], near_m)[0]
 
-        return DeviceOutput(
-            rgb=rgb, alpha=alpha, depth=depth, pairs=pairs, had_room=had_room, again=again
-        )
+        return [
+            DeviceOutput(
+                rgb=rgb[index],
+                alpha=alpha[index],
+                depth=depth[index],
+                pairs=pairs,
+                had_room=had_room,
+                again=partial(again, index),
+            )
+            for index in range(len(views))
+        ]
 
-    def _image(
-        self, spans: npt.NDArray[np.int32], poses: F64, camera: PinholeCamera, near_m: float
-    ) -> tuple[Tensor, Tensor]:
+    def _image(self, views: Sequence[CloudView], near_m: float) -> tuple[Tensor, Tensor]:
         """Return what `composite` does of the clouds, and the number of pairs of splat and tile."""
-        kernels, (tiles_x, tiles_y) = self.kernels, tile_grid(camera)
+        kernels = self.kernels
+        poses = np.concatenate([self._poses(*view, near_m) for view in views])
+        numbers = [
+            [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
+            for camera, _ in views
+        ]
+        spans = self._spans(views)
         total = len(spans) * BLOCK
         records = self._empty((total, kernels.RECORD), torch.float32)
         depths = self._empty((total,), torch.float32)
         boxes = self._empty((total, kernels.BOX), torch.int32)
         counts = self._empty((total,), torch.int32)
-        numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
         if total:
             kernels.project[(len(spans),)](
                 self._upload(spans, np.int32),
@@ -299,25 +313,34 @@ class UploadedClouds(TileCompositor):
                 boxes,
                 counts,
                 near_m,
-                tiles_x,
-                tiles_y,
+                *tile_grid(views[0][0]),
                 SIZE=self.sh_size,
                 TILE=TILE,
                 BLOCK=BLOCK,
             )
-        view = self.composite(records, depths, boxes, counts, camera)
-        return view.image, counts.sum(dtype=torch.int32)
+        drawn = self.composite(records, depths, boxes, counts, views[0][0], len(views))
+        return drawn.image, counts.sum(dtype=torch.int32)
 
-    def _spans(self, clouds: Sequence[int]) -> npt.NDArray[np.int32]:
-        """Return the table of blocks ``(B, 3)``: node, first Gaussian, number of Gaussians."""
+    def _poses(self, camera: PinholeCamera, nodes: Sequence[DrawnCloud], near_m: float) -> F64:
+        """Return the poses of a view's nodes ``(N, POSE)``."""
+        poses = node_poses([node.T_world_node for node in nodes], camera, near_m)
+        poses[:, POSE_ANTIALIAS] = [
+            MIP_PX2 if node.antialiased else self.antialias_px2[node.cloud] for node in nodes
+        ]
+        return poses[:, : self.kernels.POSE]
+
+    def _spans(self, views: Sequence[CloudView]) -> npt.NDArray[np.int32]:
+        """Return the table of blocks ``(B, SPAN)``: node among those of all views, first Gaussian,
+        number of Gaussians, view.
+        """
         spans = []
-        for node, cloud in enumerate(clouds):
+        drawn = [(view, node.cloud) for view, (_, nodes) in enumerate(views) for node in nodes]
+        for node, (view, cloud) in enumerate(drawn):
             begins = np.arange(0, self.sizes[cloud], BLOCK)
             sizes = np.minimum(self.sizes[cloud] - begins, BLOCK)
-            spans.append(
-                np.column_stack([np.full_like(begins, node), self.first[cloud] + begins, sizes])
-            )
-        return _joined(spans, (3,)).astype(np.int32)
+            columns = np.broadcast_arrays(node, self.first[cloud] + begins, sizes, view)
+            spans.append(np.column_stack(columns))
+        return _joined(spans, (self.kernels.SPAN,)).astype(np.int32)
 
     def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
         return upload(np.asarray(array, dtype), self.device)
@@ -343,5 +366,6 @@ def rasterize_triton(
         RendererError: Triton is not installed.
         InfrastructureError: There is no such device.
     """
-    drawn = UploadedClouds([cloud], device).draw([(0, None)], camera, background, near_m)
-    return drawn.on_host()
+    clouds = UploadedClouds([cloud], device)
+    behind = upload(background_image(background, camera), clouds.device)
+    return clouds.draw([(camera, [DrawnCloud(0)])], behind, near_m)[0].on_host()

@@ -18,6 +18,7 @@ from alpasim_plugin.gaussians import constants, sh
 POSE = 13  # float64 per node: rotation node to camera by rows, camera centre in it, its 2D filter
 CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
 RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
+SPAN = 4  # int32 per block of Gaussians: node, first, number, view
 BOX = 4  # int32 per splat: first and last + 1 tile column, first and last + 1 tile row
 PIXEL = 6  # float32 per pixel: see `composite`
 
@@ -97,13 +98,17 @@ def project(
     """Project a block of Gaussians of one node: its record, depth, box of tiles and their count.
 
     Positions are float64 up to the camera's axes, so that UTM-sized coordinates keep millimetres.
-    A Gaussian that is not drawn has depth infinity and no tile.
+    A Gaussian that is not drawn has depth infinity and no tile. The tiles of a view stand below
+    those of the view before.
     """
     block = tl.program_id(0)
-    node = tl.load(spans + block * 3)
+    node = tl.load(spans + block * 4)
     lane = tl.arange(0, BLOCK)
-    present = lane < tl.load(spans + block * 3 + 2)
-    i = (tl.load(spans + block * 3 + 1) + lane).to(tl.int64)
+    present = lane < tl.load(spans + block * 4 + 2)
+    i = (tl.load(spans + block * 4 + 1) + lane).to(tl.int64)
+    view = tl.load(spans + block * 4 + 3)
+    camera += view * 8
+    above = view * tiles_y
     pose = poses + node * 13
     r00 = tl.load(pose)
     r01 = tl.load(pose + 1)
@@ -189,8 +194,8 @@ def project(
     tl.store(counts + slot, count)
     tl.store(boxes + slot * 4, x0)
     tl.store(boxes + slot * 4 + 1, x1)
-    tl.store(boxes + slot * 4 + 2, y0)
-    tl.store(boxes + slot * 4 + 3, y1)
+    tl.store(boxes + slot * 4 + 2, above + y0)
+    tl.store(boxes + slot * 4 + 3, above + y1)
     seen = count > 0
     record = records + slot * 12
     tl.store(record, u, seen)
@@ -249,6 +254,7 @@ def composite(
     width,
     height,
     tiles_x,
+    tiles_y,
     TILE: tl.constexpr,
     CHUNK: tl.constexpr,
 ):
@@ -256,7 +262,9 @@ def composite(
     the last of the six numbers is the place in the tile's list behind the last splat drawn.
     """
     tile = tl.program_id(0)
-    column, row = _pixels(tile, tiles_x, TILE)
+    tiles = tiles_x * tiles_y
+    column, row = _pixels(tile % tiles, tiles_x, TILE)
+    image += (tile // tiles).to(tl.int64) * (height * width * 6)
     px = column.to(tl.float32) + 0.5
     py = row.to(tl.float32) + 0.5
     transmittance = tl.full((TILE, TILE), 1.0, tl.float32)

@@ -23,12 +23,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from alpasim_plugin.core.detail import halvings_of
-from alpasim_plugin.core.devices import implementation
+from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -40,6 +40,7 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
 
 if TYPE_CHECKING:
+    from alpasim_plugin.gaussians.raster.device_output import DeviceOutput
     from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
 
 
@@ -131,7 +132,16 @@ def nodes_by_tile(
 
 
 CELL_PX = 3.5  # larger is faster and coarser
-Chosen = tuple[SceneNode, int, F64 | None]  # a node, its level, and where it is if it moves
+SceneView = tuple[PinholeCamera, Mapping[str, F64]]  # from where, and ``T_world_box`` of the actors
+
+
+class ChosenNode(NamedTuple):
+    """A node that a camera may see."""
+
+    node: SceneNode
+    level: int
+    T_world_node: F64 | None  # (4, 4); None: the identity
+    antialiased: bool
 
 
 class SceneGraph:
@@ -175,72 +185,87 @@ class SceneGraph:
         device: str = "cpu",
         px_per_rad: float | None = None,
     ) -> RasterOutput:
-        """Render one view.
+        """Render one view; see `render_all`."""
+        return self.render_all([(camera, actor_poses)], threads, device, px_per_rad)[0]
+
+    def render_all(
+        self,
+        views: Sequence[SceneView],
+        threads: int | None = None,
+        device: str = "cpu",
+        px_per_rad: float | None = None,
+    ) -> list[RasterOutput]:
+        """Render views; a GPU draws those of one size together.
 
         Args:
-            camera: From where.
-            actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
+            views: From where, and actor id to ``T_world_box (4, 4)`` of the actors present.
             threads: Thread count on the CPU; None leaves it as it is.
             device: Where to draw. The first frame on a GPU uploads all nodes.
             px_per_rad: Of the camera whose smaller image this is, which decides whether it is
                 sharp; None: the camera's own.
 
         Returns:
-            Colour with sky, alpha, depth, and ``stats`` with ``visible`` (on the CPU), ``nodes``
+            Of each view colour with sky, alpha, depth, and ``stats`` with ``visible`` (on the CPU), ``nodes``
             (drawn) and ``nodes_total``. A GPU's is a `DeviceOutput`.
 
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
         """
-        rolling = camera.rolling
-        sharp = halvings_of(px_per_rad or camera.fx)
-        chosen = self._choose(
-            camera if rolling is None else camera.widened(rolling.reach_px), actor_poses, sharp
-        )
-        antialiased = [sharp > 0 and node.is_built for node, _, _ in chosen]
-        on_host = partial(self._draw_on_host, threads)
-        draw = implementation(device, on_host, partial(self._draw_on_card, device))
-        out = draw(chosen, antialiased, camera)
-        stats = {
-            **out.stats,
-            "nodes": len(chosen),
-            "nodes_total": len(self.background) + len(actor_poses),
-        }
-        return replace(out, stats=stats)
+        chosen = [
+            (camera, self._choose(camera, poses, halvings_of(px_per_rad or camera.fx)))
+            for camera, poses in views
+        ]
+        one_by_one = partial(map, partial(self._draw_on_host, threads))
+        draw = implementation(device, one_by_one, partial(self._draw_on_card, device))
+        return [
+            replace(
+                out,
+                stats={
+                    **out.stats,
+                    "nodes": len(nodes),
+                    "nodes_total": len(self.background) + len(poses),
+                },
+            )
+            for out, (_, nodes), (_, poses) in zip(draw(chosen), chosen, views, strict=True)
+        ]
 
     def _draw_on_host(
-        self,
-        threads: int | None,
-        chosen: Sequence[Chosen],
-        antialiased: Sequence[bool],
-        camera: PinholeCamera,
+        self, threads: int | None, view: tuple[PinholeCamera, Sequence[ChosenNode]]
     ) -> RasterOutput:
-        prepared = [self._prepare(node, level) for node, level, _ in chosen]
-        nodes: list[Node] = [
-            (replace(one, antialias_px2=MIP_PX2) if filtered else one, T)
-            for one, filtered, (_, _, T) in zip(prepared, antialiased, chosen, strict=True)
-        ]
+        camera, chosen = view
+        nodes: list[Node] = []
+        for one in chosen:
+            prepared = self._prepare(one.node, one.level)
+            if one.antialiased:
+                prepared = replace(prepared, antialias_px2=MIP_PX2)
+            nodes.append((prepared, one.T_world_node))
         starts: list[F64 | None] = []
         if camera.rolling is not None:
-            starts = [camera.rolling.actors_start.get(node.name) for node, _, _ in chosen]
+            starts = [camera.rolling.actors_start.get(one.node.name) for one in chosen]
         behind = self.sky.image(camera)
         return rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
 
     def _draw_on_card(
-        self,
-        device: str,
-        chosen: Sequence[Chosen],
-        antialiased: Sequence[bool],
-        camera: PinholeCamera,
-    ) -> RasterOutput:
+        self, device: str, views: Sequence[tuple[PinholeCamera, Sequence[ChosenNode]]]
+    ) -> list[DeviceOutput]:
+        from alpasim_plugin.gaussians.raster.rasterize_triton import CloudView, DrawnCloud
+
         clouds, place = self._upload(device)
-        placed = [(place[node.name, i], T) for node, i, T in chosen]
-        sky = self.sky.on_device(camera, device)
-        return clouds.draw(placed, camera, sky, antialiased=antialiased)
+        placed = [
+            (camera, [DrawnCloud(place[one.name, level], *pose) for one, level, *pose in chosen])
+            for camera, chosen in views
+        ]
+
+        def draw(some: Sequence[CloudView]) -> list[DeviceOutput]:
+            return clouds.draw(some, self.sky.on_device([camera for camera, _ in some], device))
+
+        return batched(placed, lambda view: (view[0].height, view[0].width), draw)
 
     def _choose(
         self, camera: PinholeCamera, actor_poses: Mapping[str, F64], sharp: int
-    ) -> list[Chosen]:
+    ) -> list[ChosenNode]:
+        if camera.rolling is not None:
+            camera = camera.widened(camera.rolling.reach_px)
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
             raise RendererError(
@@ -261,7 +286,12 @@ class SceneGraph:
         nodes, places = (*self.background, *present), [None] * len(self.background) + list(poses)
         allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
         return [
-            (nodes[i], self._level(nodes[i], float(allowed_m[i]), sharp), places[i])
+            ChosenNode(
+                nodes[i],
+                self._level(nodes[i], float(allowed_m[i]), sharp),
+                places[i],
+                sharp > 0 and nodes[i].is_built,
+            )
             for i in np.flatnonzero(seen)
         ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
@@ -82,8 +83,10 @@ class Sky:
         columns += np.float32(WIDTH) * (columns < 0)
         return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
 
-    def on_device(self, camera: PinholeCamera, device: str) -> Tensor:
-        """Return `image` as a tensor of a device, which receives the panorama once."""
+    def on_device(self, cameras: Sequence[PinholeCamera], device: str) -> Tensor:
+        """Return `image` of cameras of one size ``(V, H, W, 3)`` as a tensor of a device, which
+        receives the panorama once.
+        """
         import torch
         import torch.nn.functional as F
 
@@ -91,30 +94,27 @@ class Sky:
             parts = self._panorama.transpose(2, 0, 1), PX_PER_RAD, 2 / SPAN_PX
             self._uploaded[device] = [upload(part, device) for part in parts]
         panorama, px_per_rad, shares = self._uploaded[device]
-        ahead = math.atan2(*camera.T_camera_world[2, 1::-1])
-        T_camera_ahead = camera.T_camera_world[:3, :3] @ se2(0, 0, ahead)[:3, :3]
-        rays = T_camera_ahead.T @ np.linalg.inv(camera.K)
-        middle = np.array([ahead, -HIGH_RAD]) * PX_PER_RAD
-        numbers = upload(np.concatenate([rays.ravel(), middle]), device)
-        corners = _corners(camera.height, camera.width, device)
-        x, y, z = numbers[:9].view(3, 3) @ corners.flatten(1)
-        angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=1)
-        places = torch.addcmul(numbers[9:], angles, px_per_rad).float().T
-        coarse = places.view(1, 2, *corners.shape[1:])
+        numbers = upload(np.stack([_seen_from(camera) for camera in cameras]), device)
+        height, width = cameras[0].height, cameras[0].width
+        corners = _corners(height, width, device)
+        x, y, z = (numbers[:, :9].view(-1, 3, 3) @ corners.flatten(1)).unbind(1)
+        angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
+        places = torch.addcmul(numbers[:, None, 9:], angles, px_per_rad).float().mT
+        coarse = places.reshape(-1, 2, *corners.shape[1:])
         finer = F.interpolate(coarse, scale_factor=STEP_PX, mode="bilinear", align_corners=False)
         first = STEP_PX // 2
-        window = finer[0, :, first : first + camera.height, first : first + camera.width]
+        window = finer[:, :, first : first + height, first : first + width]
         # OpenCV interpolates at the nearest 32nd of a pixel.
         window = (window * PARTS).round_().div_(PARTS)
-        window[0].remainder_(WIDTH)
-        image = F.grid_sample(
-            panorama[None],
-            (window.permute(1, 2, 0) * shares - 1)[None],
+        window[:, 0].remainder_(WIDTH)
+        images = F.grid_sample(
+            panorama.expand(len(cameras), *panorama.shape),
+            window.permute(0, 2, 3, 1) * shares - 1,
             mode="bilinear",
             padding_mode="border",
             align_corners=True,
         )
-        return image[0].permute(1, 2, 0)
+        return images.permute(0, 2, 3, 1)
 
     def _places(self, camera: PinholeCamera) -> tuple[F64, F64]:
         """Return columns and rows of the panorama at every `STEP_PX`-th pixel corner; columns may
@@ -138,6 +138,16 @@ class Sky:
         azimuth = ahead + wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
         rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
         return azimuth * (WIDTH / (2 * np.pi)), rows
+
+
+def _seen_from(camera: PinholeCamera) -> F64:
+    """Return the matrix from pixels to rays whose x is ahead, and the place of its origin in the
+    panorama: nine numbers and two.
+    """
+    ahead = math.atan2(*camera.T_camera_world[2, 1::-1])
+    T_camera_ahead = camera.T_camera_world[:3, :3] @ se2(0, 0, ahead)[:3, :3]
+    rays = T_camera_ahead.T @ np.linalg.inv(camera.K)
+    return np.concatenate([rays.ravel(), np.array([ahead, -HIGH_RAD]) * PX_PER_RAD])
 
 
 def _steps(size: int) -> I64:
