@@ -142,7 +142,7 @@ class SpeculativeRenderer(FixedRenderer):
         self._check(ordered)
         place = len(self.true)
         predicted = self.draft[place] if place < len(self.draft) else []
-        self.true.append([self.runner.render(request) for request in ordered])
+        self.true.append(self.runner.render(ordered))
         forecasts = [
             deviation(item.request, request)
             for (item, _), request in zip(predicted, ordered, strict=bool(predicted))
@@ -166,7 +166,7 @@ class SpeculativeRenderer(FixedRenderer):
             coming = min(left, *(len(request.ahead) for request in ordered))
             block = list(self.true)
             block += [
-                [self.runner.render(request.ahead[k]) for request in ordered] for k in range(coming)
+                self.runner.render([request.ahead[k] for request in ordered]) for k in range(coming)
             ]
             fixed = self._fix(self.fixer.preview, block)
             self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]

@@ -11,7 +11,7 @@ bands as rows each row has its own pose.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -94,6 +94,21 @@ def bands(request: RenderRequest) -> list[Band]:
         ]
     count = min(max(int(np.ceil(motion_px(request) / APART_PX)), 1), MOST_BANDS)
     return list(bands_of(request, count))
+
+
+def joined(request: RenderRequest, exposed: Sequence[Band], parts: Sequence[Any]) -> Any:
+    """Return a request's image of the windows of its bands, all arrays or all tensors of a device;
+    0 where nobody looks.
+    """
+    if request.exposure is None:
+        return parts[0]
+    first, size = parts[0], (request.camera.height, request.camera.width)
+    shape = *size, *first.shape[2:]
+    on_host = isinstance(first, np.ndarray)
+    whole = np.zeros(shape, first.dtype) if on_host else first.new_zeros(shape)
+    for band, part in zip(exposed, parts, strict=True):
+        band.put(whole, part)
+    return whole
 
 
 def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:

@@ -270,8 +270,8 @@ class Frame:
 
     @property
     def device(self) -> Any:
-        """The device that drew it, also if its image was changed on the host since; or None."""
-        return None if self.on_device is None else self.on_device.rgb.device
+        """The device that drew it, also if its image was changed on the host since."""
+        return "cpu" if self.on_device is None else self.on_device.rgb.device
 
     def is_pending(self, plane: str) -> bool:
         """Return whether a plane is that of a device, downloaded or not."""

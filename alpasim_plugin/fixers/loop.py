@@ -26,7 +26,7 @@ from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
-from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
 
@@ -48,7 +48,7 @@ class BlockRunner:
     """Render and fix the blocks of one rollout.
 
     Attributes:
-        render_base: The base renderer; its frames are checked.
+        render_base: The base renderer, of the frames of an instant; they are checked.
         scene_map: The scene's map, or None where the fixer uses none.
         actors: The scenario's, for the sizes of their boxes.
         references: Warps recorded frames into each view; None where the fixer reads none, or the
@@ -60,7 +60,7 @@ class BlockRunner:
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
-    render_base: Callable[[RenderRequest], Frame]
+    render_base: Callable[[Sequence[RenderRequest]], Sequence[Frame]]
     scene_map: PreparedMap | None
     actors: Sequence[Actor]
     threads: int | None = None
@@ -73,9 +73,18 @@ class BlockRunner:
         """Set the time of every stage seen so far to zero."""
         self.stage_ms = dict.fromkeys(self.stage_ms, 0.0)
 
-    def render(self, request: RenderRequest) -> ConditionedFrame:
-        """Render one frame, warp its references and draw its map."""
-        parts = [self._pinhole(part) for part in self.cover.requests(request)]
+    def render(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
+        """Render the frames of an instant, warp their references and draw their maps."""
+        cuts = [self.cover.requests(request) for request in requests]
+        parts = iter(self._pinholes([part for cut in cuts for part in cut]))
+        return [
+            self._joined(request, [next(parts) for _ in cut])
+            for request, cut in zip(requests, cuts, strict=True)
+        ]
+
+    def _joined(
+        self, request: RenderRequest, parts: Sequence[ConditionedFrame]
+    ) -> ConditionedFrame:
         if request.camera.lens is None:
             return parts[0]
         sides = self.cover.sides[request.camera.name]
@@ -86,17 +95,22 @@ class BlockRunner:
                 image = joined_image(sides, [part.map for part in parts])
         return ConditionedFrame(request, frame, image)
 
-    def _pinhole(self, request: RenderRequest) -> ConditionedFrame:
-        frame = self.render_base(request)
+    def _pinholes(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
+        frames = self.render_base(requests)
         if self.references is not None:
             with self._timed("references"):
-                frame = self.references.added(request, frame, self.on_device)
-        if self.scene_map is None:
-            return ConditionedFrame(request, frame, None)
-        device = frame.device if self.on_device else None
-        with self._timed("map"):
-            image = draw_exposed_map(self.scene_map, request, self.actors, self.threads, device)
-        return ConditionedFrame(request, frame, image)
+                frames = [
+                    self.references.added(request, frame, self.on_device)
+                    for request, frame in zip(requests, frames, strict=True)
+                ]
+        images: Sequence[Any] = [None] * len(frames)
+        if self.scene_map is not None:
+            device = frames[0].device if self.on_device else "cpu"
+            with self._timed("map"):
+                images = draw_exposed_maps(
+                    self.scene_map, requests, self.actors, self.threads, device
+                )
+        return list(map(ConditionedFrame, requests, frames, images))
 
     def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
         """Fix a block and check the result.
@@ -217,15 +231,13 @@ class PerFrameRenderer(FixedRenderer):
             FixerError: The fixer broke its contract.
         """
         self.runner.reset_times()
-        fixed = self.runner.fix(
-            self.fixer, self.fixer.step, [self.runner.render(request) for request in requests]
-        )
+        fixed = self.runner.fix(self.fixer, self.fixer.step, self.runner.render(requests))
         self.frames += len(fixed)
         return fixed
 
 
 def fixed_renderer(
-    render: Callable[[RenderRequest], Frame],
+    render: Callable[[Sequence[RenderRequest]], Sequence[Frame]],
     make_fixer: Callable[[], Fixer],
     settings: FixerSettings,
     scenario: Scenario,
@@ -240,7 +252,8 @@ def fixed_renderer(
     ``settings.mode`` names what is done about it.
 
     Args:
-        render: The base renderer of the same rollout; its frames are checked.
+        render: The base renderer of the same rollout, of the frames of an instant; they are
+            checked.
         make_fixer: Makes a fixer without history.
         settings: Mode, tolerances, and whether the fixer wants semantic maps.
         scenario: Its map and its actors' boxes are what the semantic map shows.

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -427,12 +427,9 @@ def make_renderer(
     fixer, settings = spec.fixer, spec.fixer.settings
     assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
 
-    def render(request: RenderRequest) -> Frame:
-        return checked_frames(base, [request], on_device=True)[0]
-
     recorded = base.recorded() if settings.references else ()
     return fixed_renderer(
-        render,
+        partial(checked_frames, base, on_device=True),
         lambda: build(fixer, scene_id=scenario.scene_id, **session),
         settings,
         scenario,

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from alpasim_plugin.core.devices import download, facts_of, implementation, require_device, upload
+from alpasim_plugin.core.devices import download, facts_of, require_device, upload
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -104,9 +104,8 @@ def semantic_map(device: str) -> Facts:
 
     def draws(width: int, height: int, name: str) -> Call:
         request = frame_request(scenario, width, height)
-        place = implementation(name, None, torch.device(name))
-        draw = partial(draw_exposed_map, scene, request, scenario.actors, device=place)
-        return lambda: torch.as_tensor(draw()).cpu().numpy()
+        draw = partial(draw_exposed_maps, scene, [request], scenario.actors, device=name)
+        return lambda: torch.as_tensor(draw()[0]).cpu().numpy()
 
     return compared(device, draws)
 

@@ -25,11 +25,11 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
 CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK, "COLUMNS": COLUMNS}
 TYPES = {
     "*u8": ("levels",),
-    "*fp64": ("poses", "camera", "means", "primitives", "samples"),
+    "*fp64": ("poses", "camera", "means", "primitives", "samples", "cameras"),
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
-    "*i64": ("order", "ends", "places", "count"),
+    "*i64": ("order", "ends", "places"),
     "fp32": ("near_m",),
-    "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height", "rows", "top"),
+    "i32": ("tiles_x", "tiles_y", "total", "capacity", "width", "height", "rows", "most"),
     "constexpr": tuple(CONSTANTS),
 }
 

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
@@ -281,11 +280,12 @@ def test_a_gpu_draws_the_same_pixels():
     pytest.importorskip("triton", reason="Triton is not installed")
     from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles
 
-    (scene, boxes), rows = street(), slice(3, 25)
-    view = replace(PIN, width=48, height=27, K=np.diag([0.1875, 0.1875, 1]) @ PIN.K)
-    seen = seen_from(scene, view, at(x=1.0), boxes)
-    found = draw_tiles(scene, *seen, rows, torch.device("cpu"))
-    assert_array_equal(found, draw_map(scene, view, at(x=1.0), boxes, rows=rows))
+    (scene, boxes), camera = street(), replace(PIN, width=48, height=27)
+    camera = replace(camera, K=np.diag([0.1875, 0.1875, 1]) @ PIN.K)
+    views = (at(x=1.0), boxes, slice(3, 25)), (at(x=2.0), boxes[:1], slice(0, 22))
+    seen = [(*seen_from(scene, camera, *view), rows) for *view, rows in views]
+    for image, (*view, rows) in zip(draw_tiles(scene, "cpu", seen), views, strict=True):
+        assert_array_equal(image, draw_map(scene, camera, *view, rows=rows))
 
 
 def test_concave_area_stays_concave():

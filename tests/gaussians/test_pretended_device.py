@@ -126,10 +126,10 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
     view = CameraSpec("front", spec.width, spec.height, spec.K, T, lens=lens)
     request = RenderRequest(100_000, view, np.stack([T, T]), {})
 
-    def rendered(asked, device="cuda:0"):
-        view = camera_at(asked, asked.T_world_camera[1])
-        shown = graph.render(view, poses, device=device).surface()
-        return shown.frame(asked.t_us, asked.camera.name)
+    def rendered(requests, device="cuda:0"):
+        views = [(camera_at(asked, asked.T_world_camera[1]), poses) for asked in requests]
+        drawn = zip(requests, graph.render_all(views, device=device), strict=True)
+        return [out.surface().frame(asked.t_us, asked.camera.name) for asked, out in drawn]
 
     def fixed(device):
         references = ReferenceSession(recorded, (), path, 2)
@@ -147,7 +147,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
             if device != "cpu":
                 graph._upload(device)[0].capacity = capacity
             one = replace(request, t_us=t_us)
-            (frame,) = runner.fix(fixer, fixer.step, [runner.render(one)])
+            (frame,) = runner.fix(fixer, fixer.step, runner.render([one]))
         return frame
 
     wanted = fixed("cpu")
@@ -163,7 +163,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
             assert traffic.bytes_down < 3.1 * rgb[..., 0].size + 200
         if lens is not None:
             return
-        renderer = SimpleNamespace(render_batch=lambda asked: [rendered(*asked)])
+        renderer = SimpleNamespace(render_batch=rendered)
         served = SceneEntry(None, None, renderer, ReferenceSession(recorded, (), path, 2), True)
         traffic.reset()
         assert len(served.render(request, True).pending.references) == 2

@@ -110,7 +110,9 @@ def drive(
 
 def session_of(scenario, make, **settings):
     base = make_renderer("clean", scenario, 0, threads=1)
-    return fixed_renderer(base.render, make, FixerSettings(name="test", **settings), scenario, 1)  # type: ignore[arg-type]
+    return fixed_renderer(
+        base.render_batch, make, FixerSettings(name="test", **settings), scenario, 1
+    )  # type: ignore[arg-type]
 
 
 def rendered(scenario, requests):

@@ -35,7 +35,7 @@ from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers.lenses import joined, joined_image
-from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_map
+from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
@@ -152,7 +152,7 @@ def asked_of(
 
 
 def drawn_map(
-    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = None
+    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any
 ) -> Any:
     """Return the semantic map as the lens sees it, of the device that drew its frame; None where
     the fixer takes none.
@@ -160,8 +160,7 @@ def drawn_map(
     scene_map, actors = entry.scene_map, entry.scenario.actors
     if scene_map is None:
         return None
-    maps = [draw_exposed_map(scene_map, part, actors, device=device) for part in asked]
-    return joined_image(sides, maps)
+    return joined_image(sides, draw_exposed_maps(scene_map, asked, actors, device=device))
 
 
 def gated(
@@ -248,7 +247,8 @@ class LocalSource:
                 frames.append(entry.render(part, entry.reads_device))
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
         with left.holding(self._busy):
-            sdmap = drawn_map(entry, asked, sides, frames[0].device if entry.reads_device else None)
+            place = frames[0].device if entry.reads_device else "cpu"
+            sdmap = drawn_map(entry, asked, sides, place)
         rendered = Rendered(joined(view.camera, sides, frames), sdmap, blind_of(sides))
         if sdmap is None:
             return rendered

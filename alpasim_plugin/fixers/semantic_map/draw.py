@@ -11,12 +11,14 @@ rows i to i + 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.shutter import bands, joined
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
 from alpasim_plugin.fixers.semantic_map import kernels
 from alpasim_plugin.fixers.semantic_map.prepare import (
@@ -77,40 +79,50 @@ def draw_map(
     return image[rows]
 
 
-def draw_exposed_map(
+def draw_exposed_maps(
     scene: PreparedMap,
-    request: RenderRequest,
+    requests: Sequence[RenderRequest],
     actors: Sequence[Actor],
     threads: int | None = None,
-    device: Any = None,
-) -> Any:
-    """Draw the map of a requested frame ``(H, W, 3)``: each band of a rolling shutter at its
+    device: Any = "cpu",
+) -> list[Any]:
+    """Draw the maps of requested frames ``(H, W, 3)``: each band of a rolling shutter at its
     instant; see `draw_map`.
 
     Args:
         scene: Prepared map.
-        request: Camera, poses, road users and when rows are exposed.
+        requests: Cameras, poses, road users and when rows are exposed.
         actors: The scenario's, for the sizes of their boxes.
         threads: As many CPU threads; None leaves numba's number.
-        device: A card, which draws the map and keeps it as a tensor; None: the CPU.
+        device: What draws the maps; a card keeps them as tensors, and draws all of one size at
+            once.
     """
-    camera = request.camera
-    size = camera.height, camera.width
-    out: Any = np.zeros((*size, 3), np.uint8)
-    if device is not None:
-        import torch
+    draw = implementation(device, partial(_on_host, threads), partial(_on_card, device))
+    cuts = [bands(request) for request in requests]
+    views = [
+        (request.camera, band.T_world_camera, actor_boxes(band.actors, actors), band.rows)
+        for request, cut in zip(requests, cuts, strict=True)
+        for band in cut
+    ]
+    parts = iter(draw(scene, views))
+    return [
+        joined(request, cut, [next(parts)[:, band.columns] for band in cut])
+        for request, cut in zip(requests, cuts, strict=True)
+    ]
 
-        from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles
 
-        out = torch.zeros((*size, 3), dtype=torch.uint8, device=device)
-    for band in bands(request):
-        seen = scene, camera, band.T_world_camera, actor_boxes(band.actors, actors)
-        if device is None:
-            part: Any = draw_map(*seen, threads=threads, rows=band.rows)
-        else:
-            part = draw_tiles(scene, *seen_from(*seen), band.rows, device)
-        band.put(out, part[:, band.columns])
-    return out
+View = tuple[CameraSpec, F64, Sequence[ActorBox], slice]  # its pose, road users and rows
+
+
+def _on_host(threads: int | None, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
+    return [draw_map(scene, *seen, threads=threads, rows=rows) for *seen, rows in views]
+
+
+def _on_card(device: Any, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
+    from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles, size_of
+
+    seen = [(*seen_from(scene, *view), rows) for *view, rows in views]
+    return batched(seen, size_of, partial(draw_tiles, scene, device))
 
 
 def seen_from(

@@ -23,20 +23,28 @@ def draw_tiles(
     primitives,
     samples,
     levels,
-    count,
-    top,
+    counts,
+    cameras,
+    most,
     rows,
     width,
     height,
     tiles_x,
+    tiles_y,
     COLUMNS: tl.constexpr,
     TILE: tl.constexpr,
 ):
-    """Draw a tile of ``rows`` rows of an image, from ``top`` on: each sample shows the nearest primitive, of equally
-    near ones the first. For the columns of a primitive see `on_device`.
+    """Draw a tile of ``rows`` rows of a view, from the last number of its camera on: each sample
+    shows the nearest primitive, of equally near ones the first. A view has ``counts`` of ``most``
+    primitives; for the columns of one see `on_device`.
     """
-    left = (tl.program_id(0) % tiles_x) * TILE
-    above = (tl.program_id(0) // tiles_x) * TILE
+    view = tl.program_id(0) // (tiles_x * tiles_y)
+    tile = tl.program_id(0) % (tiles_x * tiles_y)
+    primitives += view * most * COLUMNS
+    levels += view.to(tl.int64) * (rows * width * 3)
+    top = tl.load(cameras + view * 23 + 22).to(tl.int32)
+    left = (tile % tiles_x) * TILE
+    above = (tile // tiles_x) * TILE
     tile_top = top + above
     lane = tl.arange(0, TILE * TILE)[:, None]
     column = left + lane % TILE
@@ -49,7 +57,7 @@ def draw_tiles(
     stretch = tl.cast(width, tl.float64) / height
     depth = tl.full((TILE * TILE, 4), 0.0, tl.float32)
     colour = tl.full((TILE * TILE, 4), 0, tl.int32)
-    for k in range(tl.load(count)):
+    for k in range(tl.load(counts + view)):
         p = primitives + k * COLUMNS
         in_columns = (tl.load(p) < left + TILE) & (tl.load(p + 2) > left)
         in_rows = (tl.load(p + 1) < tile_top + TILE) & (tl.load(p + 3) > tile_top)
