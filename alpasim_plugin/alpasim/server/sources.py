@@ -152,7 +152,7 @@ def asked_of(
 
 
 def drawn_map(
-    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any
+    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = "cpu"
 ) -> Any:
     """Return the semantic map as the lens sees it, of the device that drew its frame; None where
     the fixer takes none.
