@@ -226,7 +226,7 @@ class _Functions(TorchFunctionMode):
 def _moved(tensor, device, func, args, kwargs):
     """Move a tensor, then convert its type if that was asked for as well."""
     if device is None or (device.type == "cuda") == isinstance(tensor, OnDevice):
-        rest = [value for value in args[1:] if _device_of(value) is None]
+        rest = [value for value in args[1:] if isinstance(value, torch.dtype)]
         others = {key: value for key, value in kwargs.items() if key != "device"}
         return func(tensor, *rest, **others) if rest or others else tensor
     if device.type == "cuda":
@@ -291,6 +291,7 @@ def pretended_device(patch, computes=True):
         computes: Whether Triton kernels do; interpreted, they take seconds a frame.
     """
     pytest.importorskip("triton", reason="Triton is not installed")
+    from alpasim_plugin.block_fixers.pipeline import BlockPipeline
     from alpasim_plugin.fixers import pixel_fixer
     from alpasim_plugin.fixers.semantic_map import tile_kernel
     from alpasim_plugin.gaussians.raster import rasterize_triton, triton_kernels
@@ -315,6 +316,9 @@ def pretended_device(patch, computes=True):
     # Subclasses of tensors do not work in inference mode; gradients are off in either.
     plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]
     patch.setattr(pixel_fixer, "fix_frame", plain)
+    for name in ("run", "keep"):
+        plain = torch.no_grad()(getattr(BlockPipeline, name).__wrapped__)
+        patch.setattr(BlockPipeline, name, plain)
     overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
     torch.__future__.set_overwrite_module_params_on_conversion(True)
     pixel_fixer._captured.cache_clear()  # a graph of a test before has another device's tensors

@@ -4,15 +4,12 @@ session is made.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.bundle import FixerFactory
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from alpasim_plugin.block_fixers.onefixer import OneFixer
 
 
@@ -22,14 +19,6 @@ def _session(
     from alpasim_plugin.block_fixers.onefixer import OneFixer  # loads torch
 
     return OneFixer(settings, scene_id, seed, device, threads)
-
-
-def _drawn_blocks(
-    settings: OneFixerSettings, width: int, height: int, device: str
-) -> Callable[[], Tensor]:
-    from alpasim_plugin.block_fixers.drawn_blocks import drawn_blocks
-
-    return drawn_blocks(settings, width, height, device)
 
 
 blocks = FixerFactory(
@@ -45,5 +34,5 @@ blocks = FixerFactory(
         "artifixer-pre": "variant of the comparison: opacity in every block, long blocks; to be trained",
         "artifixer": "variant of the comparison: artifixer-pre, distilled; to be trained",
     },
-    _drawn_blocks,
+    "alpasim_plugin.block_fixers.drawn_blocks:drawn_blocks",
 )

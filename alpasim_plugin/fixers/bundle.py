@@ -43,14 +43,14 @@ class FixerFactory(Generic[S]):
         session: Makes one rollout's session from settings, scene id, seed, device and threads. It
             imports what loads torch.
         help: One line for every fixer that the factory makes, by its name.
-        drawn_blocks: Of settings, width, height and device: makes a call that fixes one further
-            block of random images with random weights; None where there are no blocks.
+        drawn_blocks: ``module:function`` that runs blocks with random weights, where there are any:
+            see `block_fixers.drawn_blocks`.
     """
 
     settings_model: type[S]
     session: Callable[[S, str, int, str, int | None], Fixer]
     help: Mapping[str, str] = field(default_factory=dict)
-    drawn_blocks: Callable[[S, int, int, str], Callable[[], Tensor]] | None = None
+    drawn_blocks: str = ""
 
     def __call__(
         self,

@@ -6,12 +6,13 @@ Each section is a process of its own: after an error of CUDA nothing more runs i
 
 from __future__ import annotations
 
+import itertools
 import json
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -30,15 +31,30 @@ from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, compositor_of
+from alpasim_plugin.gaussians.raster.rasterize_triton import (
+    TileCompositor,
+    UploadedClouds,
+    compositor_of,
+)
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.gpu_work import (
+    H100,
+    PEAKS,
+    Work,
+    blocks,
+    counted,
+    fixer_work,
+    raster_work,
+    transparent_splats,
+)
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario
 
 SCENE = "smoke/curve"
-SIZES = ((256, 144), (960, 544), (1920, 1088))
+MIDDLE, LARGE = (960, 544), (1920, 1080)
+SIZES = ((256, 144), MIDDLE, (1920, 1088))
 SPLATS = 5_000  # of the image whose gradients are compared
 REPEATS = 5
 # Grey levels, or thousandths of the largest gradient, by which a card may differ from the CPU.
@@ -59,7 +75,8 @@ def check_gpu(device: str, budget_s: float) -> Iterator[tuple[str, Facts]]:
     end = time.monotonic() + budget_s
     for name in SECTIONS:
         left_s = end - time.monotonic()
-        yield name, _child(name, device, left_s) if left_s > 0 else _failed("no time was left")
+        facts = _child(name, device, left_s) if left_s > 0 else _failed("no time was left")
+        yield name, facts if facts["ok"] else facts | {"do": AVOIDED_BY.get(name, ON_CPU)}
 
 
 def _child(name: str, device: str, left_s: float) -> Facts:
@@ -112,7 +129,12 @@ def semantic_map(device: str) -> Facts:
 
 def fixer(device: str) -> Facts:
     """Compare frames of the fixer with those of the CPU, and time them."""
-    return compared(device, _streaming)
+    return compared(device, partial(_streaming, "onefixer", ["front"]))
+
+
+def block_fixer(device: str) -> Facts:
+    """Compare blocks of the small generator with those of the CPU, and time them."""
+    return compared(device, partial(_streaming, "onefixer-dit-tiny", ["front"]), SIZES[:1])
 
 
 def gradient(device: str) -> Facts:
@@ -151,25 +173,94 @@ def rollout(device: str) -> Facts:
     return {"ok": frames > 0, "frames": frames, "ms_per_frame": round(1e3 * seconds / frames, 2)}
 
 
+def raster_rate(device: str) -> Facts:
+    """Time a frame of many splats beside what it costs at least."""
+
+    def draws() -> Call:
+        cloud, camera = transparent_splats(*LARGE)
+        clouds = UploadedClouds([cloud], device)
+        return lambda: clouds.draw([(0, None)], camera).arrays["alpha"]
+
+    return {"ok": True} | _rated(device, raster_work(*LARGE), draws)
+
+
+def fixer_rate(device: str) -> Facts:
+    """Time a frame of one and of six cameras beside what it costs at least."""
+    facts: Facts = {"ok": True}
+    for count in (1, 6):
+        cameras = [f"camera {i}" for i in range(count)]
+        fixes = partial(_streaming, "onefixer", cameras, *MIDDLE, device)
+        facts[f"cameras: {count}"] = _rated(device, fixer_work(count, *MIDDLE), fixes)
+    return facts
+
+
+def block_rate(device: str) -> Facts:
+    """Time a block of eight frames of the largest generator beside what it costs at least, with a
+    forward of its own for the history and without.
+    """
+
+    def fixes(history: str) -> Call:
+        _, fix = blocks(history, *MIDDLE, device)
+        return lambda: download(fix().mean())
+
+    facts: Facts = {"ok": True}
+    for history in ("finalise", "last-forward"):
+        facts["weights"], fix = blocks(history, *MIDDLE, "meta")
+        facts[history] = _rated(device, counted(fix, "bf16"), partial(fixes, history))
+    return facts
+
+
 SECTIONS: dict[str, Callable[[str], Facts]] = {
     "card": card,
     "rasteriser": rasteriser,
     "semantic_map": semantic_map,
     "fixer": fixer,
+    "block_fixer": block_fixer,
     "gradient": gradient,
     "rollout": rollout,
+    "raster_rate": raster_rate,
+    "fixer_rate": fixer_rate,
+    "block_rate": block_rate,
+}
+# What leaves out the part of a section that failed; where nothing does, the card is left out.
+ON_CPU = "run with --device cpu"
+AVOIDED_BY = {
+    "semantic_map": f"--set fixer.uses_map=false fixes without a map; otherwise {ON_CPU}",
+    "fixer": f"--renderer 3dgs leaves the fixer out; otherwise {ON_CPU}",
+    "block_fixer": f"--renderer onefixer fixes frame by frame; otherwise {ON_CPU}",
+    "gradient": "run simrun import drive with --device cpu, and what fits behind 3dgs once as well",
+    "fixer_rate": f"--renderer 3dgs leaves the fixer out; otherwise {ON_CPU}",
+    "block_rate": "choose onefixer-dit-s or onefixer in the place of onefixer-2b",
 }
 
 
-def compared(device: str, make: Callable[[int, int, str], Call]) -> Facts:
+def _rated(device: str, work: Work, make: Callable[[], Call]) -> Facts:
+    """Return what a call costs at least and, on a card, its time and share of the card's peak."""
+
+    def on_card() -> Facts:
+        ms, name = _median_ms(make()), facts_of(device)["card"]
+        known = name in PEAKS
+        share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
+        return {"ms": ms, "roofline_share": share}
+
+    facts = work._asdict() | {"h100_least_ms": work.least_ms(H100)}
+    return facts | implementation(device, dict[str, Any], on_card)()
+
+
+def compared(
+    device: str,
+    make: Callable[[int, int, str], Call],
+    sizes: Sequence[tuple[int, int]] | None = None,
+) -> Facts:
     """Return by how many levels arrays of a device differ from the CPU's, and how long each takes.
 
     Args:
         device: The card.
         make: Returns what makes an array of a width and a height on a device.
+        sizes: These widths and heights; None for all.
     """
     facts: Facts = {"ok": True}
-    for width, height in SIZES:
+    for width, height in sizes or SIZES:
         ours, theirs = make(width, height, device), make(width, height, "cpu")
         differs = np.abs(ours().astype(float) - theirs())
         odd_share = float((differs > LEVELS).mean())
@@ -231,18 +322,26 @@ def _gradients(
     return _gradients(cloud, camera, compositor)
 
 
-def _streaming(width: int, height: int, device: str) -> Call:
-    """Return a call that fixes the next frame of a drawn clip."""
-    session = make_fixer("onefixer", scene_id="gpu-check", device=device)
+def _streaming(
+    fixer_name: str, cameras: Sequence[str], width: int, height: int, device: str
+) -> Call:
+    """Return a call that fixes the next frames of a drawn clip."""
+    session = make_fixer(fixer_name, scene_id="gpu-check", device=device)
     rng = stream("gpu-check", 0, "clip")
     image = rng.integers(0, 255, (height, width, 4), dtype=np.uint8)
+    rgb = image[..., :3].copy()
     opacity = rng.random((height, width)).astype(np.float32)
     times_us = iter(range(0, 10**9, 100_000))
+    blocks = itertools.count()
 
     def step() -> Any:
-        rgb = image[..., :3].copy()
-        frame = Frame(next(times_us), "front", rgb, opacity, references=(image,))
-        return session.step([frame], [rgb])[0].rgb
+        times = [next(times_us) for _ in range(session.blocks.frames(next(blocks)))]
+        frames = [
+            Frame(t_us, camera, rgb, opacity, references=(image,))
+            for camera in cameras
+            for t_us in times
+        ]
+        return session.step(frames, [rgb] * len(frames))[-1].rgb
 
     return step
 

@@ -9,10 +9,9 @@ and results in.
 from __future__ import annotations
 
 import copy
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -20,176 +19,141 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from alpasim_plugin.core.parts import find, unidentified
+from alpasim_plugin.core.parts import find
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.pixel_generator import TORCH
 from alpasim_plugin.fixers.pixel_fixer import GivenFrame, fix_frame, in_range
 from alpasim_plugin.fixers.pixel_network import load_generator
-from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, EPS2D_PX2, TILE
+from alpasim_plugin.gaussians.constants import TILE
 
 SPLATS = 2_000_000
-SIGMA_PX = 1.0  # of a splat in the image
 OPACITY = 0.02  # so low that no splat hides another: every pair of splat and tile is blended
+DISTANCE_M = 10.0
+PAIRS = 1.58  # of a splat and tiles: (1 + 2 h / 16)^2 for h = 2.06 px, where its alpha is 1/255
 # Operations of `triton_kernels.project` a splat, and of `composite` a splat and pixel.
 PROJECT_FLOP = 420
 BLEND_FLOP = 23
-# Bytes of a splat's parameters, of what `project` writes of it, of a pair, of a pixel.
-SPLAT_BYTES = 260
-PROJECTED_BYTES = 64
-PAIR_BYTES = 8
+# Bytes of a splat that is read, projected, and read again; of a pair of splat and tile that is
+# listed, sorted and read; of a pixel.
+SPLAT_BYTES = 260 + 2 * 72
+PAIR_BYTES = 4 * 8
 PIXEL_BYTES = 24
+BLOCKS_BEFORE = 3  # until an attention window of six latents is full
 
-BLOCKS_BEFORE = 3  # until the attention window of six latents is full
-BlockCall = Callable[[], Tensor]  # fixes one further block
-
-
-@dataclass(frozen=True)
-class Peak:
-    """Dense peak rates of a card."""
-
-    bf16_tflops: float
-    fp32_tflops: float  # without TF32
-    gb_s: float  # of its memory
-
-
-# NVIDIA's data sheets, and its white paper of the Ada architecture, by the name that CUDA gives.
+# Dense TFLOP/s of bfloat16 and of float32 without TF32, and GB/s of the memory, by the name that
+# CUDA gives: NVIDIA's data sheets, and its white paper of the Ada architecture.
 H100 = "NVIDIA H100 80GB HBM3"  # SXM
 PEAKS = {
-    "NVIDIA A100-PCIE-40GB": Peak(312, 19.5, 1555),
-    "NVIDIA A100-SXM4-40GB": Peak(312, 19.5, 1555),
-    "NVIDIA A100 80GB PCIe": Peak(312, 19.5, 1935),
-    "NVIDIA A100-SXM4-80GB": Peak(312, 19.5, 2039),
-    "NVIDIA H100 PCIe": Peak(756, 51, 2000),
-    H100: Peak(989, 67, 3350),
-    "NVIDIA H200": Peak(989, 67, 4800),
-    "NVIDIA L4": Peak(121, 30.3, 300),
-    "NVIDIA L40S": Peak(362, 91.6, 864),
-    "NVIDIA GeForce RTX 4090": Peak(165.2, 82.6, 1008),
+    "NVIDIA A100-PCIE-40GB": (312, 19.5, 1555),
+    "NVIDIA A100-SXM4-40GB": (312, 19.5, 1555),
+    "NVIDIA A100 80GB PCIe": (312, 19.5, 1935),
+    "NVIDIA A100-SXM4-80GB": (312, 19.5, 2039),
+    "NVIDIA H100 PCIe": (756, 51, 2000),
+    H100: (989, 67, 3350),
+    "NVIDIA H200": (989, 67, 4800),
+    "NVIDIA L4": (121, 30.3, 300),
+    "NVIDIA L40S": (362, 91.6, 864),
+    "NVIDIA GeForce RTX 4090": (165.2, 82.6, 1008),
 }
 
 
-@dataclass(frozen=True)
-class Work:
-    """Floating-point operations by precision, and bytes read and written."""
+class Work(NamedTuple):
+    """What is computed, and what is read and written."""
 
-    bf16_flop: int
-    fp32_flop: int
-    bytes: int
+    gflop: float
+    gb: float
+    precision: Literal["fp32", "bf16"] = "fp32"
 
-    def least_ms(self, card: str) -> float | None:
-        """Return the time that a card takes at its peak rates, None where they are not known."""
-        if card not in PEAKS:
-            return None
-        peak = PEAKS[card]
-        flop_ms = self.bf16_flop / peak.bf16_tflops / 1e9 + self.fp32_flop / peak.fp32_tflops / 1e9
-        return round(max(flop_ms, self.bytes / peak.gb_s / 1e6), 3)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What a report says of it."""
-        return {
-            "gflop": round((self.bf16_flop + self.fp32_flop) / 1e9, 2),
-            "gb": round(self.bytes / 1e9, 3),
-        }
+    def least_ms(self, card: str) -> float:
+        """Return the time that a card of `PEAKS` takes at its peak rates."""
+        bf16, fp32, memory = PEAKS[card]
+        rate = bf16 if self.precision == "bf16" else fp32
+        return round(max(self.gflop / rate, 1e3 * self.gb / memory), 3)
 
 
 class _Counter(TorchFunctionMode):
-    """Counts what runs inside ``with counter.flop, counter:``."""
+    """Counts products, convolutions and attention; use it inside ``with counter.flop, counter``."""
 
     def __init__(self) -> None:
         super().__init__()
         self.flop = FlopCounterMode(display=False)
-        self.by_type: Counter[torch.dtype] = Counter()
         self.bytes = 0
 
-    def __torch_function__(
-        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         options = kwargs or {}
         before = self.flop.get_total_flops()
         made = func(*args, **options)
-        flop = self.flop.get_total_flops() - before
-        if flop:
-            self.by_type[made.dtype] += flop
+        if self.flop.get_total_flops() > before:
             self.bytes += bytes_of(*args, *options.values(), made)
         return made
 
-    def work(self) -> Work:
-        """Return the sums."""
-        return Work(self.by_type[torch.bfloat16], self.by_type[torch.float32], self.bytes)
-
 
 def bytes_of(*parts: Any) -> int:
-    """Return the bytes of tensors among values."""
+    """Return the bytes of the tensors among values."""
     return sum(part.nbytes for part in parts if isinstance(part, Tensor))
+
+
+def counted(
+    call: Callable[[], Sequence[Tensor]],
+    precision: Literal["fp32", "bf16"] = "fp32",
+    given: Sequence[Any] = (),
+) -> Work:
+    """Return the work of a call, with the bytes of what it is given and returns."""
+    counter = _Counter()
+    with counter.flop, counter:
+        made = call()
+    moved = counter.bytes + bytes_of(*given, *made)
+    return Work(round(counter.flop.get_total_flops() / 1e9, 2), round(moved / 1e9, 3), precision)
 
 
 def fixer_work(cameras: int, width: int, height: int) -> Work:
     """Count a frame of ``onefixer`` with two recorded images a camera."""
-    settings = fixer_settings("onefixer")
-    assert isinstance(settings, PixelFixerSettings)
+    settings: Any = fixer_settings("onefixer")
     loaded = load_generator(settings)
-    net = copy.deepcopy(loaded.net).to("meta")
+    on_meta = replace(loaded, net=copy.deepcopy(loaded.net).to("meta"), operations=TORCH)
     image = torch.empty((cameras, height, width, 3), dtype=torch.uint8, device="meta")
-    references = torch.empty((cameras, 2, height, width, 4), dtype=torch.uint8, device="meta")
+    references = image.new_empty((cameras, 2, height, width, 4))
     scale = settings.scale_of(height, width)
-    state = net.start(in_range(image, scale), scale)
+    state = on_meta.net.start(in_range(image, scale), scale)
     given = GivenFrame(image, image, image, *state, None, image, references)
-    counter = _Counter()
-    with counter.flop, counter:
-        fixed = fix_frame(replace(loaded, net=net, operations=TORCH), settings, given)
-    work = counter.work()
-    return replace(work, bytes=work.bytes + bytes_of(*given, *fixed))
+    return counted(lambda: fix_frame(on_meta, settings, given), given=given)
 
 
-def block_calls(name: str, history: str, width: int, height: int, device: str) -> BlockCall:
-    """Return a call that fixes one further block of a block generator, with random weights."""
-    spec = unidentified("fixer", name, (f"history={history}",))
-    call: BlockCall = load(find("fixer", name).target, "fixer").drawn_blocks(
-        spec.settings, width, height, device
-    )
-    return call
-
-
-def block_work(name: str, history: str, width: int, height: int) -> Work:
-    """Count a block once the attention window is full."""
-    fix = block_calls(name, history, width, height, "meta")
+def blocks(history: str, width: int, height: int, device: str) -> tuple[int, Callable[[], Tensor]]:
+    """Return the number of weights of ``onefixer-2b``, drawn on a device, and a call that fixes one
+    further block with a full attention window.
+    """
+    settings = fixer_settings("onefixer-2b", [f"history={history}"])
+    factory = load(find("fixer", settings.name).target, "fixer")
+    weights, fix = load(factory.drawn_blocks, "fixer")(settings, width, height, device)
     for _ in range(BLOCKS_BEFORE):
         fix()
-    counter = _Counter()
-    with counter.flop, counter:
-        fix()
-    return counter.work()
+    return weights, fix
 
 
 def raster_work(width: int, height: int) -> Work:
-    """Count a frame of `transparent_splats`; lists of pairs are not sorted for nothing, but by how
-    many passes is the card's affair: they are written and read once here.
-    """
-    half_px = np.sqrt(2 * np.log(OPACITY / ALPHA_MIN) * (SIGMA_PX**2 + EPS2D_PX2))
-    pairs = int(SPLATS * (1 + 2 * half_px / TILE) ** 2)
-    flop = SPLATS * PROJECT_FLOP + pairs * TILE * TILE * BLEND_FLOP
-    moved = SPLATS * (SPLAT_BYTES + 2 * PROJECTED_BYTES) + pairs * 2 * PAIR_BYTES
-    return Work(0, flop, moved + width * height * PIXEL_BYTES)
+    """Count a frame of `transparent_splats`."""
+    pairs = PAIRS * SPLATS
+    flop = SPLATS * PROJECT_FLOP + pairs * TILE**2 * BLEND_FLOP
+    moved = SPLATS * SPLAT_BYTES + pairs * PAIR_BYTES + width * height * PIXEL_BYTES
+    return Work(round(flop / 1e9, 2), round(moved / 1e9, 3))
 
 
 def transparent_splats(width: int, height: int) -> tuple[GaussianCloud, PinholeCamera]:
-    """Return small splats all over the image of a camera with a narrow view."""
+    """Return splats of one pixel's standard deviation all over the image of a camera."""
+    px_m = 1 / width  # the image is one metre wide at their distance
+    high = [1.0, height * px_m, DISTANCE_M + 0.01]
     rng = stream("gpu-check", 0, "transparent splats")
-    focal_px = 10.0 * width
-    K = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
-    depths = rng.uniform(2, 50, SPLATS)
-    uv = rng.uniform([0, 0], [width, height], (SPLATS, 2)) - K[:2, 2]
     cloud = GaussianCloud(
-        np.column_stack([uv * depths[:, None] / focal_px, depths]),
-        np.tile(np.array([1.0, 0, 0, 0], np.float32), (SPLATS, 1)),
-        np.repeat(SIGMA_PX * depths[:, None] / focal_px, 3, axis=1),
+        rng.uniform([0, 0, DISTANCE_M], high, (SPLATS, 3)),
+        np.tile([1.0, 0, 0, 0], (SPLATS, 1)),
+        np.full((SPLATS, 3), px_m),
         np.full(SPLATS, OPACITY),
         np.zeros((SPLATS, 16, 3), np.float32),
     )
+    K = np.diag([DISTANCE_M * width, DISTANCE_M * width, 1])
     return cloud, PinholeCamera(width, height, K, np.eye(4))
