@@ -236,15 +236,15 @@ AVOIDED_BY = {
 
 def _rated(device: str, work: Work, make: Callable[[], Call]) -> Facts:
     """Return what a call costs at least and, on a card, its time and share of the card's peak."""
-
-    def on_card() -> Facts:
-        ms, name = _median_ms(make()), facts_of(device)["card"]
-        known = name in PEAKS
-        share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
-        return {"ms": ms, "roofline_share": share}
-
-    facts = work._asdict() | {"h100_least_ms": work.least_ms(H100)}
-    return facts | implementation(device, dict[str, Any], on_card)()
+    facts: Facts = work._asdict() | {"h100_least_ms": work.least_ms(H100)}
+    name = facts_of(device).get("card")
+    if name is not None:
+        ms = _median_ms(make())
+        facts["ms"] = ms
+        facts["roofline_share"] = "not known for this card"
+        if name in PEAKS:
+            facts["roofline_share"] = round(work.least_ms(name) / ms, 3)
+    return facts
 
 
 def compared(
