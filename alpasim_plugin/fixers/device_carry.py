@@ -19,6 +19,7 @@ from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.fixers import ground
 from alpasim_plugin.fixers.warp import (
+    FREE_SHARE,
     INCONSISTENT,
     INFINITY_M,
     NEAREST_M,
@@ -27,6 +28,7 @@ from alpasim_plugin.fixers.warp import (
     VALID,
     RecordedImage,
     WarpTarget,
+    hidden_by_users,
 )
 
 ABSENT = np.full((4, 4), np.nan)
@@ -51,7 +53,7 @@ class UploadedImage:
 
 def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage:
     """Send a recorded frame, as of `ground.with_users`, to a device."""
-    parts = recorded.rgb, recorded.depth, ground.hidden_by_users(recorded).depth
+    parts = recorded.rgb, recorded.depth, hidden_by_users(recorded)
     rgb, depth, hidden = (upload(part, device) for part in parts)
     return UploadedImage(recorded, rgb.permute(2, 0, 1)[None].float(), depth, hidden)
 
@@ -71,13 +73,18 @@ def carry_on_device(
     on_ground = _ground_depth(rays, target, T_world_rig)
     by_depth = torch.stack([_warp(one, one.depth, rays, target, depth, np.inf) for one in images])
     by_ground = torch.stack(
-        [_warp(one, one.hidden, rays, target, on_ground, ground.FREE_SHARE) for one in images]
+        [_warp(one, one.hidden, rays, target, on_ground, FREE_SHARE) for one in images]
     )
     chosen = on_ground > 0
     if len(images) > 1:
         size = ground.window_px(target.K)
-        apart = _disagreement(by_ground, size) - _disagreement(by_depth, size)
-        chosen &= (apart <= ground.PREFERENCE * size**2) | (depth <= 0)
+        step = ground.step_px(size)
+        across = size // step | 1
+        by_both = (part[:, ::step, ::step] for part in (by_ground, by_depth))
+        apart = torch.sub(*(_disagreement(part, across) for part in by_both))
+        agrees = (apart <= ground.PREFERENCE * across**2).repeat_interleave(step, dim=0)
+        agrees = agrees.repeat_interleave(step, dim=1)[: len(depth), : depth.shape[1]]
+        chosen &= agrees | (depth <= 0)
     return torch.where(chosen[..., None], by_ground, by_depth)
 
 
@@ -116,7 +123,7 @@ def _warp(
         rays: Of the view.
         target: The view.
         depth: By which the frame is carried; road users move with their boxes by the view's own.
-        free_share: See `warp.warp`.
+        free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
     recorded, placed = image.recorded, target.placed
     project = recorded.K @ inverse(recorded.T_world_camera)[:3]
@@ -158,7 +165,7 @@ def _ground_depth(rays: Tensor, target: WarpTarget, T_world_rig: F64) -> Tensor:
     (slope,) = _turned(down[None], rays)
     z = -height_m / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
-    free &= (depth <= 0) | (depth >= ground.FREE_SHARE * z)
+    free &= (depth <= 0) | (depth >= FREE_SHARE * z)
     for ray, eye, walls, _ in zip(*target.placed.seen, strict=True):
         along = _turned(ray, rays)
         reaches = [_column(wall - eye, rays) / along for wall in walls]

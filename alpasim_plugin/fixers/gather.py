@@ -27,8 +27,10 @@ from alpasim_plugin.fixers.network.reference_blend import (
     Operations,
     ReferenceCells,
 )
+from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
+BAND = 8  # rows of a smaller image that are enlarged at a time
 
 
 def _array(x: Tensor) -> np.ndarray:
@@ -36,7 +38,7 @@ def _array(x: Tensor) -> np.ndarray:
     return np.ascontiguousarray((x.float() if x.is_floating_point() else x).numpy())
 
 
-def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
+def gather_references(references: Tensor, render: Tensor) -> ReferenceCells:
     """Return the same as `network.reference_blend.gather_references`, of references as bytes."""
     (b, k), (_, h, w, _) = references.shape[:2], render.shape
     sizes = [
@@ -44,21 +46,18 @@ def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> Ref
         for n, side in ((b, CELL), (b, DETAIL), (b * k, CELL), (b * k, DETAIL))
     ]
     made = ReferenceCells(*(torch.empty(size) for size in sizes))
-    lines = _array(references).reshape(b, k, scale * h, -1)
-    _gather_references(lines, _array(render), scale, *(part.numpy() for part in made))
+    lines = _array(references).reshape(b, k, h, -1)
+    _gather_references(lines, _array(render), *(part.numpy() for part in made))
     return made
 
 
 @kernel
-def _gather_references(references, render, scale, mean4, mean2, each4, each2):
+def _gather_references(references, render, mean4, mean2, each4, each2):
     batch = references.shape[0]
     count = references.shape[1]
     height = render.shape[1]
     width = render.shape[2]
-    share, level = (
-        np.float32(1.0) / np.float32(count),
-        np.float32(1.0) / np.float32(HALF * scale * scale),
-    )
+    share, level = np.float32(1.0) / np.float32(count), np.float32(1.0 / HALF)
     size = CHANNELS * width
     row = np.empty(size, np.float32)
     mean = np.empty(size, np.float32)
@@ -71,16 +70,9 @@ def _gather_references(references, render, scale, mean4, mean2, each4, each2):
             own = render[b, y]
             mean[:] = np.float32(0.0)
             for k in range(count):
-                row[:] = np.float32(0.0)
-                for line in references[b, k, scale * y : scale * (y + 1)]:
-                    if scale == 1:
-                        for i in range(len(row)):
-                            row[i] = np.float32(line[i])
-                    else:
-                        for x in range(width):
-                            for i in range(scale * x, scale * (x + 1)):
-                                for c in range(CHANNELS):
-                                    row[CHANNELS * x + c] += np.float32(line[CHANNELS * i + c])
+                line = references[b, k, y]
+                for i in range(len(row)):
+                    row[i] = np.float32(line[i])
                 for x in range(width):
                     holds = row[CHANNELS * x + 3] * level * np.float32(0.5)
                     for c in range(3):
@@ -109,38 +101,78 @@ def _put_runs(row, cells, at, run):
             cell[at + i] = row[run * j + i]
 
 
-def blend(
-    repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1
-) -> tuple[Tensor, Tensor]:
+def blend(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
     """Return the same as `network.reference_blend.blend`, of references as bytes."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
-    pixels = _array(references).view(np.uint32)[..., 0]
-    parts = (_array(part) for part in heads)
-    _blend(_array(repaired), pixels, *parts, scale, out.numpy(), recorded.numpy())
+    whole = _array(repaired), *_sources(references, heads), out.numpy(), recorded.numpy()
+    for image, pixels, weight, offset_px, correction, *made in zip(*whole, strict=True):
+        _blend(image, pixels, weight, offset_px, correction, 1, 0, *made)
     return out, recorded
 
 
+def _sources(references: Tensor, heads: BlendHeads) -> tuple[np.ndarray, ...]:
+    """Return references as one number a pixel, its first channel the lowest byte, and the heads."""
+    return _array(references).view(np.uint32)[..., 0], *(_array(part) for part in heads)
+
+
+def enlarge(
+    rgb: Tensor,
+    change: Tensor,
+    references: Tensor | None,
+    heads: BlendHeads | None,
+    scale: int,
+) -> Tensor:
+    """Return the same as `network.reference_blend.enlarge`, a band of rows at a time, which stays in
+    the processor's cache; the bands are shared by torch's number of threads.
+    """
+    height, width = rgb.shape[1:3]
+    out = torch.empty_like(rgb)
+    renders, changes, levels = _array(rgb), _array(change), out.numpy()
+    sources = None
+    if references is not None and heads is not None:
+        sources = _sources(references, heads)
+    starts = range(0, height, BAND * scale)
+    todo = iter([(b, first) for b in range(len(rgb)) for first in starts])
+
+    def work() -> None:
+        for b, first in todo:
+            band = slice(first, min(first + BAND * scale, height))
+            above = max(first // scale - 1, 0)
+            around = changes[b, above : first // scale + BAND + 1]
+            added = cv2.resize(around, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+            added = added[first - above * scale :][: band.stop - first, :width]
+            image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
+            if sources is not None:
+                mixed, recorded = np.empty_like(image), np.empty_like(image[..., :1])
+                _blend(image, *(part[b] for part in sources), scale, first, mixed, recorded)
+                image = mixed
+            levels[b, band] = cv2.addWeighted(image, HALF, image, 0, HALF, dtype=cv2.CV_8U)
+
+    run_on_threads(torch.get_num_threads(), work)
+    return out
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _blend(repaired, references, weight, offset_px, correction, scale, out, recorded):
+def _blend(repaired, references, weight, offset_px, correction, scale, first_row, out, recorded):
     """Blend a row at a time: where each pixel is looked up, what is found there, its share; channel
     by channel, so that rows are vectors.
 
     What the heads say is ``scale`` times coarser than the image, offsets twice that, and is
-    interpolated between the middles. A pixel of a reference is one number, its first channel the
-    lowest byte.
+    interpolated between the middles. ``repaired`` holds the rows from ``first_row`` on.
     """
-    batch, count, height, width = references.shape
+    count, height, width = references.shape
+    cells_down, cells_across = weight.shape[1:3]
     one = np.float32(1.0)
     zero = np.float32(0.0)
     largest = np.float32(LARGEST)
     nowhere = np.float32(NOWHERE)
     level, half = np.float32(1.0 / HALF), np.float32(0.5 / HALF)
-    y0, y1, fy = _between(height, scale)
-    x0, x1, fx = _between(width, scale)
-    v0, v1, fv = _between(height, scale * DETAIL)
-    u0, u1, fu = _between(width, scale * DETAIL)
-    coarse_offset = np.empty((2, width // (scale * DETAIL)), np.float32)
-    coarse_correction = np.empty((CHANNELS, width // scale), np.float32)
+    y0, y1, fy = _between(height, scale, DETAIL * cells_down)
+    x0, x1, fx = _between(width, scale, DETAIL * cells_across)
+    v0, v1, fv = _between(height, scale * DETAIL, cells_down)
+    u0, u1, fu = _between(width, scale * DETAIL, cells_across)
+    coarse_offset = np.empty((2, cells_across), np.float32)
+    coarse_correction = np.empty((CHANNELS, DETAIL * cells_across), np.float32)
     # The two coarser rows around a row of pixels, by whether their number is odd; the next row of
     # pixels most often lies between the same two.
     offset_rows = np.empty((count, 2, 2, width), np.float32)
@@ -153,81 +185,77 @@ def _blend(repaired, references, weight, offset_px, correction, scale, out, reco
     blended = np.empty((3, width), np.float32)
     total = np.empty(width, np.float32)
     share = np.empty(width, np.float32)
-    for b in range(batch):
-        row_of[:] = -1
-        for y in range(height):
-            total[:] = one
+    row_of[:] = -1
+    for i in range(len(repaired)):
+        y = first_row + i
+        total[:] = one
+        for x in range(width):
+            for c in range(3):
+                blended[c, x] = repaired[i, x, c]
+        for k in range(count):
+            for row in (v0[y], v1[y]):
+                if row_of[k, row % 2] != row:
+                    row_of[k, row % 2] = row
+                    for j in range(coarse_offset.shape[1]):
+                        for c in range(2):
+                            coarse_offset[c, j] = np.float32(scale) * offset_px[k, row, j, c]
+                    _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
+            upper, lower = offset_rows[k, v0[y] % 2], offset_rows[k, v1[y] % 2]
             for x in range(width):
-                for c in range(3):
-                    blended[c, x] = repaired[b, y, x, c]
-            for k in range(count):
-                for row in (v0[y], v1[y]):
-                    if row_of[k, row % 2] != row:
-                        row_of[k, row % 2] = row
-                        for j in range(coarse_offset.shape[1]):
-                            for c in range(2):
-                                coarse_offset[c, j] = np.float32(scale) * offset_px[b, k, row, j, c]
-                        _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
-                upper, lower = offset_rows[k, v0[y] % 2], offset_rows[k, v1[y] % 2]
+                px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
+                py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
+                px = min(max(px, zero), np.float32(width - 1))
+                py = min(max(py, zero), np.float32(height - 1))
+                left = np.int32(px)
+                top = np.int32(py)
+                a = px - np.float32(left)
+                g = py - np.float32(top)
+                shares[3, x] = g * a
+                shares[1, x] = a - shares[3, x]
+                shares[2, x] = g - shares[3, x]
+                shares[0, x] = one - a - shares[2, x]
+                to_right = min(left + 1, width - 1) - left
+                to_below = (min(top + 1, height - 1) - top) * width
+                first = top * width + left
+                place[0, x] = first
+                place[1, x] = first + to_right
+                place[2, x] = first + to_below
+                place[3, x] = first + to_right + to_below
+            image = references[k].reshape(-1)
+            for corner in range(4):
                 for x in range(width):
-                    px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
-                    py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
-                    px = min(max(px, zero), np.float32(width - 1))
-                    py = min(max(py, zero), np.float32(height - 1))
-                    left = np.int32(px)
-                    top = np.int32(py)
-                    a = px - np.float32(left)
-                    g = py - np.float32(top)
-                    shares[3, x] = g * a
-                    shares[1, x] = a - shares[3, x]
-                    shares[2, x] = g - shares[3, x]
-                    shares[0, x] = one - a - shares[2, x]
-                    to_right = min(left + 1, width - 1) - left
-                    to_below = (min(top + 1, height - 1) - top) * width
-                    first = top * width + left
-                    place[0, x] = first
-                    place[1, x] = first + to_right
-                    place[2, x] = first + to_below
-                    place[3, x] = first + to_right + to_below
-                image = references[b, k].reshape(-1)
-                for corner in range(4):
-                    for x in range(width):
-                        corners[corner, x] = image[place[corner, x]]
-                for c in range(CHANNELS):
-                    shift = np.uint32(8 * c)
-                    for x in range(width):
-                        value = zero
-                        for corner in range(4):
-                            value += shares[corner, x] * np.float32(
-                                np.int32((corners[corner, x] >> shift) & np.uint32(255))
-                            )
-                        looked_up[c, x] = value
-                for row in (y0[y], y1[y]):
-                    if row_of[k, 2 + row % 2] != row:
-                        row_of[k, 2 + row % 2] = row
-                        if scale == 1:
-                            _correction_row(
-                                weight[b, k], correction[b, k], row, correction_rows[k, row % 2]
-                            )
-                        else:
-                            _correction_row(weight[b, k], correction[b, k], row, coarse_correction)
-                            _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
-                upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
+                    corners[corner, x] = image[place[corner, x]]
+            for c in range(CHANNELS):
+                shift = np.uint32(8 * c)
                 for x in range(width):
-                    logarithm = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
-                    share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
-                    total[x] += share[x]
-                for c in range(3):
-                    for x in range(width):
-                        correction_here = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
-                        blended[c, x] += share[x] * (
-                            looked_up[c, x] * level - one + correction_here
+                    value = zero
+                    for corner in range(4):
+                        value += shares[corner, x] * np.float32(
+                            np.int32((corners[corner, x] >> shift) & np.uint32(255))
                         )
+                    looked_up[c, x] = value
+            for row in (y0[y], y1[y]):
+                if row_of[k, 2 + row % 2] != row:
+                    row_of[k, 2 + row % 2] = row
+                    if scale == 1:
+                        _correction_row(weight[k], correction[k], row, correction_rows[k, row % 2])
+                    else:
+                        _correction_row(weight[k], correction[k], row, coarse_correction)
+                        _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
+            upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
             for x in range(width):
-                over = one / total[x]
-                for c in range(3):
-                    out[b, y, x, c] = blended[c, x] * over
-                recorded[b, y, x, 0] = max(one - over, zero)
+                logarithm = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
+                share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
+                total[x] += share[x]
+            for c in range(3):
+                for x in range(width):
+                    correction_here = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
+                    blended[c, x] += share[x] * (looked_up[c, x] * level - one + correction_here)
+        for x in range(width):
+            over = one / total[x]
+            for c in range(3):
+                out[i, x, c] = blended[c, x] * over
+            recorded[i, x, 0] = max(one - over, zero)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -241,14 +269,14 @@ def _stretched(coarse, before, after, share, out):
 
 
 @kernel
-def _between(length, scale):
+def _between(length, scale, count):
     """Return for each pixel of a row or column the values before and after it, ``scale`` pixels
-    wide, and the share of the second.
+    wide and ``count`` in number, and the share of the second.
     """
     before = np.empty(length, np.uint32)
     after = np.empty(length, np.uint32)
     share = np.empty(length, np.float32)
-    last = length // scale - 1
+    last = count - 1
     for x in range(length):
         place = max((x + 0.5) / scale - 0.5, 0.0)
         before[x] = min(int(place), last)
@@ -271,24 +299,19 @@ def _correction_row(weight, correction, row, out):
 
 
 def smaller(x: Tensor, scale: int) -> Tensor:
-    """Average images ``(B, H, W, C)`` of at most four channels over squares of ``scale`` pixels."""
-    return _resize(x, 1 / scale, cv2.INTER_AREA)
-
-
-def larger(x: Tensor, scale: int) -> Tensor:
-    """Enlarge images ``(B, H, W, C)`` of at most four channels bilinearly."""
-    return _resize(x, scale, cv2.INTER_LINEAR)
-
-
-def _resize(x: Tensor, factor: float, method: int) -> Tensor:
-    if factor == 1:
+    """Return the same as `network.reference_blend.smaller`, of at most four channels."""
+    if scale == 1:
         return x
+    height, width, channels = x.shape[-3:]
     out = torch.empty(
-        x.shape[0], round(x.shape[1] * factor), round(x.shape[2] * factor), x.shape[3]
+        *x.shape[:-3], -(-height // scale), -(-width // scale), channels, dtype=x.dtype
     )
-    for image, resized in zip(_array(x), out.numpy(), strict=True):
-        cv2.resize(image, resized.shape[1::-1], dst=resized, interpolation=method)
+    border = 0, -height % scale, 0, -width % scale
+    resized = out.numpy().reshape(-1, *out.shape[-3:])
+    for image, made in zip(_array(x).reshape(-1, height, width, channels), resized, strict=True):
+        whole = cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE)
+        cv2.resize(whole, made.shape[1::-1], dst=made, interpolation=cv2.INTER_AREA)
     return out
 
 
-CPU = Operations(gather_references, blend, smaller, larger, sparse_source)
+CPU = Operations(gather_references, blend, smaller, enlarge, sparse_source)

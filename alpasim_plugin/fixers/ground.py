@@ -22,19 +22,24 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.kernels import float_kernel
-from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget, on_boxes, place_boxes, warp
+from alpasim_plugin.core.types import F32, F64, U8, Bool, Box
+from alpasim_plugin.fixers.warp import (
+    FREE_SHARE,
+    RecordedImage,
+    WarpTarget,
+    on_boxes,
+    place_boxes,
+    warp,
+)
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
 
 I32 = npt.NDArray[np.int32]
 
 NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
-# a surface nearer than this share of the ground's depth stands above the ground for certain
-FREE_SHARE = 0.4
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
 PREFERENCE = 3  # grey levels by which the ground may agree less than the render's depth does
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
-HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind shows nowhere
+SAMPLES = 15  # a larger window is sampled by so many rows and columns, or up to twice as many
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
@@ -53,41 +58,60 @@ def carry(
     Returns:
         For each recorded image ``(H, W, 4)`` uint8: see `warp`.
     """
-    by_depth = _warp_all(recorded_images, target, np.inf, threads)
     depth = ground_hypothesis(target, T_world_rig)
-    rows = np.flatnonzero(depth.any(axis=1))
-    if not by_depth or not len(rows):
-        return tuple(by_depth)
-    lower = slice(int(rows[0]), len(depth))
-    K = target.K.copy()
-    K[1, 2] -= lower.start
-    view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = _warp_all(
-        [hidden_by_users(recorded) for recorded in recorded_images], view, FREE_SHARE, threads
+    ground = depth > 0
+    if len(recorded_images) < 2 or not ground.any():
+        return tuple(_warp_all(recorded_images, _by_two(target, depth, ground), threads))
+    size = window_px(target.K)
+    step = step_px(size)
+    across = size // step | 1
+    top = int(ground.any(axis=1).argmax()) // step * step
+    compared = recorded_images[:2]
+    by_depth = _warp_all(compared, _sampled(target, 0, step), threads)
+    view = _sampled(replace(target, depth=depth, ground=ground, actors={}), top, step)
+    by_ground = _warp_all(compared, view, threads)
+    own = [image[top // step :] for image in by_depth]
+    agrees = (
+        _disagreement(by_ground[0], by_ground[1], across)
+        <= _disagreement(own[0], own[1], across) + PREFERENCE * across**2
     )
-    ground = view.depth > 0
-    if len(recorded_images) > 1:
-        size = window_px(K)
-        own = [image[lower] for image in by_depth[:2]]
-        better = (
-            _disagreement(by_ground[0], by_ground[1], size)
-            <= _disagreement(own[0], own[1], size) + PREFERENCE * size**2
-        )
-        ground &= better | (target.depth[lower] <= 0)
+    rows, columns = ground[top:].shape
+    agrees = agrees.repeat(step, axis=0)[:rows].repeat(step, axis=1)[:, :columns]
+    ground[top:] &= agrees | (target.depth[top:] <= 0)
+    chosen = _by_two(target, depth, ground)
+    if step > 1:
+        return tuple(_warp_all(recorded_images, chosen, threads))
     for image, on_ground in zip(by_depth, by_ground, strict=True):
-        cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
-    return tuple(by_depth)
+        cv2.copyTo(on_ground, ground[top:].view(np.uint8), image[top:])  # in place
+    return (*by_depth, *_warp_all(recorded_images[2:], chosen, threads))
+
+
+def _by_two(target: WarpTarget, depth: F32, ground: Bool) -> WarpTarget:
+    """Return a view that has the depth of the ground where ``ground`` says so."""
+    return replace(target, depth=np.where(ground, depth, target.depth), ground=ground)
+
+
+def _sampled(target: WarpTarget, top: int, step: int) -> WarpTarget:
+    """Return every ``step``-th pixel of the rows of a view from ``top`` on, as a view."""
+    K = target.K.copy()
+    K[:2, 2] += (step - 1) / 2 - np.array([0, top])
+    K[:2] /= step
+    depth, ground = (
+        None if part is None else np.ascontiguousarray(part[top::step, ::step])
+        for part in (target.depth, target.ground)
+    )
+    return replace(target, K=K, depth=depth, ground=ground)
 
 
 def _warp_all(
-    recorded_images: Sequence[RecordedImage], target: WarpTarget, free_share: float, threads: int
+    recorded_images: Sequence[RecordedImage], target: WarpTarget, threads: int
 ) -> list[U8]:
     out = {}
     todo = iter(range(len(recorded_images)))  # shared: each thread takes the next
 
     def work() -> None:
         for i in todo:
-            out[i] = warp(recorded_images[i], target, free_share)
+            out[i] = warp(recorded_images[i], target)
 
     run_on_threads(max(1, min(threads, len(recorded_images))), work)
     return [out[i] for i in range(len(recorded_images))]
@@ -96,6 +120,11 @@ def _warp_all(
 def window_px(K: F64) -> int:
     """Return the side of the window in which two recorded frames are compared, pixels; odd."""
     return max(3, round(WINDOW_RAD * float(K[0, 0])) | 1)
+
+
+def step_px(size: int) -> int:
+    """Return every how many pixels two recorded frames are compared in windows of a size."""
+    return max(1, size // SAMPLES)
 
 
 def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
@@ -136,17 +165,6 @@ def with_users(recorded: RecordedImage, boxes: Mapping[str, Box]) -> RecordedIma
     )
     users = on_boxes((height, width), placed.seen)
     return replace(recorded, users=users) if users.any() else recorded
-
-
-def hidden_by_users(recorded: RecordedImage) -> RecordedImage:
-    """Return a recorded frame whose road users hide all ground behind them, however near to it they
-    stand.
-    """
-    return (
-        recorded
-        if recorded.users is None
-        else replace(recorded, depth=np.where(recorded.users, np.float32(HIDING_M), recorded.depth))
-    )
 
 
 def _disagreement(a: U8, b: U8, size: int) -> I32:

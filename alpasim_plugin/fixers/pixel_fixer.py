@@ -27,16 +27,18 @@ from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import (
     GRID_PX,
     PixelState,
+    Repaired,
+    blended,
     content_key,
     noise_key,
 )
+from alpasim_plugin.fixers.network.reference_blend import HALF, enlarged, in_bytes
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.trust import trust_facts, trust_sums
 from alpasim_plugin.fixers.views import (
-    HALF,
     Views,
     check_continues,
     group_views,
@@ -49,8 +51,6 @@ class GivenFrame(NamedTuple):
     """One frame of B cameras, and what is known of the frame before."""
 
     rgb: Tensor  # (B, H, W, 3) uint8
-    rgb_before: Tensor  # as rgb; a first frame's own
-    fixed_before: Tensor  # as rgb; a first frame's own
     output: Tensor  # this and the next three: see `PixelState`
     render: Tensor
     hidden: Tensor
@@ -77,18 +77,19 @@ class FixedFrame(NamedTuple):
 def fix_frame(
     generator: LoadedGenerator, settings: PixelFixerSettings, given: GivenFrame
 ) -> FixedFrame:
-    """Fix one frame."""
-    _, height, width, _ = given.rgb.shape
-    scale = settings.scale_of(height, width)
-    state = PixelState(given.output, given.render, given.hidden, given.recorded)
-    render = in_range(given.rgb, scale)
-    opacity = (
-        torch.ones_like(render[..., :1])
-        if given.alpha is None
-        else padded(given.alpha, scale)[..., None]
+    """Fix one frame; a large one as a smaller one, whose changes are then enlarged."""
+    net, operations = generator.net, generator.operations
+    scale = settings.scale_of(*given.rgb.shape[1:3])
+    alpha = None if given.alpha is None else given.alpha[..., None]
+    rgb, alpha, maps, references = (
+        None if part is None else operations.smaller(part, scale)
+        for part in (given.rgb, alpha, given.maps, given.references)
     )
-    sdmap = torch.full_like(render, -1.0) if given.maps is None else in_range(given.maps, scale)
-    references = given.references
+    _, height, width, _ = rgb.shape
+    state = PixelState(given.output, given.render, given.hidden, given.recorded)
+    render = in_range(rgb)
+    opacity = torch.ones_like(render[..., :1]) if alpha is None else padded(alpha)
+    sdmap = torch.full_like(render, -1.0) if maps is None else in_range(maps)
     if references is not None:
         right, below = render.shape[2] - width, render.shape[1] - height
         references = F.pad(references, (0, 0, 0, right, 0, below))
@@ -97,32 +98,32 @@ def fix_frame(
     def source(draw: int) -> Tensor:
         if given.keys is None:
             return render
-        return generator.operations.source(render, transparent, given.keys[draw])
+        return operations.source(render, transparent, given.keys[draw])
 
-    def predict(z: Tensor, t: Tensor | None) -> tuple[Tensor, PixelState]:
-        images = render, opacity, sdmap
-        predicted: tuple[Tensor, PixelState] = generator.net(
-            *images, state, z, t, references, scale, generator.operations
-        )
-        return predicted
+    def predict(z: Tensor, t: Tensor | None) -> tuple[Repaired, Tensor, PixelState]:
+        repaired = net.repair(render, opacity, sdmap, state, z, t, references, operations)
+        if scale > 1 and repaired.heads is not None:
+            repaired = repaired._replace(heads=enlarged(repaired.heads, scale))
+        return repaired, *blended(repaired, render, references, operations)
 
-    video, after = predict(source(0), None)
+    repaired, video, after = predict(source(0), None)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = render.new_full((len(render),), level.sigma)
-        video, after = predict(interpolant(video, source(index), level.sigma), t)
+        repaired, video, after = predict(interpolant(video, source(index), level.sigma), t)
+    change = repaired.image - render
     if settings.keep_render:
         share = render_share(video, render, opacity, sdmap, state.output)
         if share is not None:
             video = torch.lerp(video, render, share * (1 - after.recorded))
             after = after._replace(output=video.clamp(-1, 1))
+            change = change * (1 - share)
     visible = slice(None), slice(height), slice(width)
     output = after.output[visible]
-    levels = (output * HALF).add_(HALF).round_().clamp_(0, 255)
-    levels = levels.nan_to_num_(0.0).to(torch.uint8)
-    measured = guard.measures(
-        video[visible], levels, given.rgb, given.fixed_before, given.rgb_before
-    )
+    levels, *before = (in_bytes(x[visible]) for x in (after.output, state.output, state.render))
+    measured = guard.measures(video[visible], levels, rgb, *before)
     sums = trust_sums(output, after.render[visible], after.recorded[visible])
+    if scale > 1:
+        levels = operations.enlarge(given.rgb, change, given.references, repaired.heads, scale)
     return FixedFrame(levels, measured, sums, *after)
 
 
@@ -146,7 +147,6 @@ class CameraHistory:
     frames: int  # fixed so far
     t_us: int  # of the last
     raw: Tensor  # (H, W, 3) uint8, the last render
-    fixed: Tensor  # like it, the last output as generated, also if the guard returned the raw frame
 
 
 class PixelFixer(Fixer):
@@ -271,14 +271,10 @@ class PixelFixer(Fixer):
             for b, past in enumerate(pasts)
         ]
         counts = [0 if past is None else past.frames for past in pasts]
-        height, width = view.shape
-        before = [
-            (rgb[b], rgb[b]) if past is None else (past.raw, past.fixed)
-            for b, past in enumerate(pasts)
-        ]
+        scale = self.settings.scale_of(*view.shape)
+        height, width = (-(-side // scale) for side in view.shape)
         given = GivenFrame(  # type: ignore[call-arg]
             rgb,
-            *(torch.stack(parts) for parts in zip(*before, strict=True)),
             *(torch.cat(parts) for parts in zip(*states, strict=True)),
             alpha,
             maps,
@@ -286,10 +282,9 @@ class PixelFixer(Fixer):
             self._noise_keys(view, rgb, counts),
         )
         fixed_frame = self._run(given)
-        levels = fixed_frame.levels
         after = PixelState(*fixed_frame[3:])
         images, measured, sums, *rest = download(
-            levels,
+            fixed_frame.levels,
             fixed_frame.measured,
             fixed_frame.sums,
             *(planes.pairs for planes in drawn),
@@ -303,7 +298,7 @@ class PixelFixer(Fixer):
             state = PixelState(*(part[b : b + 1] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
                 state = self._start(rgb[b : b + 1])
-            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], rgb[b], levels[b])
+            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], rgb[b])
             events, facts = frame.events, dict(frame.facts)
             if frame.pending is not None:  # nobody has looked at the render yet
                 events += guard.render_events(measured[b])
@@ -320,7 +315,7 @@ class PixelFixer(Fixer):
     def _start(self, rgb: Tensor) -> PixelState:
         """Return the state before a first frame ``(1, H, W, 3)``."""
         scale = self.settings.scale_of(*rgb.shape[1:3])
-        return self.generator.net.start(in_range(rgb, scale), scale)
+        return self.generator.net.start(in_range(self.generator.operations.smaller(rgb, scale)))
 
     def _noise_keys(self, view: Views, rgb: Tensor, counts: Sequence[int]) -> Tensor | None:
         """Return the keys of a frame's noise ``(steps, B)``, None where it has none."""
@@ -361,10 +356,10 @@ def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[F
     return replace(view, rgb=rgb[:, None], alpha=alpha[:, None]), frames
 
 
-def padded(plane: Tensor, scale: int) -> Tensor:
-    """Return planes ``(B, H, W, ...)`` with their edges repeated up to multiples of 16 ``scale``."""
+def padded(plane: Tensor) -> Tensor:
+    """Return planes ``(B, H, W, ...)`` with their edges repeated up to multiples of 16."""
     height, width = plane.shape[1:3]
-    below, right = -height % (GRID_PX * scale), -width % (GRID_PX * scale)
+    below, right = -height % GRID_PX, -width % GRID_PX
     if not (below or right):
         return plane
     rows = torch.arange(height + below, device=plane.device).clamp_(max=height - 1)
@@ -372,6 +367,6 @@ def padded(plane: Tensor, scale: int) -> Tensor:
     return plane[:, rows][:, :, columns]
 
 
-def in_range(image: Tensor, scale: int) -> Tensor:
+def in_range(image: Tensor) -> Tensor:
     """Convert images of bytes to [-1, 1], `padded`."""
-    return padded(image, scale).float().div_(HALF).sub_(1)
+    return padded(image).float().div_(HALF).sub_(1)

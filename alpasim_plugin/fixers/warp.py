@@ -27,6 +27,10 @@ SLACK_M = 0.4
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
 # stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
 PARALLEL = 1e-300
+# A recorded surface that is at least this share of a point's distance away does not hide the ground;
+# another point is hidden by all that does not agree with it.
+FREE_SHARE = 0.4
+HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind shows nowhere
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
 # Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
 VALID = 255
@@ -44,6 +48,7 @@ class WarpTarget:
             infinitely far.
         actors: ``T_world_box`` of the actors present.
         boxes: Sizes of actors; one that has none counts as absent.
+        ground: ``(H, W)`` which depths are the ground's; None: none is.
     """
 
     K: F64
@@ -51,6 +56,7 @@ class WarpTarget:
     depth: F32
     actors: Mapping[str, F64]
     boxes: Mapping[str, Box]
+    ground: Bool | None = None
 
     @cached_property
     def placed(self) -> PlacedBoxes:
@@ -74,7 +80,16 @@ class RecordedImage:
     users: Bool | None = None
 
 
-def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf) -> U8:
+def hidden_by_users(recorded: RecordedImage) -> F32:
+    """Return the depth of a recorded frame whose road users hide all ground behind them, however
+    near to it they stand.
+    """
+    if recorded.users is None:
+        return recorded.depth
+    return np.where(recorded.users, np.float32(HIDING_M), recorded.depth)
+
+
+def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
     A pixel's surface point is moved with the box it lies in, from where the actor is now to where
@@ -83,8 +98,6 @@ def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf
     Args:
         recorded: The recorded frame.
         target: The view.
-        free_share: A recorded surface that is at least this share of a point's distance away does
-            not hide the point. Infinite: only one that agrees with the point does not.
 
     Returns:
         ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with
@@ -103,7 +116,9 @@ def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf
     b = project[:, :3] @ target.T_world_camera[:3, 3] + project[:, 3]
     depth = np.ascontiguousarray(target.depth)
     depth_then = np.ascontiguousarray(recorded.depth)
-    _coordinates(depth, depth_then, A, b, free_share, x, y, held)
+    ground = np.zeros(shape, bool) if target.ground is None else target.ground
+    hidden = depth_then if target.ground is None else hidden_by_users(recorded)
+    _coordinates(depth, ground, depth_then, np.ascontiguousarray(hidden), A, b, x, y, held)
     names, seen = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([recorded.actors.get(name, absent) for name in names])
@@ -113,7 +128,7 @@ def warp(recorded: RecordedImage, target: WarpTarget, free_share: float = np.inf
         part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
         box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
         images = x[part], y[part], held[part]
-        _coordinates_on_box(depth[part], depth_then, *box, free_share, *images)
+        _coordinates_on_box(depth[part], depth_then, *box, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.dstack([rgb, held])
 
@@ -164,11 +179,11 @@ def place_boxes(
 
 
 @float_kernel
-def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
+def _coordinates(depth, ground, depth_then, hidden, A, b, x, y, held):
     """Fill ``x``, ``y`` and ``held`` as if nothing moved."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
-    surfaces = depth_then.reshape(-1)
+    surfaces, behind_users = depth_then.reshape(-1), hidden.reshape(-1)
     place = np.empty(width, np.uint32)
     distance = np.empty(width, np.float64)
     seen = np.empty(width, np.bool_)
@@ -193,9 +208,13 @@ def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
                 there,
             )
         for column in range(width):
-            held[row, column] = (
-                _held(surfaces[place[column]], distance[column], free_share) if seen[column] else 0
-            )
+            if not seen[column]:
+                held[row, column] = 0
+            elif ground[row, column]:
+                surface = behind_users[place[column]]
+                held[row, column] = _held(surface, distance[column], FREE_SHARE)
+            else:
+                held[row, column] = _held(surfaces[place[column]], distance[column], np.inf)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -210,9 +229,7 @@ def _held(surface, rz, free_share):
 
 
 @float_kernel
-def _coordinates_on_box(
-    depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held
-):
+def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, x, y, held):
     """Fill in what moves with one box in the part of the image that it may be seen in; see
     `SeenBoxes`.
 
@@ -240,7 +257,7 @@ def _coordinates_on_box(
             v = (project[1, 0] * px + project[1, 1] * py + project[1, 2] * pz + project[1, 3]) / rz
             if 0 <= u < columns_then and 0 <= v < rows_then:
                 x[row, column], y[row, column] = u - 0.5, v - 0.5
-                held[row, column] = _held(depth_then[int(v), int(u)], rz, free_share)
+                held[row, column] = _held(depth_then[int(v), int(u)], rz, np.inf)
 
 
 def on_boxes(shape: tuple[int, int], seen: SeenBoxes) -> Bool:

@@ -8,6 +8,7 @@ import torch
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
+from alpasim_plugin.fixers import ground
 from alpasim_plugin.fixers.device_carry import carry_on_device, upload_image
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
@@ -20,9 +21,12 @@ def actors(x_m):
     return {"car": se2(18.0 + x_m, -1.0, 0.1, 0.75), "van": se2(25.0, 3.0, 0.0, 1.25)}
 
 
-@pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("wall_m", [np.inf, 30.0])
-def test_images_equal_those_of_the_processor(count, wall_m):
+@pytest.mark.parametrize(
+    ("count", "wall_m", "window_rad"),
+    [(1, 30.0, 0.075), (3, np.inf, 0.075), (3, 30.0, 0.075), (3, np.inf, 0.7)],
+)
+def test_images_equal_those_of_the_processor(count, wall_m, window_rad, monkeypatch):
+    monkeypatch.setattr(ground, "WINDOW_RAD", window_rad)  # 3 pixels, or 35, of which half count
     T, depth, _ = street(10.013, wall_m)
     depth[22:30, 8:40] = 0
     depth[30:36, 8:40] = 3.0

@@ -18,38 +18,33 @@ def recordings(batch, references, height, width):
     return out
 
 
-@pytest.mark.parametrize(
-    ("batch", "references", "height", "width", "scale"),
-    [
-        (1, 1, 16, 16, 1),
-        (2, 3, 32, 48, 1),
-        (1, 4, 16, 80, 1),
-        (2, 2, 32, 64, 2),
-        (1, 1, 48, 96, 3),
-        (1, 2, 32, 64, 8),
-    ],
-)
-def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, width, scale):
+def heads_of(batch, references, height, width):
     draw = torch.Generator().manual_seed(height + references)
-    repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
+    at2 = (batch, references, height // 2, width // 2)
+    sizes = (4, 3.0), (2, 8.0), (12, 0.3)
+    return BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in sizes))
+
+
+def images_in_range(*shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(shape[1])) * 2 - 1
+
+
+@pytest.mark.parametrize(
+    ("batch", "references", "height", "width"), [(1, 1, 16, 16), (2, 3, 32, 48), (1, 4, 16, 80)]
+)
+def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, width):
+    repaired = images_in_range(batch, height, width, 3)
     images = recordings(batch, references, height, width)
-    at2 = (batch, references, height // (2 * scale), width // (2 * scale))
-    heads = BlendHeads(
-        *(
-            torch.randn(*at2, n, generator=draw) * size
-            for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))
-        )
-    )
-    seen, floats = repaired[:, : height // scale, : width // scale], in_floats(images)
-    exact_cells = TORCH.gather_references(images, seen, scale)
-    for one, other in zip(CPU.gather_references(images, seen, scale), exact_cells, strict=True):
+    heads, floats = heads_of(batch, references, height, width), in_floats(images)
+    exact_cells = TORCH.gather_references(images, repaired)
+    for one, other in zip(CPU.gather_references(images, repaired), exact_cells, strict=True):
         assert torch.allclose(one, other, atol=2e-6)
     exact = BlendHeads(
         *(part.double() for part in heads)
     )  # in float32 the operations one by one are less exact
     fast, plain = (
-        CPU.blend(repaired, images, heads, scale),
-        mix(sources_of(repaired.double(), floats.double(), exact, scale)),
+        CPU.blend(repaired, images, heads),
+        mix(sources_of(repaired.double(), floats.double(), exact)),
     )
     for one, other in zip(
         fast, plain, strict=True
@@ -60,8 +55,27 @@ def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, 
         heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16()
     )  # read as they are
     for one, other in zip(
-        CPU.blend(repaired, images, half, scale),
-        mix(sources_of(repaired, floats, half, scale)),
-        strict=True,
+        CPU.blend(repaired, images, half), mix(sources_of(repaired, floats, half)), strict=True
     ):
         assert torch.allclose(one, other, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("references", "height", "width", "scale"), [(2, 32, 64, 2), (1, 130, 100, 8), (0, 45, 91, 3)]
+)
+def test_bands_enlarge_as_the_operations_one_by_one(references, height, width, scale):
+    rgb, images = recordings(2, 1, height, width)[:, 0, ..., :3], None
+    seen = CPU.smaller(rgb, scale)
+    apart = seen.int() - TORCH.smaller(rgb, scale)
+    assert int(apart.abs().max()) <= 1  # halves are rounded to other sides
+    assert torch.allclose(*(one.smaller(rgb.float(), scale) for one in (CPU, TORCH)))
+    size = [-(-side // (16 * scale)) * 16 for side in (height, width)]
+    change, heads = images_in_range(2, *size, 3), None
+    if references:
+        images, heads = recordings(2, references, height, width), heads_of(2, references, *size)
+    one, other = (each.enlarge(rgb, change, images, heads, scale) for each in (CPU, TORCH))
+    assert one.shape == rgb.shape
+    assert float(((one.int() - other).abs() > 1).float().mean()) < 1e-3
+    if not references:  # the change of the render is all there is, here in the middle of squares
+        due = rgb[:, 1::3, 1::3] + 127.5 * change[:, : height // 3, : width // 3]
+        assert float((one[:, 1::3, 1::3] - due.clamp(0, 255)).abs().max()) <= 0.51

@@ -8,6 +8,7 @@ from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
+from alpasim_plugin.fixers import ground
 from alpasim_plugin.fixers.ground import (
     carry,
     ground_hypothesis,
@@ -69,6 +70,24 @@ def recorded(x_m, wall_m=np.inf):
 
 def off(image, truth, where):
     return float(np.abs(image[..., :3].astype(float) - truth)[where].mean())
+
+
+@pytest.mark.parametrize("wall_m", [np.inf, 20.0])
+def test_a_large_window_is_sampled_and_few_pixels_choose_another_depth(wall_m, monkeypatch):
+    T, depth, _ = street(10.0, wall_m)
+    depth[22:40, 8:56] = 0.0
+    depth[30:36, 20:40] = 2.0
+    view, pictures = (
+        WarpTarget(K, T, depth, NOBODY, {}),
+        [recorded(9.0, wall_m), recorded(8.0, wall_m)],
+    )
+    monkeypatch.setattr(ground, "WINDOW_RAD", 0.94)
+    assert ground.step_px(ground.window_px(K)) == 3
+    sampled = carry(pictures, view, rig(10.0))
+    monkeypatch.setattr(ground, "SAMPLES", 47)
+    assert ground.step_px(ground.window_px(K)) == 1
+    for image, whole in zip(sampled, carry(pictures, view, rig(10.0)), strict=True):
+        assert (image != whole).any(axis=-1).mean() < 0.02
 
 
 @pytest.mark.parametrize("fog_m", [0.0, 30.0], ids=["a hole", "mist behind the road"])

@@ -111,11 +111,14 @@ def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle):
     )
 
 
-@pytest.mark.parametrize("size", [(17, 33), (30, 50), (16, 16)])
-def test_odd_sizes_are_padded_and_cropped(bundle, size):
-    out = run(session(bundle), moving_picture(3, size), maps_of(moving_picture(3, size)))
+@pytest.mark.parametrize(("size", "scale"), [((17, 33), 1), ((30, 50), 1), ((70, 101), 3)])
+def test_odd_sizes_are_padded_and_cropped(bundle, size, scale):
+    fixer, frames = session(bundle, f"scale={scale}"), moving_picture(3, size)
+    out = run(fixer, frames, maps_of(frames))
     assert [frame.rgb.shape for frame in out] == [(*size, 3)] * 3
     assert not any(frame.events for frame in out)
+    assert fixer._history["front"].state.output.shape[1] == 32
+    assert all(frame.facts["guessed_share"] > 0 for frame in out)
 
 
 def test_a_missing_map_is_a_black_one(bundle):

@@ -4,7 +4,6 @@ order, and no harm where none holds.
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from alpasim_plugin.fixers.gather import CPU
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
@@ -73,34 +72,6 @@ def test_the_operations_of_a_processor_give_the_same_frame(batch, references):
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
         assert float((a - b).abs().quantile(0.99)) < 1e-4
         assert float((a - b).abs().max()) < 1e-2
-
-
-@pytest.mark.parametrize("references", [0, 2])
-def test_a_network_that_sees_smaller_images_blends_at_full_size(references):
-    net = trained_like()
-    render, opacity, sdmap, images = inputs(references, 2)
-    given = (images.abs() * 255).byte() if references else None
-    start = net.start(render, 2)
-    assert start.hidden.shape[1] * 2 == net.start(render).hidden.shape[1]
-    assert torch.equal(start.output, render)
-    frame = render, opacity, sdmap, start, None, None, given, 2
-    one, after = net(*frame)
-    other, _ = net(*frame, CPU)
-    assert one.shape == after.render.shape == render.shape
-    assert float((one - other).abs().quantile(0.99)) < 1e-4
-
-    seen = [
-        F.avg_pool2d(x.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1) for x in (render, opacity, sdmap)
-    ]
-    if references == 0:  # the change of the render is all there is, and it is enlarged
-        small, _ = call(net, *seen, None)
-        change = F.interpolate(
-            (small - seen[0]).permute(0, 3, 1, 2),
-            scale_factor=2,
-            mode="bilinear",
-            align_corners=False,
-        )
-        assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
 
 
 def test_a_large_image_is_not_bent_by_small_offsets_and_takes_more_of_its_references():

@@ -47,9 +47,8 @@ from alpasim_plugin.fixers.network.reference_blend import (
     Operations,
     ReferenceBlend,
     blend,
-    enlarged,
+    enlarge,
     gather_references,
-    larger,
     smaller,
 )
 
@@ -206,7 +205,7 @@ class Repaired(NamedTuple):
     heads: BlendHeads | None  # None without references
 
 
-TORCH = Operations(gather_references, blend, smaller, larger, dense_source)
+TORCH = Operations(gather_references, blend, smaller, enlarge, dense_source)
 
 
 class PixelGenerator(nn.Module):
@@ -258,16 +257,12 @@ class PixelGenerator(nn.Module):
             torch.manual_seed(seed % 2**63)
             return cls(sizes)
 
-    def start(self, render: Tensor, scale: int = 1) -> PixelState:
-        """Return the state before a rollout: the first render stands for the past.
-
-        Args:
-            render: ``(B, H, W, 3)`` the first frame.
-            scale: As in `forward`.
+    def start(self, render: Tensor) -> PixelState:
+        """Return the state before a rollout: the first render ``(B, H, W, 3)`` stands for the
+        past.
         """
         b, h, w, _ = render.shape
-        side = CELL * scale
-        hidden = render.new_zeros(b, h // side, w // side, self.sizes.hidden)
+        hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
         return PixelState(render, render, hidden, torch.zeros_like(render[..., :1]))
 
     def forward(
@@ -279,13 +274,12 @@ class PixelGenerator(nn.Module):
         source: Tensor | None = None,
         t: Tensor | None = None,
         references: Tensor | None = None,
-        scale: int = 1,
         operations: Operations = TORCH,
     ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame.
 
         Args:
-            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16 ``scale``.
+            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16.
             opacity: ``(B, H, W, 1)``, 0 to 1.
             sdmap: ``(B, H, W, 3)`` in [-1, 1]; black (-1) where there is no map.
             state: From `start` or the last call.
@@ -295,21 +289,13 @@ class PixelGenerator(nn.Module):
             references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and
                 where it holds, 0 to 1, or both as bytes; None: there is none. A network without a
                 blending head does not read them.
-            scale: The network sees images that are this many times smaller; its change of the
-                render and the heads of the references are enlarged, and render and references are
-                blended at their own size (joint upsampling; Kopf et al., 2007).
             operations: For the device.
 
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
         """
-        repaired = self.repair(
-            render, opacity, sdmap, state, source, t, references, scale, operations
-        )
-        out, recorded = repaired.image, torch.zeros_like(render[..., :1])
-        if repaired.heads is not None and references is not None:
-            out, recorded = operations.blend(out, references, repaired.heads, scale)
-        return out, PixelState(out.clamp(-1, 1), render, repaired.hidden, recorded)
+        repaired = self.repair(render, opacity, sdmap, state, source, t, references, operations)
+        return blended(repaired, render, references, operations)
 
     def repair(
         self,
@@ -320,26 +306,20 @@ class PixelGenerator(nn.Module):
         source: Tensor | None = None,
         t: Tensor | None = None,
         references: Tensor | None = None,
-        scale: int = 1,
         operations: Operations = TORCH,
     ) -> Repaired:
         """Run the network up to the blend of its image with the references; see `forward`."""
         dtype = self.stem.weight.dtype
-        smaller = operations.smaller
-        shown = smaller(render, scale)
-        noised = shown if source is None or source is render else smaller(source, scale)
-        past = state._replace(
-            output=smaller(state.output, scale), render=smaller(state.render, scale)
-        )
-        cover = 2 * smaller(opacity, scale) - 1
-        images = shown, cover, smaller(sdmap, scale), past.output, past.render, noised - shown
-        coarse = torch.cat([*(cells(image, CELL) for image in images), past.hidden], dim=-1)
-        details = shown, cover, past.output
+        noised = render if source is None else source
+        cover = 2 * opacity - 1
+        images = render, cover, sdmap, state.output, state.render, noised - render
+        coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
+        details = render, cover, state.output
         fine = torch.cat([cells(image, DETAIL) for image in details], dim=-1)
         stem, detail = self.stem(coarse.to(dtype)), self.read(fine.to(dtype))
         seen = None
         if self.blend is not None and references is not None:
-            seen = operations.gather_references(references, shown, scale)
+            seen = operations.gather_references(references, render)
             at4, at2 = self.blend.features(seen)
             stem, detail = stem + at4, detail + at2
 
@@ -360,9 +340,7 @@ class PixelGenerator(nn.Module):
         heads = None
         if self.blend is not None and seen is not None:
             heads = self.blend(y, fine, seen)
-            if scale > 1:
-                heads = enlarged(heads, scale)
-        return Repaired(render + operations.larger(change, scale), hidden, heads)
+        return Repaired(render + change, hidden, heads)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
@@ -379,6 +357,16 @@ class PixelGenerator(nn.Module):
     def facts(self) -> dict[str, object]:
         """Sizes as plain values."""
         return asdict(self.sizes)
+
+
+def blended(
+    repaired: Repaired, render: Tensor, references: Tensor | None, operations: Operations
+) -> tuple[Tensor, PixelState]:
+    """Blend what the network made of a render with the references; see `PixelGenerator.forward`."""
+    out, recorded = repaired.image, torch.zeros_like(render[..., :1])
+    if repaired.heads is not None and references is not None:
+        out, recorded = operations.blend(out, references, repaired.heads)
+    return out, PixelState(out.clamp(-1, 1), render, repaired.hidden, recorded)
 
 
 def _blocks(channels: int, count: int) -> nn.Sequential:

@@ -82,15 +82,15 @@ class Operations:
     Attributes:
         gather_references: See `gather_references`.
         blend: See `blend`.
-        smaller: Average images ``(B, H, W, C)`` over squares of a number of pixels.
-        larger: Enlarge images ``(B, H, W, C)`` bilinearly by a whole number.
+        smaller: See `smaller`.
+        enlarge: See `enlarge`.
         source: Fill what is transparent with noise; see `pixel_generator.sparse_source`.
     """
 
-    gather_references: Callable[[Tensor, Tensor, int], ReferenceCells]
-    blend: Callable[[Tensor, Tensor, BlendHeads, int], tuple[Tensor, Tensor]]
+    gather_references: Callable[[Tensor, Tensor], ReferenceCells]
+    blend: Callable[[Tensor, Tensor, BlendHeads], tuple[Tensor, Tensor]]
     smaller: Callable[[Tensor, int], Tensor]
-    larger: Callable[[Tensor, int], Tensor]
+    enlarge: Callable[[Tensor, Tensor, Tensor | None, BlendHeads | None, int], Tensor]
     source: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -223,16 +223,17 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
-        heads: Of the same, or of images ``scale`` times smaller; they are then interpolated, and
-            offsets are as much longer.
+        heads: Of the same, or of images ``scale`` times smaller, whose last rows and columns may lie
+            beyond; they are then interpolated, and offsets are as much longer.
         scale: How many times.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
     weight, correction = (
-        larger(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction)
+        larger(pixels(part, DETAIL).to(repaired.dtype), scale)[:, :h, :w]
+        for part in (weight, correction)
     )
-    moved = _sampled(references.flatten(0, 1), scale * offset_px)
+    moved = _sampled(references.flatten(0, 1), scale * offset_px, scale * DETAIL)
     colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
     logit = (weight + holds.log()).view(b, k, h, w, 1)
@@ -253,11 +254,23 @@ def in_floats(references: Tensor) -> Tensor:
     return torch.cat([references[..., :3] / HALF - 1, references[..., 3:] / (2 * HALF)], dim=-1)
 
 
+def in_bytes(image: Tensor) -> Tensor:
+    """Convert images in [-1, 1] to bytes; what is not a number is black."""
+    levels = (image * HALF).add_(HALF).round_().clamp_(0, 255)
+    return levels.nan_to_num_(0.0).to(torch.uint8)
+
+
 def smaller(x: Tensor, scale: int) -> Tensor:
-    """Average images ``(B, H, W, C)`` over squares of ``scale`` pixels."""
+    """Average images ``(..., H, W, C)``, of bytes or floats, over squares of ``scale`` pixels; the
+    last row and column go on up to whole squares.
+    """
     if scale == 1:
         return x
-    return F.avg_pool2d(x.permute(0, 3, 1, 2), scale).permute(0, 2, 3, 1)
+    height, width = x.shape[-3:-1]
+    planes = x.flatten(0, -4).permute(0, 3, 1, 2).float()
+    whole = F.pad(planes, (0, -width % scale, 0, -height % scale), mode="replicate")
+    mean = F.avg_pool2d(whole, scale).permute(0, 2, 3, 1).unflatten(0, x.shape[:-3])  # type: ignore[no-untyped-call]
+    return mean if x.is_floating_point() else mean.round().to(x.dtype)
 
 
 def larger(x: Tensor, scale: int) -> Tensor:
@@ -281,23 +294,50 @@ def blend(
     return mix(sources_of(repaired, in_floats(references), heads, scale))
 
 
+def enlarge(
+    rgb: Tensor,
+    change: Tensor,
+    references: Tensor | None,
+    heads: BlendHeads | None,
+    scale: int,
+) -> Tensor:
+    """Return large images as a network that saw smaller ones would have them: its change of the
+    render and the heads of the references are interpolated, and render and references are blended
+    at their own size (joint upsampling; Kopf et al., 2007).
+
+    Args:
+        rgb: ``(B, H, W, 3)`` uint8, the render.
+        change: ``(B, h, w, 3)`` of the image ``scale`` times smaller, of a range of 2; its last
+            rows and columns may lie beyond the large one.
+        references: ``(B, K, H, W, 4)`` uint8; None: there is none.
+        heads: Of the smaller images, see `enlarged`; None: there is none.
+        scale: How many times.
+
+    Returns:
+        ``(B, H, W, 3)`` uint8.
+    """
+    height, width = rgb.shape[1:3]
+    image = rgb / HALF - 1 + larger(change, scale)[:, :height, :width]
+    if references is not None and heads is not None:
+        image, _ = blend(image, references, heads, scale)
+    return in_bytes(image)
+
+
 def mix(sources: Sources) -> tuple[Tensor, Tensor]:
     """Blend the sources of an image; see `blend`."""
     shares = sources.logit.softmax(dim=1)
     return (shares * sources.colour).sum(dim=1), 1 - shares[:, 0]
 
 
-def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
+def gather_references(references: Tensor, render: Tensor) -> ReferenceCells:
     """Put what the network reads of references side by side.
 
     Args:
-        references: ``(B, K, scale H, scale W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1;
-            or the same as bytes.
+        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1; or the same
+            as bytes.
         render: ``(B, H, W, 3)`` in [-1, 1].
-        scale: References are averaged over squares of so many pixels.
     """
-    b, k = references.shape[:2]
-    seen = smaller(in_floats(references).flatten(0, 1), scale).unflatten(0, (b, k))  # type: ignore[no-untyped-call]
+    seen = in_floats(references)
     holds = seen[..., 3:]
     each = torch.cat([(seen[..., :3] - render[:, None]) * holds, holds], dim=-1)
     mean, flat = each.mean(dim=1), each.flatten(0, 1)
@@ -312,18 +352,16 @@ def _add_to_each(each: Tensor, one: Tensor) -> Tensor:
     return parts.add_(one[:, None]).flatten(0, 1)
 
 
-def _sampled(images: Tensor, offset: Tensor) -> Tensor:
-    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of a coarser grid;
-    beyond the border the outermost go on.
+def _sampled(images: Tensor, offset: Tensor, side: int = DETAIL) -> Tensor:
+    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of cells of ``side``
+    pixels; beyond the border the outermost go on.
     """
     h, w = images.shape[1:3]
-    full = F.interpolate(
-        offset.permute(0, 3, 1, 2), size=(h, w), mode="bilinear", align_corners=False
-    )
+    full = larger(offset, side)[:, :h, :w]
     columns = torch.arange(w, device=images.device) + 0.5
     rows = torch.arange(h, device=images.device)[:, None] + 0.5
     grid = torch.stack(
-        [(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1
+        [(columns + full[..., 0]) * (2 / w) - 1, (rows + full[..., 1]) * (2 / h) - 1], dim=-1
     )
     sampled = F.grid_sample(
         images.permute(0, 3, 1, 2),
