@@ -117,9 +117,8 @@ def fixer_work(cameras: int, width: int, height: int) -> Work:
     on_meta = replace(loaded, net=copy.deepcopy(loaded.net).to("meta"), operations=TORCH)
     image = torch.empty((cameras, height, width, 3), dtype=torch.uint8, device="meta")
     references = image.new_empty((cameras, 2, height, width, 4))
-    scale = settings.scale_of(height, width)
-    state = on_meta.net.start(in_range(image, scale), scale)
-    given = GivenFrame(image, image, image, *state, None, image, references)
+    seen = TORCH.smaller(image, settings.scale_of(height, width))
+    given = GivenFrame(image, *on_meta.net.start(in_range(seen)), None, image, references)
     return counted(lambda: fix_frame(on_meta, settings, given), given=given)
 
 
