@@ -43,6 +43,7 @@ class Traffic:
     launches: int = 0
     waits: Counter[str] = field(default_factory=Counter)
     bytes_up: int = 0
+    bytes_pinned: int = 0  # of those up
     bytes_down: int = 0
     graph: object = None  # that is being captured
     backward: int = 0  # of a tensor of the device, in progress
@@ -50,7 +51,7 @@ class Traffic:
 
     def reset(self):
         """Forget everything."""
-        self.launches = self.bytes_up = self.bytes_down = 0
+        self.launches = self.bytes_up = self.bytes_pinned = self.bytes_down = 0
         self.waits.clear()
 
 
@@ -231,6 +232,7 @@ def _moved(tensor, device, func, args, kwargs):
         return func(tensor, *rest, **others) if rest or others else tensor
     if device.type == "cuda":
         moved = _uploaded(tensor)
+        traffic.bytes_pinned += tensor.nbytes * hasattr(tensor, "pinned")
         if kwargs.get("non_blocking") is not True:
             traffic.waits["copy to the device"] += 1
     else:
@@ -245,6 +247,12 @@ def _device_of(value):
     if isinstance(value, str) and value.partition(":")[0] in ("cpu", "cuda"):
         return torch.device(value)
     return None
+
+
+def _pinned(tensor):
+    copy = tensor.clone()
+    copy.pinned = True
+    return copy
 
 
 class _Launches:
@@ -307,9 +315,12 @@ def pretended_device(patch, computes=True):
     )
     patch.setattr(torch.cuda, "CUDAGraph", PretendedGraph)
     patch.setattr(torch.cuda, "graph", captured)
-    patch.setattr(torch.cuda, "Stream", lambda: SimpleNamespace(wait_stream=lambda other: None))
+    patch.setattr(
+        torch.cuda, "Stream", lambda *place: SimpleNamespace(wait_stream=lambda other: None)
+    )
     patch.setattr(torch.cuda, "current_stream", torch.cuda.Stream)
     patch.setattr(torch.cuda, "stream", nullcontext)
+    patch.setattr(torch.Tensor, "pin_memory", _pinned)
     patch.setattr(torch.cuda, "device", nullcontext)
     patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
     patch.setattr(tile_kernel, "draw_tiles", _Launches(tile_kernel.draw_tiles))

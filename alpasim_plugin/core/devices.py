@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -22,6 +23,7 @@ WARM_UP = 3  # calls before a function is recorded
 
 def require_device(name: str) -> str:
     """Return a device's full name, ``cpu`` or ``cuda:N``; nothing falls back to another device.
+    In a process that torchrun started ``cuda`` is the card of its number.
 
     Raises:
         InputError: Neither ``cpu``, ``cuda`` nor ``cuda:N``.
@@ -33,7 +35,7 @@ def require_device(name: str) -> str:
         return name
     import torch
 
-    number = int(name.partition(":")[2] or 0)
+    number = int(name.partition(":")[2] or os.environ.get("LOCAL_RANK", 0))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if number >= count:
         raise InfrastructureError(
@@ -91,6 +93,19 @@ def autocast(place: device, dtype: dtype | None = None) -> AbstractContextManage
     return torch.autocast(kind, dtype or torch.bfloat16, enabled=dtype is not None)
 
 
+def join_ranks(place: device) -> tuple[int, int]:
+    """Join the processes that torchrun started, by NCCL on cards and by gloo on CPUs; return this
+    one's number and their count.
+    """
+    if "WORLD_SIZE" not in os.environ:
+        return 0, 1
+    from torch import distributed
+
+    if not distributed.is_initialized():
+        distributed.init_process_group(implementation(place, "gloo", "nccl"))
+    return distributed.get_rank(), distributed.get_world_size()
+
+
 def share_card(device: str, workers: int) -> None:
     """Leave every worker of a card an equal share of its memory."""
     if implementation(device, False, workers > 1):
@@ -101,12 +116,33 @@ def share_card(device: str, workers: int) -> None:
 
 def upload(array: npt.ArrayLike | Tensor, place: device | str) -> Tensor:
     """Return a copy of an array as a tensor of a device, or a tensor there, for which the host does
-    not wait.
+    not wait: a card reads it from pinned memory.
     """
     import torch
 
     tensor = array if isinstance(array, torch.Tensor) else torch.tensor(array)
+    if str(place).startswith("cuda") and tensor.device.type == "cpu":
+        tensor = tensor.pin_memory()
     return tensor.to(place, non_blocking=True)
+
+
+def side_stream(place: device) -> Callable[[], AbstractContextManager[None]]:
+    """Return what makes contexts in which tensors are sent to a card beside what it computes; what
+    it computes afterwards waits for them. Hold them until the host has waited for the card.
+    """
+    if implementation(place, True, False):
+        return nullcontext
+    import torch
+
+    stream = torch.cuda.Stream(place)
+
+    @contextmanager
+    def beside() -> Iterator[None]:
+        with torch.cuda.stream(stream):
+            yield
+        torch.cuda.current_stream(place).wait_stream(stream)
+
+    return beside
 
 
 def download(*parts: Tensor) -> list[Any]:

@@ -17,10 +17,10 @@ from types import MappingProxyType
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from alpasim_plugin.core.atomic import atomic_file, disk_error, write_safetensors, write_text
-from alpasim_plugin.core.devices import autocast, upload
+from alpasim_plugin.core.devices import autocast, join_ranks, side_stream, upload
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.reading import parse_json, parsing, read_text
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
@@ -136,6 +136,8 @@ class Carried(Protocol):
 class Trainer(Generic[Batch]):
     """Train one module in one run folder; the same folder resumes.
 
+    Processes of torchrun share the batches of an update, and end with the weights of one process.
+
     Args:
         module: Its parameters that require a gradient are trained.
         folder: Receives state.safetensors (weights, average, moments), log.jsonl.
@@ -151,7 +153,7 @@ class Trainer(Generic[Batch]):
 
     Raises:
         InputError: The folder holds another run, or one whose decay has begun under another
-            schedule; or a parameter of no part.
+            schedule; or a parameter of no part; or processes that cannot share an update.
     """
 
     def __init__(
@@ -182,6 +184,14 @@ class Trainer(Generic[Batch]):
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
+        self.rank, self.ranks = join_ranks(self.device)
+        if schedule.accumulate % self.ranks or (carried and self.ranks > 1):
+            raise InputError(
+                f"{folder}: {self.ranks} processes cannot share the batches of an update",
+                "train per-frame in one process; of others make --accumulate a multiple of them",
+            )
+        self._beside = side_stream(self.device)
+        self._ahead: dict[int, Batch] = {}  # the next batch, made while the device computes
         self._kept: dict[str, Tensor] = {}
         several = (
             {}
@@ -194,7 +204,8 @@ class Trainer(Generic[Batch]):
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
-        self._cut_log()
+        if self.rank == 0:
+            self._cut_log()
 
     def run(
         self,
@@ -208,9 +219,11 @@ class Trainer(Generic[Batch]):
                 good update, and the batch is saved.
         """
         last = min(until or self.schedule.steps, self.schedule.steps)
+        self._end = last * self.schedule.accumulate
         while self.step < last:
             numbers = self._update()
-            self._write_log(numbers)
+            if self.rank == 0:
+                self._write_log(numbers)
             if report is not None:
                 report(self.step, numbers)
             if self.step % self.schedule.save_every == 0 or self.step == last:
@@ -251,7 +264,13 @@ class Trainer(Generic[Batch]):
         return {**self.module.state_dict(), **self.average}
 
     def save(self) -> None:
-        """Write the checkpoint."""
+        """Write the checkpoint, in the first process; the others wait for it."""
+        if self.rank == 0:
+            self._write()
+        if self.ranks > 1:
+            distributed.barrier()
+
+    def _write(self) -> None:
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
         for (
@@ -275,18 +294,23 @@ class Trainer(Generic[Batch]):
         self.optimiser.zero_grad(set_to_none=True)
         sums: dict[str, Tensor | float] = {}
         n = self.schedule.accumulate
-        for part in range(n):
-            index = self.step * n + part
-            batch = self._batch(index)
+        held = []  # until the host has waited for the device
+        for index in range(self.step * n + self.rank, (self.step + 1) * n, self.ranks):
+            held.append(self._ahead.pop(index) if index in self._ahead else self._sent(index))
             with autocast(self.device, self._autocast):
-                loss, numbers = self._loss(moved(batch, self.device), index)
+                loss, numbers = self._loss(held[-1], index)
             (loss / n).backward()  # type: ignore[no-untyped-call]
+            following = index + self.ranks
+            if following < self._end:
+                self._ahead[following] = self._sent(following)
             for name, value in {"loss": loss.detach(), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
+        if self.ranks > 1:
+            sums = self._added_up(sums)
         norms = self._clip()
         found = floats({**sums, **norms})
         if not all(map(math.isfinite, found.values())):
-            self._stop(batch, f"update {self.step}: {found}")
+            self._stop(index, f"update {self.step}: {found}")
         lr = self.schedule.lr(self.step)
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group["rate"]
@@ -302,6 +326,20 @@ class Trainer(Generic[Batch]):
             "s": time.perf_counter() - began,
             CORE_S: time.process_time() - core_began,
         }
+
+    def _sent(self, index: int) -> Batch:
+        """Make a batch and send it to the device, beside what it computes."""
+        with self._beside():
+            sent: Batch = moved(self._batch(index), self.device)
+        return sent
+
+    def _added_up(self, sums: Mapping[str, Tensor | float]) -> dict[str, Tensor | float]:
+        """Add up gradients and values for the log over all processes."""
+        values = torch.stack([upload(value, self.device).float() for value in sums.values()])
+        for part in (values, *(p.grad for p in self.parameters.values())):
+            if part is not None:
+                distributed.all_reduce(part)
+        return dict(zip(sums, values.unbind(), strict=True))
 
     def _clip(self) -> dict[str, Tensor]:
         """Clip the gradients of every part that has any, and return their norms."""
@@ -323,10 +361,10 @@ class Trainer(Generic[Batch]):
                 if p.grad is not None:
                     self.average[name].lerp_(p, 1 - decay)
 
-    def _stop(self, batch: Batch, found: str) -> None:
+    def _stop(self, index: int, found: str) -> None:
         path = self.folder / BAD_FILE
         with atomic_file(path) as partial:
-            torch.save(batch, partial)
+            torch.save(self._batch(index), partial)
         self.save()
         raise InfrastructureError(
             f"{self.folder}: {found}",

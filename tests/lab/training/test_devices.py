@@ -1,5 +1,9 @@
-"""Training on a pretended device: the log and the weights of the CPU, one wait an update."""
+"""Training on a pretended device: the weights of the CPU, one wait an update; and in processes that
+share an update.
+"""
 
+import os
+import socket
 from dataclasses import replace
 from functools import partial
 
@@ -7,14 +11,17 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.core.devices import join_ranks, require_device
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training import vae
 from alpasim_plugin.lab.training.clips import CropSize
 from alpasim_plugin.lab.training.fixer_run import train_fixer
-from alpasim_plugin.lab.training.trainer import Trainer
+from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
 from tests.examples import first_of
 from tests.lab.training.test_generator import brightness, data, run_of  # noqa: F401 - data is a fixture
+from tests.lab.training.test_trainer import batch, trainer
 from tests.pretended_device import pretended_device, traffic
 
 
@@ -28,6 +35,7 @@ def waits(monkeypatch):
         traffic.reset()
         numbers = update(trainer)
         found.append(sum(traffic.waits.values()))
+        assert traffic.bytes_pinned == traffic.bytes_up
         return numbers
 
     monkeypatch.setattr(Trainer, "_update", counted)
@@ -57,3 +65,63 @@ def test_a_recipe_on_a_device_equals_the_processors(recipe, data, tmp_path, monk
     wanted = load_weights(trained(recipe, data, tmp_path / "host", "cpu", monkeypatch))
     for name, due in wanted.items():
         torch.testing.assert_close(found[name], due, rtol=0, atol=1e-3)
+
+
+def test_a_run_goes_on_on_another_device_and_makes_batches_ahead(tmp_path, monkeypatch):
+    schedule = Schedule(steps=6)
+    trainer(tmp_path / "host", schedule).run()
+    trainer(tmp_path / "both", schedule).run(until=2)
+    made, made_at = [], []
+    with pretended_device(monkeypatch):
+        there = trainer(tmp_path / "both", schedule, device="cuda")
+        monkeypatch.setattr(there, "_batch", lambda index: made.append(index) or batch(index))
+        there.run(lambda step, numbers: made_at.append(len(made)), until=5)
+    assert (made, made_at) == ([2, 3, 4], [2, 3, 3])
+    trainer(tmp_path / "both", schedule).run()
+    wanted, found = (load_weights(tmp_path / name / STATE_FILE) for name in ("host", "both"))
+    assert wanted.keys() == found.keys()
+    for name, due in wanted.items():
+        torch.testing.assert_close(found[name], due)
+
+
+def train_in_a_rank(rank, folder, port):
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}
+    os.environ["MASTER_PORT"] = str(port)
+    trainer(folder / "two", Schedule(steps=3, accumulate=4, save_every=1)).run()
+    with pytest.raises(InputError):
+        trainer(folder / "odd", Schedule(steps=3, accumulate=3))
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_two_processes_train_to_the_weights_and_the_log_of_one(tmp_path):
+    trainer(tmp_path / "one", Schedule(steps=3, accumulate=4, save_every=1)).run()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    torch.multiprocessing.spawn(train_in_a_rank, (tmp_path, port), nprocs=2)
+    one, two = (load_weights(tmp_path / name / STATE_FILE) for name in ("one", "two"))
+    for name, due in one.items():
+        torch.testing.assert_close(two[name], due)
+    logs = [(tmp_path / name / "log.jsonl").read_text().splitlines() for name in ("one", "two")]
+    assert len(logs[0]) == len(logs[1])
+
+
+def test_processes_on_cards_join_by_nccl_each_with_a_card_of_its_own(monkeypatch):
+    chosen = []
+    for name, value in {
+        "is_initialized": lambda: False,
+        "init_process_group": chosen.append,
+        "get_rank": lambda: 1,
+        "get_world_size": lambda: 2,
+    }.items():
+        monkeypatch.setattr(torch.distributed, name, value)
+    assert join_ranks(torch.device("cpu")) == (0, 1)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert require_device("cuda") == "cuda:1"
+    assert require_device("cuda:0") == "cuda:0"
+    assert join_ranks(torch.device("cuda:1")) == join_ranks(torch.device("cpu")) == (1, 2)
+    assert chosen == ["nccl", "gloo"]

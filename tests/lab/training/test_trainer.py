@@ -30,11 +30,12 @@ def batch(index):
 TRUTH = torch.arange(12.0).reshape(3, 4) / 12
 
 
-def trainer(folder, schedule, facts="a", bad_at=-1):
-    model = Linear()
+def trainer(folder, schedule, facts="a", bad_at=-1, device="cpu"):
+    model = Linear().to(device)
+    truth = TRUTH.to(device)
 
     def loss(x, index):
-        error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
+        error = ((x @ model.weight.T + model.bias - x @ truth.T) ** 2).mean()
         return (error * float("nan") if index == bad_at else error), {
             "error": float(error.detach())
         }
