@@ -224,8 +224,8 @@ class Trainer(Generic[Batch]):
             numbers = self._update()
             if self.rank == 0:
                 self._write_log(numbers)
-            if report is not None:
-                report(self.step, numbers)
+                if report is not None:
+                    report(self.step, numbers)
             if self.step % self.schedule.save_every == 0 or self.step == last:
                 self.save()
 
