@@ -96,15 +96,15 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
         PolicyError: The observation has no frame of the camera, or one of another size.
     """
     frame = observation.frames.get(camera.name)
-    expected = (camera.height, camera.width, 3)
-    if frame is None or frame.rgb.shape != expected:
+    expected = (camera.height, camera.width)
+    if frame is None or frame.size != expected:
         found = (
             f"frames of {sorted(observation.frames)}"
             if frame is None
-            else f"a frame of shape {frame.rgb.shape}"
+            else f"a frame of {frame.size}"
         )
         raise PolicyError(
-            f"policy {policy!r} at {observation.t_us} us: {found}; needed is {camera.name!r} of shape {expected}",
+            f"policy {policy!r} at {observation.t_us} us: {found}; needed is {camera.name!r} of {expected} (height, width)",
             "render the cameras that the policy names in `sensors`, at the scenario's size",
         )
     return frame

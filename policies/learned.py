@@ -11,17 +11,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from alpasim_plugin.core.devices import download, upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import direction_of
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import F64, Observation, Plan, Route, Scenario, SensorSpec
 from policies.base import MIN_CRUISE_MPS, camera_frame, plan_times, seconds
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
 from policies.learned_input import (
     COMMANDS,
-    level_view,
-    network_input,
     route_command,
     view_camera,
 )
@@ -71,7 +70,9 @@ class Learned(Policy):
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
         self.net = load_net(type(self).files[0] if weights is None else Path(weights))
         self.cameras = [view_camera(scenario, view) for view in self.net.views]
-        self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(c.name) for c in self.cameras)
+        self.sensors: Sequence[SensorSpec] = tuple(
+            SensorSpec(c.name, device=True) for c in self.cameras
+        )
         self.grid_m, self.weights = path_grid(), knot_weights()
         self.reset(0, scenario.route)
 
@@ -80,7 +81,8 @@ class Learned(Policy):
         self.seed, self.step, self.acted_us = seed, 0, 0
         self.noise: F64 | None = None  # errors of the samples, correlated over seconds
         self.desired_mps: float | None = None
-        self.histories: list[deque[tuple[int, U8]]] = [deque() for _ in self.cameras]
+        self.histories: list[deque[tuple[int, Any]]] = [deque() for _ in self.cameras]
+        self.cutters: list[Any] = []  # one a view, made for the device of the first image
 
     def act(self, observation: Observation) -> Plan:
         """Return a plan sampled from the network's prediction for the newest frames.
@@ -88,10 +90,13 @@ class Learned(Policy):
         Raises:
             PolicyError: The observation has no frame of a camera, or one of another size.
         """
-        for view, camera, history in zip(self.net.views, self.cameras, self.histories, strict=True):
-            frame = camera_frame(observation, camera, "learned")
+        frames = [camera_frame(observation, camera, "learned") for camera in self.cameras]
+        if not self.cutters:
+            self._begin_on(observation.image(self.cameras[0].name).device)
+        for frame, cutter, history in zip(frames, self.cutters, self.histories, strict=True):
             if not history or frame.t_us > history[-1][0]:
-                history.append((frame.t_us, level_view(frame.rgb, camera, view=view)))
+                image = upload(observation.image(frame.camera), self.device)
+                history.append((frame.t_us, cutter.cut(image)))
             while history[0][0] < frame.t_us - EARLIEST_US:
                 history.popleft()
         speed = max(observation.ego.speed_mps, 0.0)
@@ -122,6 +127,15 @@ class Learned(Policy):
             debug,
         )
 
+    def _begin_on(self, device: Any) -> None:
+        """Take images from a device, and run the network there."""
+        from policies.learned_views import view_on
+
+        self.device = device
+        self.net.to(device)
+        pairs = zip(self.cameras, self.net.views, strict=True)
+        self.cutters = [view_on(device, camera, view) for camera, view in pairs]
+
     def _predict(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
         """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the standard
         deviations ``(2,)``.
@@ -132,12 +146,12 @@ class Learned(Policy):
 
         images = []
         real = True  # every camera has an earlier frame
-        for history in self.histories:
+        for cutter, history in zip(self.cutters, self.histories, strict=True):
             t_us, now = history[-1]
             earlier_us, earlier = min(history, key=lambda seen: abs(t_us - EARLIER_US - seen[0]))
             if t_us - earlier_us <= EARLIER_US // 2:
                 earlier, real = now, False
-            images.append(torch.from_numpy(network_input(now, earlier))[None])
+            images.append(cutter.network_input(now, earlier))
         assert self.desired_mps is not None
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()
@@ -146,16 +160,16 @@ class Learned(Policy):
                 1
             )  # the order of summation in a convolution depends on the thread count
         try:
-            with torch.inference_mode():
-                prediction = self.net(
-                    images, torch.tensor([state]), torch.tensor([COMMANDS.index(command)])
-                )
+            with torch.no_grad():
+                numbers = upload(torch.tensor([state]), self.device)
+                word = upload(torch.tensor([COMMANDS.index(command)]), self.device)
+                prediction = self.net(images, numbers, word)
         finally:
             if threads != 1:
                 torch.set_num_threads(threads)
         heading, speed_change, sigma = (
-            part[0].double().numpy()
-            for part in (prediction.heading, prediction.speed, prediction.sigma)
+            part[0].astype(np.float64)
+            for part in download(prediction.heading, prediction.speed, prediction.sigma)
         )
         return heading, speed_change, sigma
 

@@ -25,7 +25,7 @@ SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther 
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
 MEAN, STD = 115.0, 64.0  # grey levels
 _RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
@@ -132,24 +132,33 @@ def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0, view: View = F
 
     Frames of higher angular resolution are area-averaged first.
     """
-    to_camera = view_homography(camera, yaw_rad, view)
-    shrink = int(camera.K[0, 0] / view.focal_px)
-    if shrink > 1:
-        size = (rgb.shape[1] // shrink, rgb.shape[0] // shrink)
-        scale = np.diag([size[0] / rgb.shape[1], size[1] / rgb.shape[0], 1.0])
-        centre = np.array(
-            [[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]
-        )  # pixel centres lie at halves
+    size, to_camera = sampled_at(camera, view, yaw_rad)
+    if size != (camera.width, camera.height):
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-        to_camera = np.linalg.inv(centre) @ scale @ centre @ to_camera
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = (view.width, view.height)
     return cv2.warpPerspective(rgb, to_camera, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def sampled_at(camera: CameraSpec, view: View, yaw_rad: float = 0.0) -> tuple[tuple[int, int], F64]:
+    """Return the width and height to which a camera's frames are reduced, and the homography from
+    pixels of the view to pixels of that size.
+    """
+    size = camera.width, camera.height
+    to_camera = view_homography(camera, yaw_rad, view)
+    shrink = int(camera.K[0, 0] / view.focal_px)
+    if shrink <= 1:
+        return size, to_camera
+    smaller = camera.width // shrink, camera.height // shrink
+    scale = np.diag([smaller[0] / camera.width, smaller[1] / camera.height, 1.0])
+    # Pixel centres lie at halves.
+    centre = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    return smaller, np.linalg.inv(centre) @ scale @ centre @ to_camera
 
 
 def network_input(now: U8, before: U8) -> F32:
     """Return the network's input ``(4, H, W)`` from a view now and before, ``(H, W, 3)``."""
     out = np.empty((CHANNELS, *now.shape[:2]), np.float32)
     out[:3] = now.transpose(2, 0, 1)
-    out[3] = before.astype(np.float32) @ _GREY
+    out[3] = before.astype(np.float32) @ GREY
     return (out - np.float32(MEAN)) / np.float32(STD)

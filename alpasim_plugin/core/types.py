@@ -152,6 +152,7 @@ class SensorSpec:
 
     camera: str
     interval_us: int = 0
+    device: bool = False  # its image as a tensor, see `Observation.image`
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +263,7 @@ class Frame:
         U8, ...
     ] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
     on_device: DevicePlanes | None = None  # of a frame that a device drew
+    fixed: tuple[U8, Any] | None = None  # an image that a fixer made, and the same as a tensor
 
     @property
     def pending(self) -> DevicePlanes | None:
@@ -272,6 +274,16 @@ class Frame:
     def device(self) -> Any:
         """The device that drew it, also if its image was changed on the host since."""
         return "cpu" if self.on_device is None else self.on_device.rgb.device
+
+    def image(self) -> Any:
+        """Return a copy of the image as a tensor of the device that made it."""
+        import torch
+
+        if self.pending is not None:
+            return self.pending.rgb.clone()
+        if self.fixed is not None and self.fixed[0] is self.rgb:  # nobody has changed it since
+            return self.fixed[1].clone()
+        return torch.tensor(self.rgb)
 
     def is_pending(self, plane: str) -> bool:
         """Return whether a plane is that of a device, downloaded or not."""
@@ -350,6 +362,17 @@ class Observation:
     ego: EgoState
     history: Trajectory  # rig poses in the world up to t_us
     route_rig: F64  # (20, 3) metres, rig frame now; rows of NaN where the route ends
+    images: Mapping[str, Any] = field(default_factory=dict)
+
+    def image(self, camera: str) -> Any:
+        """Return a camera's image as a tensor ``(H, W, 3)`` uint8 that the policy may change: of
+        the device that made it where the policy's `SensorSpec` says ``device``, else of the CPU.
+        """
+        if camera in self.images:
+            return self.images[camera]
+        import torch
+
+        return torch.tensor(self.frames[camera].rgb)
 
 
 @dataclass(frozen=True)

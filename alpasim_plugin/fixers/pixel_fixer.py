@@ -308,7 +308,8 @@ class PixelFixer(Fixer):
                 frame = frame.changed(references=(), events=(*events, event), facts=facts)
             else:
                 facts |= trust_facts(sums[b], height, width)
-                frame = frame.changed(references=(), events=events, facts=facts, rgb=images[b])
+                image = {"rgb": images[b], "fixed": (images[b], levels[b])}
+                frame = frame.changed(references=(), events=events, facts=facts, **image)
             fixed.append((frame, history))
         return fixed
 

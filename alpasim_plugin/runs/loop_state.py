@@ -38,6 +38,7 @@ from alpasim_plugin.core.types import (
     Plan,
     RenderRequest,
     Scenario,
+    SensorSpec,
     Trajectory,
     read_only,
 )
@@ -192,10 +193,13 @@ class LoopState:
         n = self._filled
         return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
 
-    def observe(self, cameras: Mapping[str, CameraSpec]) -> Observation:
+    def observe(
+        self, cameras: Mapping[str, CameraSpec], sensors: Sequence[SensorSpec] = ()
+    ) -> Observation:
         """Return the policy's observation at the present instant. Its arrays cannot be written,
-        since the world, the fixer's history and the log hold the same ones.
+        since the world, the fixer's history and the log hold the same ones; its tensors are copies.
         """
+        tensors = [one.camera for one in sensors if one.device and one.camera in self.frames]
         return Observation(
             self.ego.t_us,
             {name: read_only(frame) for name, frame in self.frames.items()},
@@ -203,6 +207,7 @@ class LoopState:
             read_only(self.ego),
             read_only(self.history),
             route_in_rig(self.scenario.route, self.ego.T_world_rig),
+            {name: self.frames[name].image() for name in tensors},
         )
 
     def to_world(self, plan: Plan) -> list[Trajectory]:

@@ -99,6 +99,7 @@ class Loop:
             controller,
             recorder,
         )
+        self._sensors = sensors
         self._world = actors or make_actors(scenario)
         self._plans = PlanQueue(scenario.latency)
         self.state = LoopState.at_start(scenario, clock.n_steps)
@@ -143,7 +144,7 @@ class Loop:
             if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
                 return
             if self._cadence.queries_at(tick.t_us):
-                observation = state.observe(self._rig.specs)
+                observation = state.observe(self._rig.specs, self._sensors)
                 recorder.policy_query(observation, clock)
                 began = time.perf_counter()
                 with recorder.stage("policy"):

@@ -188,6 +188,7 @@ def test_the_fixer_waits_once_a_frame_and_replays_its_graph(monkeypatch, holes):
             fixed = device.step([frame], [frame.rgb])[0]
             assert np.abs(fixed.rgb.astype(int) - due.rgb).max() <= 1
             assert fixed.facts.keys() == due.facts.keys()
+            assert np.array_equal(fixed.image().held, fixed.rgb)
             assert sum(traffic.waits.values()) == 1
             assert traffic.bytes_up == HEIGHT * WIDTH * (3 + 4 + 3 + 4) + 8 * (holes == "noise")
             assert traffic.bytes_down < HEIGHT * WIDTH * 3.1

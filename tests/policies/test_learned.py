@@ -5,6 +5,7 @@ image.
 import json
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,10 @@ import torch
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import inverse, se2, transform_points
+from alpasim_plugin.core.lens import resized
 from alpasim_plugin.core.types import EgoState, Observation
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from policies.conformance import STRAIGHT, canned_scenario, observations
 from policies.learned import Learned
@@ -29,7 +33,9 @@ from policies.learned_net import (
     load_net,
     save_net,
 )
+from policies.learned_views import view_on
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
+from scenarios.load import load_scenario
 from tests.policies.policy_world import CAMERA, observe, scenario_with
 
 ROAD = PaintedRoad()
@@ -270,7 +276,7 @@ def test_frames_of_one_camera_reach_no_other_view(tmp_path):
 
 def test_wrong_frame_is_refused():
     policy = Learned(scenario_with())
-    with pytest.raises(PolicyError, match=r"shape \(10, 10, 3\)"):
+    with pytest.raises(PolicyError, match=r"\(10, 10\)"):
         policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
 
 
@@ -281,3 +287,29 @@ def test_command_says_nothing_about_the_place_in_the_lane():
             for lateral_m in (-1.5, -0.3, 0.0, 1.5)
         }
         assert len(words) == 1
+
+
+def test_a_policy_of_a_device_fetches_no_image_and_drives_as_on_the_host(monkeypatch):
+    pretended = pytest.importorskip("tests.pretended_device")
+    scenario = load_scenario(
+        "smoke/curve", 0, ["timing.duration_us=500000", "timing.warmup_us=100000"]
+    )
+    egos, down = [], []
+    with pretended.pretended_device(monkeypatch, computes=False) as traffic:
+        for device in (True, False):
+            policy = Learned(scenario)
+            policy.sensors = [replace(one, device=device) for one in policy.sensors]
+            renderer = make_renderer("clean", scenario, 0, "cuda:0")
+            traffic.reset()
+            egos.append(run_rollout(scenario, renderer, policy).log(images=False).ego.xyz)
+            down.append(traffic.bytes_down)
+        image = seen()[3].frames[CAMERA.name].rgb
+        for shown in map(torch.tensor, (image, cv2.resize(image, (1280, 720)))):
+            camera = resized(CAMERA, *shown.shape[1::-1])
+            found = view_on(torch.device("cuda:0"), camera, FRONT).cut(shown.to("cuda:0")).cpu()
+            wanted = view_on(torch.device("cpu"), camera, FRONT).cut(shown)
+            levels = np.abs(found.permute(1, 2, 0).numpy() - wanted)
+            assert levels.max() <= 2
+            assert (levels > 1).mean() < 2e-3
+    np.testing.assert_allclose(*egos, atol=1e-3)
+    assert down[0] - down[1] == 19 * 4 * 5  # what the network says, at each query
