@@ -308,7 +308,7 @@ class PixelFixer(Fixer):
                 frame = frame.changed(references=(), events=(*events, event), facts=facts)
             else:
                 facts |= trust_facts(sums[b], height, width)
-                image = {"rgb": images[b], "fixed": (images[b], levels[b])}
+                image = {"rgb": images[b], "fixed": (images[b], fixed_frame.levels[b])}
                 frame = frame.changed(references=(), events=events, facts=facts, **image)
             fixed.append((frame, history))
         return fixed
