@@ -226,9 +226,9 @@ class UploadedClouds(TileCompositor):
         super().__init__(device)
         for cloud in clouds:
             cloud.require_drawable()
-        self.sizes = [len(cloud) for cloud in clouds]
+        self.sizes = np.array([len(cloud) for cloud in clouds], np.int64)
         self.antialias_px2 = [cloud.antialias_px2 for cloud in clouds]
-        self.first = [0, *np.cumsum(self.sizes).tolist()]
+        self.first = np.cumsum(self.sizes) - self.sizes
         self.sh_size = max((cloud.sh.shape[1] for cloud in clouds), default=1)
         opacity = _joined([cloud.opacities.astype(np.float64) for cloud in clouds], ())
         extent = np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0)))
@@ -333,14 +333,14 @@ class UploadedClouds(TileCompositor):
         """Return the table of blocks ``(B, SPAN)``: node among those of all views, first Gaussian,
         number of Gaussians, view.
         """
-        spans = []
         drawn = [(view, node.cloud) for view, (_, nodes) in enumerate(views) for node in nodes]
-        for node, (view, cloud) in enumerate(drawn):
-            begins = np.arange(0, self.sizes[cloud], BLOCK)
-            sizes = np.minimum(self.sizes[cloud] - begins, BLOCK)
-            columns = np.broadcast_arrays(node, self.first[cloud] + begins, sizes, view)
-            spans.append(np.column_stack(columns))
-        return _joined(spans, (self.kernels.SPAN,)).astype(np.int32)
+        view, cloud = np.array(drawn, np.int64).reshape(-1, 2).T
+        blocks = -(-self.sizes[cloud] // BLOCK)
+        node = np.repeat(np.arange(len(drawn)), blocks)
+        before = np.arange(len(node)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+        first = self.first[cloud[node]] + before * BLOCK
+        size = np.minimum(self.sizes[cloud[node]] - before * BLOCK, BLOCK)
+        return np.column_stack([node, first, size, view[node]]).astype(np.int32)
 
     def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
         return upload(np.asarray(array, dtype), self.device)
