@@ -93,10 +93,10 @@ class Learned(Policy):
         frames = [camera_frame(observation, camera, "learned") for camera in self.cameras]
         if not self.cutters:
             self._begin_on(observation.image(self.cameras[0].name).device)
-        for frame, cutter, history in zip(frames, self.cutters, self.histories, strict=True):
+        for frame, cut, history in zip(frames, self.cutters, self.histories, strict=True):
             if not history or frame.t_us > history[-1][0]:
                 image = upload(observation.image(frame.camera), self.device)
-                history.append((frame.t_us, cutter.cut(image)))
+                history.append((frame.t_us, cut(image)))
             while history[0][0] < frame.t_us - EARLIEST_US:
                 history.popleft()
         speed = max(observation.ego.speed_mps, 0.0)
@@ -129,12 +129,12 @@ class Learned(Policy):
 
     def _begin_on(self, device: Any) -> None:
         """Take images from a device, and run the network there."""
-        from policies.learned_views import view_on
+        from policies.learned_views import cutter
 
         self.device = device
         self.net.to(device)
         pairs = zip(self.cameras, self.net.views, strict=True)
-        self.cutters = [view_on(device, camera, view) for camera, view in pairs]
+        self.cutters = [cutter(camera, view, device) for camera, view in pairs]
 
     def _predict(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
         """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the standard
@@ -143,15 +143,16 @@ class Learned(Policy):
         import torch
 
         from policies.learned_net import SPEED_UNIT_MPS
+        from policies.learned_views import network_input
 
         images = []
         real = True  # every camera has an earlier frame
-        for cutter, history in zip(self.cutters, self.histories, strict=True):
+        for history in self.histories:
             t_us, now = history[-1]
             earlier_us, earlier = min(history, key=lambda seen: abs(t_us - EARLIER_US - seen[0]))
             if t_us - earlier_us <= EARLIER_US // 2:
                 earlier, real = now, False
-            images.append(cutter.network_input(now, earlier))
+            images.append(network_input(now, earlier))
         assert self.desired_mps is not None
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()

@@ -1,10 +1,9 @@
-"""How the learned policy's input is made of images as tensors: on the CPU by `learned_input`, on
-another device there, within two grey levels.
-"""
+"""What the learned policy's network receives, made of images as tensors where they are."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,35 +11,31 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.devices import implementation, upload
-from alpasim_plugin.core.types import F32, U8, CameraSpec
-from policies.learned_input import GREY, MEAN, STD, View, level_view, network_input, sampled_at
+from alpasim_plugin.core.types import F32, CameraSpec
+from policies.learned_input import GREY, MEAN, STD, View, level_view, sampled_at
 
 PARTS = 32  # of a pixel, between which OpenCV interpolates
 
 
-class HostView:
-    """A view that is cut from a camera's images on the CPU.
+Cut = Callable[[Tensor], Tensor]  # a view of an image (H, W, 3) uint8: whole levels (3, h, w)
 
-    Args:
-        camera: Whose images.
-        view: What is cut.
-        device: Where the images are.
+
+def cutter(camera: CameraSpec, view: View, device: torch.device) -> Cut:
+    """Return what cuts a level view from a camera's images on a device: on the CPU
+    `learned_input.level_view`, on which the network was trained, on a card the same within two grey
+    levels.
     """
+    on_card: Callable[..., Cut] = DeviceView
+    return implementation(device, partial(partial, _on_host), on_card)(camera, view, device)
 
-    def __init__(self, camera: CameraSpec, view: View, device: torch.device) -> None:
-        self.camera, self.view = camera, view
 
-    def cut(self, image: Tensor) -> U8:
-        """Return the view of an image ``(H, W, 3)`` uint8, to be given to `network_input`."""
-        return level_view(image.numpy(), self.camera, view=self.view)
-
-    def network_input(self, now: U8, before: U8) -> Tensor:
-        """Return the network's input ``(1, 4, h, w)`` from a view now and before."""
-        return torch.from_numpy(network_input(now, before))[None]
+def _on_host(camera: CameraSpec, view: View, _: torch.device, image: Tensor) -> Tensor:
+    shown = torch.from_numpy(level_view(image.numpy(), camera, view=view))
+    return shown.permute(2, 0, 1).float()
 
 
 class DeviceView:
-    """The same on another device; see `HostView`."""
+    """A level view that is cut from a camera's images on a card; see `cutter`."""
 
     def __init__(self, camera: CameraSpec, view: View, device: torch.device) -> None:
         (width, height), to_camera = sampled_at(camera, view)
@@ -53,19 +48,20 @@ class DeviceView:
         places = np.rint(PARTS * np.stack([u / w, v / w], axis=-1)) / PARTS
         shares = 2 * places[None] / (np.array([width, height]) - 1) - 1
         self.shares = upload(shares.astype(np.float32), device)
-        self.grey = upload(GREY, device)
 
-    def cut(self, image: Tensor) -> Tensor:
-        """Return whole levels ``(3, h, w)``."""
-        whole = image.permute(2, 0, 1).float()
-        reduced = (self.rows @ whole @ self.columns.T).round()[None]
-        shown = F.grid_sample(reduced, self.shares, padding_mode="border", align_corners=True)
+    def __call__(self, image: Tensor) -> Tensor:
+        """Cut the view."""
+        whole = self.rows @ image.permute(2, 0, 1).float() @ self.columns.T
+        shown = F.grid_sample(
+            whole.round()[None], self.shares, padding_mode="border", align_corners=True
+        )
         return shown[0].round()
 
-    def network_input(self, now: Tensor, before: Tensor) -> Tensor:
-        """See `HostView.network_input`."""
-        grey = torch.tensordot(self.grey, before, dims=1)
-        return (torch.cat([now, grey[None]])[None] - MEAN) / STD
+
+def network_input(now: Tensor, before: Tensor) -> Tensor:
+    """Return the network's input ``(1, 4, h, w)`` from a view now and before."""
+    grey = torch.tensordot(upload(GREY, now.device), before, dims=1)
+    return (torch.cat([now, grey[None]])[None] - MEAN) / STD
 
 
 def _means(size: int, smaller: int) -> F32:
@@ -74,8 +70,3 @@ def _means(size: int, smaller: int) -> F32:
     pixels = np.arange(size)
     shared = np.minimum(ends[1:], pixels + 1) - np.maximum(ends[:-1], pixels)
     return (np.maximum(shared, 0) * (smaller / size)).astype(np.float32)
-
-
-def view_on(device: torch.device, camera: CameraSpec, view: View) -> Any:
-    """Return what cuts a view from images on a device."""
-    return implementation(device, HostView, DeviceView)(camera, view, device)

@@ -308,8 +308,9 @@ class PixelFixer(Fixer):
                 frame = frame.changed(references=(), events=(*events, event), facts=facts)
             else:
                 facts |= trust_facts(sums[b], height, width)
-                image = {"rgb": images[b], "fixed": (images[b], fixed_frame.levels[b])}
-                frame = frame.changed(references=(), events=events, facts=facts, **image)
+                made = images[b], fixed_frame.levels[b]
+                kept = {"references": (), "events": events, "facts": facts}
+                frame = frame.changed(**kept, rgb=made[0], fixed=made)
             fixed.append((frame, history))
         return fixed
 

@@ -129,9 +129,7 @@ def reference_loss(s, values):
         values["sh"],
     )
     behind = np.asarray(values["background"], float).reshape(1, 1, 3)
-    colour, alpha, depth, _ = composite_reference(
-        project_gaussians(cloud, s.camera), s.camera, behind
-    )
+    colour, alpha, depth = composite_reference(project_gaussians(cloud, s.camera), s.camera, behind)
     image = np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2)
     return float((image * weights_of(s.camera)).sum())
 

@@ -142,7 +142,7 @@ def test_image_equals_the_reference_without_its_clamp():
     splats = Splats.from_cloud(cloud)
     out = rasterize_gradient(splats, cam, background=torch.tensor([0.3, 0.2, 0.1]))
     projected = project_gaussians(cloud_of(splats), cam)
-    colour, alpha, depth, _ = composite_reference(projected, cam, np.array([[[0.3, 0.2, 0.1]]]))
+    colour, alpha, depth = composite_reference(projected, cam, np.array([[[0.3, 0.2, 0.1]]]))
     assert colour.max() > 1.2
     for found, wanted, atol in (
         (out.rgb, colour, 1e-4),
@@ -162,7 +162,7 @@ def test_gradient_on_the_screen_is_that_of_the_projected_mean():
     projected = project_gaussians(cloud_of_scene(s), s.camera)
 
     def loss():
-        colour, alpha, depth, _ = composite_reference(
+        colour, alpha, depth = composite_reference(
             projected, s.camera, np.array(s.background).reshape(1, 1, 3)
         )
         return float(

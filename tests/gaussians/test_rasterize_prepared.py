@@ -70,7 +70,6 @@ def test_culling_never_changes_the_image():
         out = rasterize_prepared([(part, None) for part in parts], cam)
         whole = rasterize_reference(scene, cam)
         assert_same_image(out, whole, 5e-5, odd_share=1e-3)
-        assert out.stats["gaussians"] == 3000
 
 
 def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copies_from_another_process():
@@ -117,7 +116,6 @@ def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copie
     ):
         assert np.array_equal(found.rgb, again.rgb)
         assert np.array_equal(found.depth, again.depth)
-        assert found.stats == again.stats
 
 
 @pytest.mark.parametrize("fault", ["mirror", "scale", "nan", "shape"])
@@ -145,7 +143,6 @@ def test_any_number_of_threads_gives_the_same_bits(n):
             assert np.array_equal(one.rgb, other.rgb)
             assert np.array_equal(one.alpha, other.alpha)
             assert np.array_equal(one.depth, other.depth)
-            assert one.stats == other.stats
 
 
 def _render_in_child(queue):

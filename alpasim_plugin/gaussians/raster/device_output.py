@@ -55,7 +55,7 @@ class DeviceOutput(RasterOutput):
 
     def on_host(self) -> RasterOutput:
         """Return the view with arrays."""
-        return RasterOutput(**self.arrays, stats=self.stats)
+        return RasterOutput(**self.arrays)
 
     def blank(
         self, height: int, width: int, parts: Sequence[Any], again: Callable[[], Any]

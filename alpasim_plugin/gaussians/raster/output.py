@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,14 +27,11 @@ class RasterOutput:
         depth: ``(H, W)`` float32 metres along the optical axis, alpha-weighted mean over the splats
             of the pixel; 0 where alpha is 0, so read it together with `alpha`. At silhouettes
             it lies between the surfaces.
-        stats: Counts of the frame: ``gaussians``, ``visible`` and, for the tiled backend,
-            ``pairs``.
     """
 
     rgb: F32
     alpha: F32
     depth: F32
-    stats: Mapping[str, int] = field(default_factory=dict)
 
     def on_host(self) -> RasterOutput:
         """Return the view with arrays: itself, unless a device drew it."""

@@ -106,12 +106,7 @@ def rasterize_prepared(
     colour, alpha, depth_sum = composite(tiles, records, None, camera, threads)
     rgb = np.clip(colour + (1 - alpha[..., None]) * behind, 0, 1)
     depth = np.divide(depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 0)
-    stats = {
-        "gaussians": sum(prepared.n_input for prepared, _ in nodes),
-        "visible": count,
-        "pairs": len(tiles.lists),
-    }
-    return RasterOutput(rgb, alpha, depth, stats)
+    return RasterOutput(rgb, alpha, depth)
 
 
 def depth_order(depths: F32, ids: I64) -> I64:

@@ -222,9 +222,7 @@ def rasterize_torch(
         )
     behind = torch.as_tensor(background_image(background, camera))
     out = rasterize_gradient(Splats.from_cloud(cloud), camera, background=behind, near_m=near_m)
-    return RasterOutput(
-        out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy(), {"gaussians": len(cloud)}
-    )
+    return RasterOutput(out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy())
 
 
 def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:

@@ -149,19 +149,17 @@ def rasterize_reference(
     """
     splats = project_gaussians(cloud, camera, near_m)
     behind = background_image(background, camera).astype(np.float64)
-    colour, alpha, depth, blends = composite_reference(splats, camera, behind, brute)
-    stats = {"gaussians": len(cloud), "visible": len(splats), "blends": blends}
+    colour, alpha, depth = composite_reference(splats, camera, behind, brute)
     return RasterOutput(
         np.clip(colour, 0, 1).astype(np.float32),
         alpha.astype(np.float32),
         depth.astype(np.float32),
-        stats,
     )
 
 
 def composite_reference(
     splats: Projection, camera: PinholeCamera, behind: F64, brute: bool = False
-) -> tuple[F64, F64, F64, int]:
+) -> tuple[F64, F64, F64]:
     """Blend projected Gaussians, nearest first, in float64.
 
     Args:
@@ -172,7 +170,7 @@ def composite_reference(
 
     Returns:
         Colour ``(H, W, 3)`` with background, not clamped; alpha ``(H, W)``; depth ``(H, W)``,
-        metres, 0 where alpha is 0; how many splats were blended into a pixel, over all pixels.
+        metres, 0 where alpha is 0.
     """
     height, width = camera.height, camera.width
     rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
@@ -180,7 +178,6 @@ def composite_reference(
     depth_sum = np.zeros((height, width))
     transmittance = np.ones((height, width))
     finished = np.zeros((height, width), bool)
-    blends = 0
     first = np.clip(np.floor(splats.uv - splats.radii()) - 1, 0, [width, height]).astype(int)
     last = np.clip(np.ceil(splats.uv + splats.radii()) + 1, 0, [width, height]).astype(int)
 
@@ -204,7 +201,6 @@ def composite_reference(
         )  # this splat is left out, and so is everything behind it
         finished[box] |= stops
         drawn &= ~stops
-        blends += int(np.count_nonzero(drawn))
         weight = np.where(drawn, alpha * transmittance[box], 0.0)
         colour[box] += weight[:, :, None] * splats.rgb[i]
         depth_sum[box] += weight * splats.depth[i]
@@ -212,4 +208,4 @@ def composite_reference(
 
     alpha_total = 1 - transmittance
     depth = np.divide(depth_sum, alpha_total, out=np.zeros_like(depth_sum), where=alpha_total > 0)
-    return colour + transmittance[:, :, None] * behind, alpha_total, depth, blends
+    return colour + transmittance[:, :, None] * behind, alpha_total, depth

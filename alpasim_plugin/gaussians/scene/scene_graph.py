@@ -205,8 +205,7 @@ class SceneGraph:
                 sharp; None: the camera's own.
 
         Returns:
-            Of each view colour with sky, alpha, depth, and ``stats`` with ``visible`` (on the CPU), ``nodes``
-            (drawn) and ``nodes_total``. A GPU's is a `DeviceOutput`.
+            Of each view colour with sky, alpha and depth. A GPU's is a `DeviceOutput`.
 
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
@@ -217,17 +216,7 @@ class SceneGraph:
         ]
         one_by_one = partial(map, partial(self._draw_on_host, threads))
         draw = implementation(device, one_by_one, partial(self._draw_on_card, device))
-        return [
-            replace(
-                out,
-                stats={
-                    **out.stats,
-                    "nodes": len(nodes),
-                    "nodes_total": len(self.background) + len(poses),
-                },
-            )
-            for out, (_, nodes), (_, poses) in zip(draw(chosen), chosen, views, strict=True)
-        ]
+        return list(draw(chosen))
 
     def _draw_on_host(
         self, threads: int | None, view: tuple[PinholeCamera, Sequence[ChosenNode]]
