@@ -32,6 +32,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_triton import (
+    DrawnCloud,
     TileCompositor,
     UploadedClouds,
     compositor_of,
@@ -178,8 +179,8 @@ def raster_rate(device: str) -> Facts:
 
     def draws() -> Call:
         cloud, camera = transparent_splats(*LARGE)
-        clouds = UploadedClouds([cloud], device)
-        return lambda: clouds.draw([(0, None)], camera).arrays["alpha"]
+        clouds, behind = UploadedClouds([cloud], device), upload(np.zeros(3, np.float32), device)
+        return lambda: clouds.draw([(camera, [DrawnCloud(0)])], behind)[0].arrays
 
     return {"ok": True} | _rated(device, raster_work(*LARGE), draws)
 

@@ -387,10 +387,9 @@ def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     Raises:
         InputError: Settings that do not fit together.
     """
+    said = stage.deployed
     if isinstance(run.settings, OneFixerSettings):
         said = run.recipe.settings(stage, clip_latents(run, stage))
-    else:
-        said = run.recipe.own_settings(stage)
     try:
         return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:

@@ -305,10 +305,14 @@ class Trainer(Generic[Batch]):
                 self._ahead[following] = self._sent(following)
             for name, value in {"loss": loss.detach(), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
+        totals = stacked(sums, self.device)
         if self.ranks > 1:
-            sums = self._added_up(sums)
+            gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
+            for part in (totals, *gradients):
+                distributed.all_reduce(part)
         norms = self._clip()
-        found = floats({**sums, **norms})
+        values = torch.stack([*totals, *norms.values()]).cpu()  # the host waits here alone
+        found = dict(zip([*sums, *norms], values.tolist(), strict=True))
         if not all(map(math.isfinite, found.values())):
             self._stop(index, f"update {self.step}: {found}")
         lr = self.schedule.lr(self.step)
@@ -332,14 +336,6 @@ class Trainer(Generic[Batch]):
         with self._beside():
             sent: Batch = moved(self._batch(index), self.device)
         return sent
-
-    def _added_up(self, sums: Mapping[str, Tensor | float]) -> dict[str, Tensor | float]:
-        """Add up gradients and values for the log over all processes."""
-        values = torch.stack([upload(value, self.device).float() for value in sums.values()])
-        for part in (values, *(p.grad for p in self.parameters.values())):
-            if part is not None:
-                distributed.all_reduce(part)
-        return dict(zip(sums, values.unbind(), strict=True))
 
     def _clip(self) -> dict[str, Tensor]:
         """Clip the gradients of every part that has any, and return their norms."""
@@ -457,14 +453,9 @@ def moved(value: Any, device: torch.device) -> Any:
     return value
 
 
-def floats(numbers: Mapping[str, Tensor | float]) -> dict[str, float]:
-    """Return numbers of a device as floats; all are waited for at once."""
-    tensors = [value.float() for value in numbers.values() if isinstance(value, Tensor)]
-    downloaded = iter(torch.stack(tensors).cpu().tolist() if tensors else ())
-    return {
-        name: next(downloaded) if isinstance(value, Tensor) else value
-        for name, value in numbers.items()
-    }
+def stacked(numbers: Mapping[str, Tensor | float], device: torch.device) -> Tensor:
+    """Return numbers ``(N,)`` float32 on a device."""
+    return torch.stack([upload(value, device).float() for value in numbers.values()])
 
 
 def _parameters_of(part: str, parameters: Mapping[str, nn.Parameter]) -> dict[str, nn.Parameter]:

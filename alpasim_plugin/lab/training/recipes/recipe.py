@@ -163,7 +163,7 @@ class Stage:
         decay: How the learning rate falls after the warm-up.
         last_share: Share of the peak that it falls to.
         latents: Latents from a clip's start; None for the whole clip.
-        deployed: Settings of its weights that differ from the recipe's.
+        deployed: Settings of its weights besides those that attention and ``seen`` say.
         always_float32: Whether its forward passes are in float32 whatever the run's precision is.
     """
 
@@ -199,14 +199,12 @@ class Recipe:
         about: Short description for tables and cards.
         stages: In order; the last one's weights are the result.
         fixer: Fixer that gives sizes and settings.
-        deployed: Settings of the result besides those that attention and ``seen`` say.
     """
 
     name: str
     about: str
     stages: tuple[Stage, ...]
     fixer: str = "onefixer-dit-tiny"
-    deployed: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = list(GIVEN)
@@ -226,11 +224,5 @@ class Recipe:
             "steps": (1000.0,),
             **asdict(stage.attention(latents)),
             **stage.seen.settings(),
-            **self.own_settings(stage),
+            **stage.deployed,
         }
-
-    def own_settings(self, stage: Stage) -> dict[str, Any]:
-        """Return the settings that recipe and stage name: all that there are for a fixer without
-        blocks.
-        """
-        return {**self.deployed, **stage.deployed}
