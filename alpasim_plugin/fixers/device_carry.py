@@ -1,13 +1,14 @@
 """Carry recorded frames into a view on a GPU: what `fixers.ground` does, with tensors, and without
 waiting for them. Only the first rows of the ground may differ, where a window ends at another row.
 
-Points are tensors ``(3, H, W)`` float64.
+V views have P = H W pixels each, K recorded frames each. Points are tensors ``(V, 3, P)`` float64.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ class UploadedImage:
 
     Attributes:
         recorded: On the host.
-        rgb: ``(1, 3, H, W)`` float32 levels.
+        rgb: ``(3, H, W)`` float32 levels.
         depth: ``(H, W)`` metres.
         hidden: Depth with road users that hide all ground behind them.
     """
@@ -55,129 +56,204 @@ def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage
     """Send a recorded frame, as of `ground.with_users`, to a device."""
     parts = recorded.rgb, recorded.depth, hidden_by_users(recorded)
     rgb, depth, hidden = (upload(part, device) for part in parts)
-    return UploadedImage(recorded, rgb.permute(2, 0, 1)[None].float(), depth, hidden)
+    return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden)
 
 
-def carry_on_device(
-    images: Sequence[UploadedImage], target: WarpTarget, T_world_rig: F64
-) -> Tensor:
-    """Return the recorded frames in the view ``(K, H, W, 4)`` uint8; see `ground.carry`.
+class CarriedView(NamedTuple):
+    """A view into which recorded frames are carried."""
 
-    Args:
-        images: Nearest first.
-        target: The view, whose depth is a tensor.
-        T_world_rig: ``(4, 4)`` of a rig near the view.
+    images: Sequence[UploadedImage]  # nearest first
+    target: WarpTarget  # its depth is a tensor
+    T_world_rig: F64  # (4, 4) of a rig near by
+
+
+class Users(NamedTuple):
+    """The boxes of the road users of V views, at most B of each; a box that stands for none holds
+    no point.
     """
-    depth: Tensor = target.depth  # type: ignore[assignment]  # a tensor here
-    rays = _rays(depth)
-    on_ground = _ground_depth(rays, target, T_world_rig)
-    by_depth = torch.stack([_warp(one, one.depth, rays, target, depth, np.inf) for one in images])
-    by_ground = torch.stack(
-        [_warp(one, one.hidden, rays, target, on_ground, FREE_SHARE) for one in images]
+
+    ray: Tensor  # (V, B, 3, 3), this and the next two: see `warp.SeenBoxes`
+    eye: Tensor  # (V, B, 3, 1)
+    walls: Tensor  # (V, B, 2, 3, 1)
+    then: Tensor  # (V, B, 3 K, 4) from a box to the pixels of each recorded frame times depth
+
+
+def size_of(view: CarriedView) -> tuple[int, ...]:
+    """Return what views share that are carried together."""
+    return *view.target.depth.shape, len(view.images), ground.window_px(view.target.K)
+
+
+def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
+    """Return the recorded frames in views of one `size_of`, ``(V, K, H, W, 4)`` uint8; see
+    `ground.carry`.
+    """
+    depth = torch.stack([view.target.depth for view in views])  # type: ignore[arg-type]  # tensors here
+    height, width, count, size = size_of(views[0])
+    rays, flat = _rays(depth[0]), depth.flatten(1)
+    users = _users(views, depth.device)
+    on_ground = _ground_depth(views, rays, flat, users)
+    by_depth, by_ground = (
+        part.unflatten(2, (height, width))
+        for part in (
+            _warp(views, "depth", rays, flat, users, np.inf),
+            _warp(views, "hidden", rays, on_ground, None, FREE_SHARE),
+        )
     )
-    chosen = on_ground > 0
-    if len(images) > 1:
-        size = ground.window_px(target.K)
+    chosen = on_ground.view_as(depth) > 0
+    if count > 1:
         step = ground.step_px(size)
         across = size // step | 1
-        by_both = (part[:, ::step, ::step] for part in (by_ground, by_depth))
+        by_both = (part[:, :, ::step, ::step] for part in (by_ground, by_depth))
         apart = torch.sub(*(_disagreement(part, across) for part in by_both))
-        agrees = (apart <= ground.PREFERENCE * across**2).repeat_interleave(step, dim=0)
-        agrees = agrees.repeat_interleave(step, dim=1)[: len(depth), : depth.shape[1]]
+        agrees = (apart <= ground.PREFERENCE * across**2).repeat_interleave(step, dim=1)
+        agrees = agrees.repeat_interleave(step, dim=2)[:, :height, :width]
         chosen &= agrees | (depth <= 0)
-    return torch.where(chosen[..., None], by_ground, by_depth)
+    return torch.where(chosen[:, None, :, :, None], by_ground, by_depth)
 
 
 def _rays(depth: Tensor) -> Tensor:
-    """Return the centres of the pixels of an image, (u, v, 1)."""
+    """Return the centres of the pixels of an image ``(3, P)``, (u, v, 1)."""
     height, width = depth.shape
     rows = torch.arange(height, device=depth.device).double() + 0.5
     columns = torch.arange(width, device=depth.device).double() + 0.5
     v, u = torch.meshgrid(rows, columns, indexing="ij")
-    return torch.stack([u, v, torch.ones_like(u)])
+    return torch.stack([u, v, torch.ones_like(u)]).flatten(1)
 
 
-def _column(values: F64, like: Tensor) -> Tensor:
-    """Return numbers ``(M,)`` as an image of one pixel on a device."""
-    return upload(values, like.device)[:, None, None]
+def _projections(view: CarriedView) -> F64:
+    """Return the matrices from the world to the pixels of a view's recorded frames times depth,
+    ``(K, 3, 4)``.
+    """
+    recorded = [image.recorded for image in view.images]
+    return np.array([one.K @ inverse(one.T_world_camera)[:3] for one in recorded])
 
 
-def _turned(matrix: F64, points: Tensor) -> Tensor:
-    """Return a matrix ``(M, 3)`` times points."""
-    return torch.tensordot(upload(matrix, points.device), points, dims=1)
+def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
+    most = max(len(view.target.placed.names) for view in views)
+    shape = len(views), most
+    ray, eye = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    walls = np.ones((*shape, 2, 3))  # of equal ones nothing lies between
+    then = np.zeros((*shape, 3 * len(views[0].images), 4))
+    for v, view in enumerate(views):
+        names, seen = view.target.placed
+        count = len(names)
+        ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
+        for i, name in enumerate(names):
+            T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.images]
+            then[v, i] = (_projections(view) @ np.array(T_world_box)).reshape(-1, 4)
+    parts = ray, eye[..., None], walls[..., None], then
+    return Users(*(upload(part, device) for part in parts))
+
+
+def _turned(matrices: Tensor, points: Tensor) -> Tensor:
+    """Return matrices ``(V, M, 4)`` times points ``(V, 3, P)``."""
+    return torch.baddbmm(matrices[..., 3:], matrices[..., :3], points)
 
 
 def _warp(
-    image: UploadedImage,
-    seen: Tensor,
+    views: Sequence[CarriedView],
+    seen: str,
     rays: Tensor,
-    target: WarpTarget,
     depth: Tensor,
+    users: Users | None,
     free_share: float,
 ) -> Tensor:
-    """Return one recorded frame in the view ``(H, W, 4)``; see `warp.warp`.
+    """Return the recorded frames in the views ``(V, K, P, 4)``; see `warp.warp`.
 
     Args:
-        image: The recorded frame.
-        seen: Its depth.
-        rays: Of the view.
-        target: The view.
-        depth: By which the frame is carried; road users move with their boxes by the view's own.
+        views: Their images are carried.
+        seen: Which depth of a recorded frame counts.
+        rays: Of the views.
+        depth: ``(V, P)`` by which the frames are carried.
+        users: Move with their boxes; None: nobody does.
         free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
-    recorded, placed = image.recorded, target.placed
-    project = recorded.K @ inverse(recorded.T_world_camera)[:3]
-    T_then_camera = project @ target.T_world_camera
-    points = rays * torch.where(depth > 0, depth, INFINITY_M)
-    there = _turned(T_then_camera[:, :3] @ np.linalg.inv(target.K), points)
-    there += _column(T_then_camera[:, 3], points)
-    boxes = zip(placed.names, *placed.seen[:3], strict=True) if depth is target.depth else ()  # type: ignore[comparison-overlap]
-    for name, ray, eye, (low, high) in reversed(list(boxes)):  # of two boxes the first counts
-        local = _turned(ray, points) + _column(eye, points)
-        inside = (local >= _column(low, points)) & (local < _column(high, points))
-        T_then_box = project @ recorded.actors.get(name, ABSENT)
-        then = _turned(T_then_box[:, :3], local) + _column(T_then_box[:, 3], points)
-        there = torch.where(inside.all(dim=0) & (depth > 0), then, there)
-    u, v, w = there
+    device = depth.device
+    T_then_camera = [_projections(view) @ view.target.T_world_camera for view in views]
+    from_pixels = np.array(
+        [
+            T[..., :3] @ np.linalg.inv(view.target.K)
+            for T, view in zip(T_then_camera, views, strict=True)
+        ]
+    )
+    from_camera = np.concatenate([from_pixels, np.array(T_then_camera)[..., 3:]], axis=-1)
+    points = rays * torch.where(depth > 0, depth, INFINITY_M)[:, None]
+    there = _turned(upload(from_camera.reshape(len(views), -1, 4), device), points)
+    for i in reversed(range(0 if users is None else users.ray.shape[1])):  # of two the first counts
+        assert users is not None
+        local = users.ray[:, i] @ points + users.eye[:, i]
+        inside = (local >= users.walls[:, i, 0]) & (local < users.walls[:, i, 1])
+        inside = inside.all(dim=1, keepdim=True) & (depth > 0)[:, None]
+        there = torch.where(inside, _turned(users.then[:, i], local), there)
+    u, v, w = there.unflatten(1, (-1, 3)).flatten(0, 1).unbind(1)
     u, v = u / w, v / w
-    height, width = seen.shape
+    images = [image for view in views for image in view.images]
+    surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
+    sizes = upload(np.array([image.depth.shape for image in images], np.float64), device)
+    height, width = sizes[..., None].unbind(1)
     shown = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = torch.where(shown, u, 0.5), torch.where(shown, v, 0.5)
-    surface = seen[v.long(), u.long()].double()
+    place = v.long() * surfaces.shape[2] + u.long()
+    surface = surfaces.flatten(1).gather(1, place).double()
     surface = torch.where(surface > 0, surface, INFINITY_M)
     far = (surface > INFINITY_M / 2) & (w > INFINITY_M / 2)
     agrees = far | (surface >= free_share * w) | ((surface - w).abs() < SLACK * w + SLACK_M)
     held = torch.where(agrees, VALID, INCONSISTENT) * shown
-    grid = torch.stack([(2 * u - 1) / (width - 1) - 1, (2 * v - 1) / (height - 1) - 1], dim=-1)
-    rgb = F.grid_sample(
-        image.rgb, grid[None].float(), "bicubic", padding_mode="border", align_corners=True
+    rgb = _stacked([image.rgb for image in images])
+    rows, columns = rgb.shape[2:]
+    grid = torch.stack([(2 * u - 1) / (columns - 1) - 1, (2 * v - 1) / (rows - 1) - 1], dim=-1)
+    found = F.grid_sample(
+        rgb, grid[:, None].float(), "bicubic", padding_mode="border", align_corners=True
     )
-    levels = (rgb[0].permute(1, 2, 0) + 0.5).clamp(0, 255)
-    return torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
+    levels = (found[:, :, 0].mT + 0.5).clamp(0, 255)
+    out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
+    return out.unflatten(0, (len(views), -1))
 
 
-def _ground_depth(rays: Tensor, target: WarpTarget, T_world_rig: F64) -> Tensor:
-    """Return the depth of the ground where a pixel may show it; see `ground.ground_hypothesis`."""
-    depth = target.depth
-    up = T_world_rig[:3, 2]
-    down = up @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
-    height_m = float(up @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3]))
-    (slope,) = _turned(down[None], rays)
-    z = -height_m / slope
+def _stacked(images: Sequence[Tensor]) -> Tensor:
+    """Return images ``(C, h, w)`` as one tensor; smaller ones repeat their last rows and columns."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
+    return torch.stack(
+        [
+            image
+            if image.shape[1:] == (height, width)
+            else F.pad(
+                image[None],
+                (0, width - image.shape[2], 0, height - image.shape[1]),
+                mode="replicate",
+            )[0]
+            for image in images
+        ]
+    )
+
+
+def _ground_depth(
+    views: Sequence[CarriedView], rays: Tensor, depth: Tensor, users: Users
+) -> Tensor:
+    """Return the depth of the ground ``(V, P)`` where a pixel may show it; see
+    `ground.ground_hypothesis`.
+    """
+    planes = []  # of each view: how steeply a ray falls, and the height above the ground
+    for _, target, T_world_rig in views:
+        up, T = T_world_rig[:3, 2], target.T_world_camera
+        height_m = up @ (T[:3, 3] - T_world_rig[:3, 3])
+        planes.append([*(up @ T[:3, :3] @ np.linalg.inv(target.K)), height_m])
+    numbers = upload(np.array(planes), rays.device)
+    slope = numbers[:, :3] @ rays
+    z = -numbers[:, 3:] / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
     free &= (depth <= 0) | (depth >= FREE_SHARE * z)
-    for ray, eye, walls, _ in zip(*target.placed.seen, strict=True):
-        along = _turned(ray, rays)
-        reaches = [_column(wall - eye, rays) / along for wall in walls]
-        near = torch.minimum(*reaches).amax(dim=0).clamp(min=0)
-        free &= near >= torch.maximum(*reaches).amin(dim=0)
+    for i in range(users.ray.shape[1]):
+        reaches = (users.walls[:, i] - users.eye[:, None, i]) / (users.ray[:, i] @ rays)[:, None]
+        near = reaches.amin(dim=1).amax(dim=1).clamp(min=0)
+        free &= near >= reaches.amax(dim=1).amin(dim=1)
     return torch.where(free, z, 0.0).float()
 
 
 def _disagreement(images: Tensor, size: int) -> Tensor:
     """Return by how many levels the first two images differ around each pixel; see `ground`."""
-    a, b = images[:2].float()
+    a, b = images[:, :2].float().unbind(1)
     apart = ((a - b).abs()[..., :3].sum(dim=-1) / 3).round()
     apart = torch.where(torch.minimum(a, b)[..., 3] == 0, ground.UNSEEN, apart)
-    around = F.pad(apart[None, None], (size // 2,) * 4, mode="reflect")
-    return F.avg_pool2d(around, size, 1, divisor_override=1)[0, 0]
+    around = F.pad(apart[:, None], (size // 2,) * 4, mode="reflect")
+    return F.avg_pool2d(around, size, 1, divisor_override=1)[:, 0]

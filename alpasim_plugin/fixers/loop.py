@@ -99,10 +99,7 @@ class BlockRunner:
         frames = self.render_base(requests)
         if self.references is not None:
             with self._timed("references"):
-                frames = [
-                    self.references.added(request, frame, self.on_device)
-                    for request, frame in zip(requests, frames, strict=True)
-                ]
+                frames = self.references.added(requests, frames, self.on_device)
         images: Sequence[Any] = [None] * len(frames)
         if self.scene_map is not None:
             device = frames[0].device if self.on_device else "cpu"

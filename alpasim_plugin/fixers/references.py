@@ -14,13 +14,14 @@ own future is looked at.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from alpasim_plugin.core.devices import batched
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.shutter import bands
+from alpasim_plugin.core.shutter import Band, bands, joined
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -37,6 +38,9 @@ from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
+
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.device_carry import UploadedImage
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
 SECOND_M, TURN_M = (
@@ -104,6 +108,14 @@ class ReferenceIndex:
         return tuple(int(i) for i in order if usable[i])
 
 
+class Window(NamedTuple):
+    """Rows of a view, and of what is carried into them its own part."""
+
+    band: Band
+    target: WarpTarget
+    own: tuple[slice, slice]
+
+
 class ReferenceSession:
     """The references of one rollout's frames.
 
@@ -152,22 +164,15 @@ class ReferenceSession:
             return ()
         chosen, T_world_rig = self._choose(request)
         images = [self._recorded_image(i) for i in chosen]
-        out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in images)
-        self._put(
-            out,
-            request,
-            frame.depth,
-            lambda target: carry(images, target, T_world_rig, self.threads),
-        )
-        return out
+        windows = self._windows(request, frame.depth)
+        parts = [carry(images, window.target, T_world_rig, self.threads) for window in windows]
+        return _whole(request, windows, parts)
 
-    def _put(
-        self, out: Any, request: RenderRequest, depth: Any, carried: Callable[[WarpTarget], Any]
-    ) -> None:
-        """Write recorded frames, carried into each band of a view ``(H, W)``, into ``out``."""
-        around = window_px(
-            request.camera.K
-        )  # what `carry` decides of a pixel depends on those around it
+    def _windows(self, request: RenderRequest, depth: Any) -> list[Window]:
+        """Return the windows of a view ``(H, W)`` into which recorded frames are carried."""
+        # What `carry` decides of a pixel depends on those around it.
+        around = window_px(request.camera.K)
+        windows = []
         for band in bands(request):
             top = max(band.rows.start - around, 0)
             K = request.camera.K.copy()
@@ -175,46 +180,82 @@ class ReferenceSession:
             near = depth[top : band.rows.stop + around]
             target = WarpTarget(K, band.T_world_camera, near, band.actors, self._boxes)
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            for whole, part in zip(out, carried(target), strict=True):
-                band.put(whole, part[own])
+            windows.append(Window(band, target, own))
+        return windows
 
-    def added(self, request: RenderRequest, frame: Frame, on_device: bool) -> Frame:
-        """Return a rendered frame with its references.
+    def added(
+        self, requests: Sequence[RenderRequest], frames: Sequence[Frame], on_device: bool
+    ) -> list[Frame]:
+        """Return the rendered frames of an instant with their references.
 
         Args:
-            request: What was rendered.
-            frame: The render.
-            on_device: Whether those of a frame that a device drew may stay there.
+            requests: What was rendered.
+            frames: The renders.
+            on_device: Whether those of frames that a device drew may stay there.
         """
-        if on_device and frame.pending is not None:
-            return frame.changed(on_device=self._on_device(request, frame.pending))
-        return frame.changed(references=self.of(request, frame))
+        out = list(frames)
+        drawn: dict[int, DevicePlanes] = {}
+        for index, (request, frame) in enumerate(zip(requests, frames, strict=True)):
+            if on_device and frame.pending is not None:
+                drawn[index] = frame.pending
+            else:
+                out[index] = frame.changed(references=self.of(request, frame))
+        asked = [requests[index] for index in drawn]
+        for index, planes in zip(drawn, self._on_device(asked, [*drawn.values()]), strict=True):
+            out[index] = frames[index].changed(on_device=planes)
+        return out
 
-    def _on_device(self, request: RenderRequest, planes: DevicePlanes) -> DevicePlanes:
-        """Return the planes of a rendered frame with its references, both on their device."""
-        from alpasim_plugin.fixers import device_carry
+    def _on_device(
+        self, requests: Sequence[RenderRequest], drawn: Sequence[DevicePlanes]
+    ) -> list[DevicePlanes]:
+        """Return the planes of rendered frames with their references, all on their device."""
+        from alpasim_plugin.fixers.device_carry import upload_image
 
-        chosen, T_world_rig = self._choose(request)
-        if not chosen:
-            return planes
-        device = planes.rgb.device
-        for i in chosen:
-            recorded = self._recorded_image(i)
-            if i not in self._uploaded:
-                self._uploaded[i] = device_carry.upload_image(recorded, device)
-        images = [self._uploaded[i] for i in chosen]
+        views = []
+        for request, planes in zip(requests, drawn, strict=True):
+            chosen, T_world_rig = self._choose(request)
+            for i in chosen:
+                recorded = self._recorded_image(i)
+                if i not in self._uploaded:
+                    self._uploaded[i] = upload_image(recorded, planes.rgb.device)
+            views.append((request, [self._uploaded[i] for i in chosen], T_world_rig))
+        carried = self._carried(views, drawn)
 
-        def carried(drawn: DevicePlanes) -> Mapping[str, Any]:
-            out = drawn.rgb.new_zeros((len(images), *drawn.size, 4))
-            self._put(
-                out,
-                request,
-                drawn.depth,
-                lambda target: device_carry.carry_on_device(images, target, T_world_rig),
-            )
-            return {"references": out}
+        def changed(index: int) -> DevicePlanes:
+            def references(planes: DevicePlanes) -> Mapping[str, Any]:
+                if planes is drawn[index]:
+                    return {"references": carried[index]}
+                return {"references": self._carried([views[index]], [planes])[0]}
 
-        return planes.changed(carried)
+            return drawn[index].changed(references)
+
+        return [changed(index) for index in range(len(drawn))]
+
+    def _carried(
+        self,
+        views: Sequence[tuple[RenderRequest, Sequence[UploadedImage], F64]],
+        drawn: Sequence[DevicePlanes],
+    ) -> list[Any]:
+        """Return the recorded frames in each view ``(K, H, W, 4)``, None where there are none."""
+        import torch
+
+        from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, size_of
+
+        cuts = [
+            self._windows(request, planes.depth) if images else []
+            for (request, images, _), planes in zip(views, drawn, strict=True)
+        ]
+        placed = [
+            CarriedView(images, window.target, T_world_rig)
+            for (_, images, T_world_rig), windows in zip(views, cuts, strict=True)
+            for window in windows
+        ]
+        parts = iter(batched(placed, size_of, carry_on_device))
+        out = []
+        for (request, *_), windows in zip(views, cuts, strict=True):
+            images = _whole(request, windows, [next(parts) for _ in windows])
+            out.append(torch.stack(images) if images else None)
+        return out
 
     def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""
@@ -239,6 +280,17 @@ class ReferenceSession:
                 self._uploaded.pop(dropped, None)
         self._recorded.move_to_end(i)
         return self._recorded[i]
+
+
+def _whole(
+    request: RenderRequest, windows: Sequence[Window], parts: Sequence[Sequence[Any]]
+) -> tuple[Any, ...]:
+    """Return each recorded frame in a view, of those in its windows."""
+    own = [
+        [image[window.own] for image in part] for window, part in zip(windows, parts, strict=True)
+    ]
+    exposed = [window.band for window in windows]
+    return tuple(joined(request, exposed, images) for images in zip(*own, strict=True))
 
 
 def session_of(

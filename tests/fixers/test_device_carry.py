@@ -9,7 +9,7 @@ import torch
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.fixers import ground
-from alpasim_plugin.fixers.device_carry import carry_on_device, upload_image
+from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, upload_image
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
 from tests.fixers.test_ground import K, recorded, rig, street
@@ -37,10 +37,11 @@ def test_images_equal_those_of_the_processor(count, wall_m, window_rad, monkeypa
     ]
     images[-1] = replace(images[-1], actors={})
     wanted = carry(images, view, rig(10.0))
+    uploaded = [upload_image(one, torch.device("cpu")) for one in images]
     on_device = replace(view, depth=torch.from_numpy(depth))
-    found = carry_on_device(
-        [upload_image(one, torch.device("cpu")) for one in images], on_device, rig(10.0)
-    )
+    alone = replace(on_device, actors={"car": view.actors["car"]})
+    both = [CarriedView(uploaded, target, rig(10.0)) for target in (alone, on_device)]
+    found = carry_on_device(both)[1]
     assert found.dtype == torch.uint8
     for one, other in zip(found.numpy(), wanted, strict=True):
         apart = np.abs(one.astype(int) - other)

@@ -128,17 +128,18 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         drawn = zip(requests, graph.render_all(views, device=device), strict=True)
         return [out.surface().frame(asked.t_us, asked.camera.name) for asked, out in drawn]
 
-    def fixed(device):
-        references = ReferenceSession(recorded, (), path, 2)
-        fixer = make_fixer("onefixer", scene_id="scene", device=device)
-        runner = BlockRunner(
+    def made(device):
+        return BlockRunner(
             partial(rendered, device=device),
             prepare_map(marked((line((2, 1, 0), (30, 1, 0)), "solid_white"))),
             (),
-            references=references,
-            on_device=fixer.reads_device,
+            references=ReferenceSession(recorded, (), path, 2),
+            on_device=True,
             cover=LensCover([view]),
         )
+
+    def fixed(device):
+        fixer, runner = make_fixer("onefixer", scene_id="scene", device=device), made(device)
         for t_us in (0, request.t_us):
             traffic.reset()
             if device != "cpu":
@@ -166,6 +167,13 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         assert len(served.render(request, True).pending.references) == 2
         assert not traffic.waits
         assert np.abs(found.alpha - wanted.alpha).max() <= LSB
+        launches, traffic.computes = [], False
+        for count in (1, 6):
+            cameras = [replace(view, name=f"camera {i}") for i in range(count)]
+            traffic.reset()
+            made("cuda:0").render([replace(request, camera=one) for one in cameras])
+            launches.append(traffic.launches)
+        assert launches[1] < 1.2 * launches[0]
 
 
 def test_bytes_of_a_splat():

@@ -122,10 +122,10 @@ class SceneEntry:
         drew may stay there.
         """
         assert self.renderer is not None, "scenes without a renderer are for maps only"
-        frame = checked_frames(self.renderer, [request], on_device)[0]
-        if self.references is None:
-            return frame
-        return self.references.added(request, frame, on_device)
+        frames = checked_frames(self.renderer, [request], on_device)
+        if self.references is not None:
+            frames = self.references.added([request], frames, on_device)
+        return frames[0]
 
 
 class SceneCache:
