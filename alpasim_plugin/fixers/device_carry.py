@@ -128,6 +128,13 @@ def _projections(view: CarriedView) -> F64:
     return np.array([one.K @ inverse(one.T_world_camera)[:3] for one in recorded])
 
 
+def _lifted(view: CarriedView) -> F64:
+    """Return the matrix ``(4, 4)`` from a view's pixels times depth to the world."""
+    T = view.target.T_world_camera.copy()
+    T[:3, :3] = T[:3, :3] @ np.linalg.inv(view.target.K)
+    return T
+
+
 def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
     most = max(len(view.target.placed.names) for view in views)
     shape = len(views), most
@@ -168,17 +175,9 @@ def _warp(
         users: Move with their boxes; None: nobody does.
         free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
-    device = depth.device
-    T_then_camera = [_projections(view) @ view.target.T_world_camera for view in views]
-    from_pixels = np.array(
-        [
-            T[..., :3] @ np.linalg.inv(view.target.K)
-            for T, view in zip(T_then_camera, views, strict=True)
-        ]
-    )
-    from_camera = np.concatenate([from_pixels, np.array(T_then_camera)[..., 3:]], axis=-1)
+    from_view = np.array([(_projections(view) @ _lifted(view)).reshape(-1, 4) for view in views])
     points = rays * torch.where(depth > 0, depth, INFINITY_M)[:, None]
-    there = _turned(upload(from_camera.reshape(len(views), -1, 4), device), points)
+    there = _turned(upload(from_view, depth.device), points)
     for i in reversed(range(0 if users is None else users.ray.shape[1])):  # of two the first counts
         assert users is not None
         local = users.ray[:, i] @ points + users.eye[:, i]
@@ -189,7 +188,7 @@ def _warp(
     u, v = u / w, v / w
     images = [image for view in views for image in view.images]
     surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
-    sizes = upload(np.array([image.depth.shape for image in images], np.float64), device)
+    sizes = upload(np.array([image.depth.shape for image in images]), depth.device)
     height, width = sizes[..., None].unbind(1)
     shown = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = torch.where(shown, u, 0.5), torch.where(shown, v, 0.5)
@@ -213,18 +212,13 @@ def _warp(
 def _stacked(images: Sequence[Tensor]) -> Tensor:
     """Return images ``(C, h, w)`` as one tensor; smaller ones repeat their last rows and columns."""
     height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
-    return torch.stack(
-        [
-            image
-            if image.shape[1:] == (height, width)
-            else F.pad(
-                image[None],
-                (0, width - image.shape[2], 0, height - image.shape[1]),
-                mode="replicate",
-            )[0]
-            for image in images
-        ]
-    )
+    padded = []
+    for image in images:
+        below, right = height - image.shape[1], width - image.shape[2]
+        if below or right:
+            image = F.pad(image[None], (0, right, 0, below), mode="replicate")[0]
+        padded.append(image)
+    return torch.stack(padded)
 
 
 def _ground_depth(
@@ -233,11 +227,8 @@ def _ground_depth(
     """Return the depth of the ground ``(V, P)`` where a pixel may show it; see
     `ground.ground_hypothesis`.
     """
-    planes = []  # of each view: how steeply a ray falls, and the height above the ground
-    for _, target, T_world_rig in views:
-        up, T = T_world_rig[:3, 2], target.T_world_camera
-        height_m = up @ (T[:3, 3] - T_world_rig[:3, 3])
-        planes.append([*(up @ T[:3, :3] @ np.linalg.inv(target.K)), height_m])
+    # Of each view how steeply a ray falls, and the height above the ground.
+    planes = [(inverse(view.T_world_rig) @ _lifted(view))[2] for view in views]
     numbers = upload(np.array(planes), rays.device)
     slope = numbers[:, :3] @ rays
     z = -numbers[:, 3:] / slope
