@@ -102,7 +102,8 @@ def join_ranks(place: device) -> tuple[int, int]:
     from torch import distributed
 
     if not distributed.is_initialized():
-        distributed.init_process_group(implementation(place, "gloo", "nccl"))
+        on_cards = {"backend": "nccl", "device_id": place}
+        distributed.init_process_group(**implementation(place, {"backend": "gloo"}, on_cards))
     return distributed.get_rank(), distributed.get_world_size()
 
 

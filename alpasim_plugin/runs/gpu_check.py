@@ -153,11 +153,9 @@ def gradient(device: str) -> Facts:
 
     def differentiates(width: int, height: int, name: str) -> Call:
         K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
-        view = cloud, PinholeCamera(width, height, K, np.eye(4))
-        units = [1e-3 * np.abs(part).max() for part in _gradients(*view, None)]
-        compositor = compositor_of(name)
+        view = cloud, PinholeCamera(width, height, K, np.eye(4)), compositor_of(name)
         return lambda: np.concatenate(
-            [part / unit for part, unit in zip(_gradients(*view, compositor), units, strict=True)]
+            [1e3 * part / np.abs(part).max() for part in _gradients(*view)]
         )
 
     return compared(device, differentiates)
