@@ -249,14 +249,22 @@ def joined_image(
     shape = sides[0].height, sides[0].width
     out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
     shown = np.zeros(shape, np.float32)
+    end = 0  # of the columns that a pinhole before has filled
     for lens, image in zip(sides, images, strict=True):
         assert lens.weight is not None, "one of several pinholes"
-        before, filled = (np.ascontiguousarray(part[lens.part]) for part in (out, shown))
         part = lens.shown(image)
         weight = lens.weight * (part[..., 3] + NOT_HELD) if holds else lens.weight
-        out[lens.part] = cv2.blendLinear(before, part, filled, weight)
+        first = lens.first_column
+        columns = slice(first, max(first, min(end, first + part.shape[1])))
+        both = max(0, columns.stop - first)
+        given = out[:, columns], part[:, :both], shown[:, columns], weight[:, :both]
+        if both:
+            out[:, columns] = cv2.blendLinear(*map(np.ascontiguousarray, given))
+        out[:, first + both : first + part.shape[1]] = part[:, both:]
         shown[lens.part] += weight
-    out[shown == 0] = outside
+        end = max(end, first + part.shape[1])
+    if cv2.countNonZero(shown) < shown.size:
+        out[shown == 0] = outside
     return out
 
 

@@ -29,9 +29,9 @@ from alpasim_plugin.fixers.warp import (
     VALID,
     RecordedImage,
     WarpTarget,
-    hidden_by_users,
 )
 
+HIDING_M = 1e-3
 ABSENT = np.full((4, 4), np.nan)
 
 
@@ -43,7 +43,7 @@ class UploadedImage:
         recorded: On the host.
         rgb: ``(3, H, W)`` float32 levels.
         depth: ``(H, W)`` metres.
-        hidden: Depth with road users that hide all ground behind them.
+        hidden: Depth, `HIDING_M` where a road user stands: it hides all ground behind it.
     """
 
     recorded: RecordedImage
@@ -54,8 +54,10 @@ class UploadedImage:
 
 def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage:
     """Send a recorded frame, as of `ground.with_users`, to a device."""
-    parts = recorded.rgb, recorded.depth, hidden_by_users(recorded)
-    rgb, depth, hidden = (upload(part, device) for part in parts)
+    rgb, depth = (upload(part, device) for part in (recorded.rgb, recorded.depth))
+    hidden = depth
+    if recorded.users is not None:
+        hidden = torch.where(upload(recorded.users, device), HIDING_M, depth)
     return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden)
 
 

@@ -9,6 +9,8 @@ Equal to `network.pixel_generator.TORCH` to rounding, on float32 tensors without
 
 from __future__ import annotations
 
+from itertools import product
+
 import cv2
 import numpy as np
 import torch
@@ -27,7 +29,7 @@ from alpasim_plugin.fixers.network.reference_blend import (
     Operations,
     ReferenceCells,
 )
-from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
+from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 BAND = 8  # rows of a smaller image that are enlarged at a time
@@ -131,24 +133,23 @@ def enlarge(
     sources = None
     if references is not None and heads is not None:
         sources = _sources(references, heads)
-    starts = range(0, height, BAND * scale)
-    todo = iter([(b, first) for b in range(len(rgb)) for first in starts])
 
-    def work() -> None:
-        for b, first in todo:
-            band = slice(first, min(first + BAND * scale, height))
-            above = max(first // scale - 1, 0)
-            around = changes[b, above : first // scale + BAND + 1]
-            added = cv2.resize(around, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-            added = added[first - above * scale :][: band.stop - first, :width]
-            image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
-            if sources is not None:
-                mixed, recorded = np.empty_like(image), np.empty_like(image[..., :1])
-                _blend(image, *(part[b] for part in sources), scale, first, mixed, recorded)
-                image = mixed
-            levels[b, band] = cv2.addWeighted(image, HALF, image, 0, HALF, dtype=cv2.CV_8U)
+    def enlarge_band(at: tuple[int, int]) -> None:
+        b, first = at
+        band = slice(first, min(first + BAND * scale, height))
+        above = max(first // scale - 1, 0)
+        around = changes[b, above : first // scale + BAND + 1]
+        added = cv2.resize(around, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+        added = added[first - above * scale :][: band.stop - first, :width]
+        image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
+        if sources is not None:
+            mixed, recorded = np.empty_like(image), np.empty_like(image[..., :1])
+            _blend(image, *(part[b] for part in sources), scale, first, mixed, recorded)
+            image = mixed
+        levels[b, band] = cv2.addWeighted(image, HALF, image, 0, HALF, dtype=cv2.CV_8U)
 
-    run_on_threads(torch.get_num_threads(), work)
+    bands = list(product(range(len(rgb)), range(0, height, BAND * scale)))
+    map_on_threads(torch.get_num_threads(), enlarge_band, bands)
     return out
 
 
@@ -307,10 +308,13 @@ def smaller(x: Tensor, scale: int) -> Tensor:
         *x.shape[:-3], -(-height // scale), -(-width // scale), channels, dtype=x.dtype
     )
     border = 0, -height % scale, 0, -width % scale
-    resized = out.numpy().reshape(-1, *out.shape[-3:])
-    for image, made in zip(_array(x).reshape(-1, height, width, channels), resized, strict=True):
-        whole = cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE)
-        cv2.resize(whole, made.shape[1::-1], dst=made, interpolation=cv2.INTER_AREA)
+    images, resized = (a.reshape(-1, *a.shape[-3:]) for a in (_array(x), out.numpy()))
+
+    def average(i: int) -> None:
+        whole = cv2.copyMakeBorder(images[i], *border, cv2.BORDER_REPLICATE)
+        cv2.resize(whole, resized.shape[2:0:-1], dst=resized[i], interpolation=cv2.INTER_AREA)
+
+    map_on_threads(torch.get_num_threads(), average, range(len(images)))
     return out
 
 

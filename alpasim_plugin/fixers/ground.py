@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from alpasim_plugin.fixers.warp import (
     place_boxes,
     warp,
 )
-from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
+from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads
 
 I32 = npt.NDArray[np.int32]
 
@@ -106,15 +107,7 @@ def _sampled(target: WarpTarget, top: int, step: int) -> WarpTarget:
 def _warp_all(
     recorded_images: Sequence[RecordedImage], target: WarpTarget, threads: int
 ) -> list[U8]:
-    out = {}
-    todo = iter(range(len(recorded_images)))  # shared: each thread takes the next
-
-    def work() -> None:
-        for i in todo:
-            out[i] = warp(recorded_images[i], target)
-
-    run_on_threads(max(1, min(threads, len(recorded_images))), work)
-    return [out[i] for i in range(len(recorded_images))]
+    return map_on_threads(threads, partial(warp, target=target), recorded_images)
 
 
 def window_px(K: F64) -> int:

@@ -29,6 +29,7 @@ from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 ONE_BY_ONE = BlockRule(1, 1)
@@ -76,23 +77,27 @@ class BlockRunner:
     def render(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
         """Render the frames of an instant, warp their references and draw their maps."""
         cuts = [self.cover.requests(request) for request in requests]
-        parts = iter(self._pinholes([part for cut in cuts for part in cut]))
-        return [
-            self._joined(request, [next(parts) for _ in cut])
+        parts = self._pinholes([part for cut in cuts for part in cut])
+        if not self.cover.sides:
+            return parts
+        rest = iter(parts)
+        shown = [
+            (request, [next(rest) for _ in cut])
             for request, cut in zip(requests, cuts, strict=True)
         ]
+        threads = 1 if parts[0].frame.pending else thread_count(self.threads)
+        with self._timed("lens"):
+            return map_on_threads(threads, self._joined, shown)
 
-    def _joined(
-        self, request: RenderRequest, parts: Sequence[ConditionedFrame]
-    ) -> ConditionedFrame:
+    def _joined(self, shown: tuple[RenderRequest, Sequence[ConditionedFrame]]) -> ConditionedFrame:
+        request, parts = shown
         if request.camera.lens is None:
             return parts[0]
         sides = self.cover.sides[request.camera.name]
-        with self._timed("lens"):
-            frame = joined(request.camera.name, sides, [part.frame for part in parts])
-            image = None
-            if self.scene_map is not None:
-                image = joined_image(sides, [part.map for part in parts])
+        frame = joined(request.camera.name, sides, [part.frame for part in parts])
+        image = None
+        if self.scene_map is not None:
+            image = joined_image(sides, [part.map for part in parts])
         return ConditionedFrame(request, frame, image)
 
     def _pinholes(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:

@@ -25,7 +25,6 @@ from alpasim_plugin.core.shutter import Band, bands, joined
 from alpasim_plugin.core.types import (
     F64,
     I64,
-    U8,
     Actor,
     DevicePlanes,
     Frame,
@@ -36,8 +35,9 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.views import planes_of
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
-from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
+from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
 
 if TYPE_CHECKING:
     from alpasim_plugin.fixers.device_carry import UploadedImage
@@ -153,20 +153,39 @@ class ReferenceSession:
         self._recorded: OrderedDict[int, RecordedImage] = OrderedDict()
         self._uploaded: dict[int, Any] = {}  # those of them that lie on a device
 
-    def of(self, request: RenderRequest, frame: Frame) -> tuple[U8, ...]:
-        """Return the references of a rendered frame, nearest first; none without depth.
+    def added(
+        self, requests: Sequence[RenderRequest], frames: Sequence[Frame], on_device: bool = False
+    ) -> list[Frame]:
+        """Return the rendered frames of an instant with their references, nearest first; none
+        without depth.
 
         Args:
-            request: What was rendered.
-            frame: The render, whose depth carries the recorded frames into its view.
+            requests: What was rendered.
+            frames: The renders, whose depth carries the recorded frames into their views.
+            on_device: Whether those of frames that a device drew may stay there.
         """
-        if frame.depth is None:
-            return ()
-        chosen, T_world_rig = self._choose(request)
-        images = [self._recorded_image(i) for i in chosen]
-        windows = self._windows(request, frame.depth)
-        parts = [carry(images, window.target, T_world_rig, self.threads) for window in windows]
-        return _whole(request, windows, parts)
+        drawn = planes_of(frames) if on_device else []
+        if len(drawn) == len(frames):
+            carried = self._on_device(requests, drawn)
+            return [
+                frame.changed(on_device=planes)
+                for frame, planes in zip(frames, carried, strict=True)
+            ]
+        chosen = [
+            ((), np.eye(4)) if frame.depth is None else self._choose(request)
+            for request, frame in zip(requests, frames, strict=True)
+        ]
+        recorded = self._recorded_images([i for mine, _ in chosen for i in mine])
+        threads = max(1, self.threads // len(frames))
+
+        def with_references(index: int) -> Frame:
+            request, frame, (mine, T_world_rig) = requests[index], frames[index], chosen[index]
+            images = [recorded[i] for i in mine]
+            windows = self._windows(request, frame.depth) if images else []
+            parts = [carry(images, window.target, T_world_rig, threads) for window in windows]
+            return frame.changed(references=_whole(request, windows, parts))
+
+        return map_on_threads(self.threads, with_references, range(len(frames)))
 
     def _windows(self, request: RenderRequest, depth: Any) -> list[Window]:
         """Return the windows of a view ``(H, W)`` into which recorded frames are carried."""
@@ -183,28 +202,6 @@ class ReferenceSession:
             windows.append(Window(band, target, own))
         return windows
 
-    def added(
-        self, requests: Sequence[RenderRequest], frames: Sequence[Frame], on_device: bool
-    ) -> list[Frame]:
-        """Return the rendered frames of an instant with their references.
-
-        Args:
-            requests: What was rendered.
-            frames: The renders.
-            on_device: Whether those of frames that a device drew may stay there.
-        """
-        out = list(frames)
-        drawn: dict[int, DevicePlanes] = {}
-        for index, (request, frame) in enumerate(zip(requests, frames, strict=True)):
-            if on_device and frame.pending is not None:
-                drawn[index] = frame.pending
-            else:
-                out[index] = frame.changed(references=self.of(request, frame))
-        asked = [requests[index] for index in drawn]
-        for index, planes in zip(drawn, self._on_device(asked, [*drawn.values()]), strict=True):
-            out[index] = frames[index].changed(on_device=planes)
-        return out
-
     def _on_device(
         self, requests: Sequence[RenderRequest], drawn: Sequence[DevicePlanes]
     ) -> list[DevicePlanes]:
@@ -214,8 +211,7 @@ class ReferenceSession:
         views = []
         for request, planes in zip(requests, drawn, strict=True):
             chosen, T_world_rig = self._choose(request)
-            for i in chosen:
-                recorded = self._recorded_image(i)
+            for i, recorded in self._recorded_images(chosen).items():
                 if i not in self._uploaded:
                     self._uploaded[i] = upload_image(recorded, planes.rgb.device)
             views.append((request, [self._uploaded[i] for i in chosen], T_world_rig))
@@ -270,16 +266,22 @@ class ReferenceSession:
         at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
         return chosen, se3(self._ego_log.xyz[at], self._ego_log.quat[at])
 
-    def _recorded_image(self, i: int) -> RecordedImage:
-        if i not in self._recorded:
-            frame = self.index.recorded[i]
-            recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
-            self._recorded[i] = with_users(recorded, self._boxes)
-            if len(self._recorded) > KEPT_FRAMES:
-                dropped, _ = self._recorded.popitem(last=False)
-                self._uploaded.pop(dropped, None)
-        self._recorded.move_to_end(i)
-        return self._recorded[i]
+    def _read(self, i: int) -> RecordedImage:
+        frame = self.index.recorded[i]
+        recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
+        return with_users(recorded, self._boxes)
+
+    def _recorded_images(self, numbers: Sequence[int]) -> dict[int, RecordedImage]:
+        """Return recorded frames by number; those that are not kept are read."""
+        new = [i for i in dict.fromkeys(numbers) if i not in self._recorded]
+        self._recorded.update(zip(new, map_on_threads(self.threads, self._read, new), strict=True))
+        for i in numbers:
+            self._recorded.move_to_end(i)
+        out = {i: self._recorded[i] for i in numbers}
+        while len(self._recorded) > KEPT_FRAMES:
+            dropped, _ = self._recorded.popitem(last=False)
+            self._uploaded.pop(dropped, None)
+        return out
 
 
 def _whole(

@@ -257,7 +257,7 @@ def _opacity(frames: Sequence[Frame]) -> F32 | None:
     alpha = np.ones((len(frames), *frames[0].size), np.float32)
     for i, frame in enumerate(frames):
         if frame.alpha is not None:
-            alpha[i] = frame.alpha.clip(0, 1)
+            np.clip(frame.alpha, 0, 1, out=alpha[i])
     return alpha
 
 

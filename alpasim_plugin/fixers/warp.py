@@ -27,10 +27,9 @@ SLACK_M = 0.4
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
 # stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
 PARALLEL = 1e-300
-# A recorded surface that is at least this share of a point's distance away does not hide the ground;
-# another point is hidden by all that does not agree with it.
+# A recorded surface that is at least this share of a point's distance away does not hide the ground,
+# unless it is a road user's; another point is hidden by all that does not agree with it.
 FREE_SHARE = 0.4
-HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind shows nowhere
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
 # Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
 VALID = 255
@@ -80,15 +79,6 @@ class RecordedImage:
     users: Bool | None = None
 
 
-def hidden_by_users(recorded: RecordedImage) -> F32:
-    """Return the depth of a recorded frame whose road users hide all ground behind them, however
-    near to it they stand.
-    """
-    if recorded.users is None:
-        return recorded.depth
-    return np.where(recorded.users, np.float32(HIDING_M), recorded.depth)
-
-
 def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
@@ -117,8 +107,8 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     depth = np.ascontiguousarray(target.depth)
     depth_then = np.ascontiguousarray(recorded.depth)
     ground = np.zeros(shape, bool) if target.ground is None else target.ground
-    hidden = depth_then if target.ground is None else hidden_by_users(recorded)
-    _coordinates(depth, ground, depth_then, np.ascontiguousarray(hidden), A, b, x, y, held)
+    users = np.zeros(depth_then.shape, bool) if recorded.users is None else recorded.users
+    _coordinates(depth, ground, depth_then, users, A, b, x, y, held)
     names, seen = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([recorded.actors.get(name, absent) for name in names])
@@ -130,7 +120,8 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.dstack([rgb, held])
+    out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
+    return np.asarray(cv2.insertChannel(held, out, 3))
 
 
 class PlacedBoxes(NamedTuple):
@@ -179,11 +170,11 @@ def place_boxes(
 
 
 @float_kernel
-def _coordinates(depth, ground, depth_then, hidden, A, b, x, y, held):
+def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
     """Fill ``x``, ``y`` and ``held`` as if nothing moved."""
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
-    surfaces, behind_users = depth_then.reshape(-1), hidden.reshape(-1)
+    surfaces, of_user = depth_then.reshape(-1), users.reshape(-1)
     place = np.empty(width, np.uint32)
     distance = np.empty(width, np.float64)
     seen = np.empty(width, np.bool_)
@@ -208,13 +199,14 @@ def _coordinates(depth, ground, depth_then, hidden, A, b, x, y, held):
                 there,
             )
         for column in range(width):
+            then = place[column]
             if not seen[column]:
                 held[row, column] = 0
-            elif ground[row, column]:
-                surface = behind_users[place[column]]
-                held[row, column] = _held(surface, distance[column], FREE_SHARE)
+            elif ground[row, column] and of_user[then]:
+                held[row, column] = INCONSISTENT
             else:
-                held[row, column] = _held(surfaces[place[column]], distance[column], np.inf)
+                free_share = FREE_SHARE if ground[row, column] else np.inf
+                held[row, column] = _held(surfaces[then], distance[column], free_share)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -197,15 +197,22 @@ def request(x, t_us):
     return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
 
 
+def references_of(found, asked, frame):
+    return found.added([asked], [frame])[0].references
+
+
 def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted():
     asked, frame = request(10.0, 500_000)
     frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
     wrong = replace(
         asked, camera=replace(asked.camera, T_rig_camera=se2(0.0, 0.0, 0.0, 1.0) @ FORWARD)
     )
-    images = session()[0].of(asked, frame)
+    images = references_of(session()[0], asked, frame)
     for image, same, of_lower_road in zip(
-        images, session()[0].of(wrong, frame), session(road_m=-1.0)[0].of(asked, frame), strict=True
+        images,
+        references_of(session()[0], wrong, frame),
+        references_of(session(road_m=-1.0)[0], asked, frame),
+        strict=True,
     ):
         assert_array_equal(image, same)
         assert (image != of_lower_road).any()
@@ -213,9 +220,9 @@ def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted(
 
 def test_without_memory_the_same_view_has_the_same_references_whatever_came_before():
     found, _ = session(hysteresis=False)
-    alone = found.of(*request(10.9, 500_000))
-    found.of(*request(40.0, 2_000_000))
-    again = found.of(*request(10.9, 500_000))
+    alone = references_of(found, *request(10.9, 500_000))
+    references_of(found, *request(40.0, 2_000_000))
+    again = references_of(found, *request(10.9, 500_000))
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
 
 
@@ -228,15 +235,15 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
         T_world_camera=np.stack([start, asked.T_world_camera[1]]),
         exposure=Exposure(share, {}),
     )
-    images = found.of(rolled, frame)
+    images = references_of(found, rolled, frame)
     assert len(images) == 2
-    assert (images[0] != found.of(asked, frame)[0]).any()
+    assert (images[0] != references_of(found, asked, frame)[0]).any()
     parts = bands(rolled)
     assert len(parts) > 2
     for band in parts:
         T = np.stack([band.T_world_camera] * 2)
         for image, alone in zip(
-            images, found.of(replace(asked, T_world_camera=T), frame), strict=True
+            images, references_of(found, replace(asked, T_world_camera=T), frame), strict=True
         ):
             assert_array_equal(image[band.rows], alone[band.rows])
 

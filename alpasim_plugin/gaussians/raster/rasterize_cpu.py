@@ -260,6 +260,16 @@ def thread_count(threads: int | None) -> int:
     return threads
 
 
+def map_on_threads(threads: int, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Return what a function makes of each item, in their order; a thread that is free takes the
+    next.
+    """
+    if min(threads, len(items)) <= 1:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(min(threads, len(items))) as pool:
+        return list(pool.map(function, items))
+
+
 def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> None:
     """Call ``function(*args)`` on each of ``threads`` threads, this one included, and return when
     all have ended.
