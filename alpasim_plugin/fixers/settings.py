@@ -16,7 +16,6 @@ from alpasim_plugin.core.config import Document, apply_overrides, load_yaml, val
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network import schedule
 
-DOING = "reading the settings of a fixer"
 Positive = Annotated[int, Field(ge=1)]
 
 

@@ -29,7 +29,6 @@ from alpasim_plugin.lab.bench.photograph import posed_photograph
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
 
-DOING = "measuring renderers against photographs"
 SETS = ("held-out", "never-fitted")
 BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
 METRICS = (

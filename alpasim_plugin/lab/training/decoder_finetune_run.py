@@ -29,8 +29,6 @@ from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
-DOING = "fine-tuning a decoder"
-
 
 def finetune_decoder(
     bundle: Path,

@@ -37,7 +37,6 @@ from policies.learned_net import PROXIMITY_M
 
 DEMONSTRATIONS_FILE = "demonstrations.json"
 DEMONSTRATIONS_VERSION = 5  # of the format
-READING = "reading demonstrations for the learned policy"
 GIVE = "give a folder that 'simrun train policy-data' wrote"
 SKY_SHARE = 0.2  # of a frame's rows: most of the sky, which is cut
 MAX_YAW_RAD = np.deg2rad(8.5)

@@ -33,7 +33,6 @@ from alpasim_plugin.lab.training.clips import to_tensor
 from alpasim_plugin.lab.training.pair_store import PairSequence, listed_sizes, pairs_digest
 
 F16 = npt.NDArray[np.float16]
-DOING = "encoding training clips"
 CHANNELS = 16
 DECODER = "decoder."  # names of its weights
 

@@ -33,7 +33,6 @@ from alpasim_plugin.core.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
 CONTENT = "content"
-READING = "reading training pairs"
 OPEN_CLIPS = (
     100  # at a time; each holds a file for every channel, and a process may often open 1024
 )

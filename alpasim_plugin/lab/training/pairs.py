@@ -23,7 +23,6 @@ from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_ref
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.world.ground import ground_pose
 
-DOING = "making training pairs"
 MOVING_M = 2.0  # an actor with a longer track counts as moving
 
 

@@ -28,7 +28,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
 from alpasim_plugin.lab.training.photographs import Photographs, triangulated
 
-DOING = "making pairs of photographs"
 PERIOD_US = 100_000  # photographs have no clock
 FITTED_PX = 160  # width of the views that are fitted, as for driving scenes
 

@@ -31,7 +31,6 @@ from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PixelVariant
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
 BLOCK = re.compile(r"(encode|decode|middle)\w*\.\d+\.")  # a residual block of a stage
-DOING = "training a per-frame generator"
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ from alpasim_plugin.lab.training.render_step import (
 )
 from alpasim_plugin.lab.training.trainer import Loss
 
-DOING = "setting up the training of an image model"
 ROLLOUT = (
     8  # frames of a temporal clip; the loss is on one of those that have four outputs before them
 )

@@ -37,7 +37,6 @@ from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_los
 from alpasim_plugin.lab.training.map_errors import MapError, draw_map_error, with_error
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
 
-DOING = "making training streams"
 KINDS = ("pairs", "identity", "video", "damaged_video")
 SIDE = 16  # crops are multiples of it
 # Probability of each augmentation of an episode: played backward, every second frame, mirrored,

@@ -22,7 +22,6 @@ from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.video_damage import damage_video, draw_damage
 from alpasim_plugin.log.video import read_mp4
 
-DOING = "making pairs of a video"
 TRAIN, HELD_OUT = "train", "held-out"
 
 

@@ -16,32 +16,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers.network.checkpoints import load_weights, weight
 
 NAME = "perceptual-syn"
-FORMAT = "simrun-perceptual-1"
 WIDTHS = (16, 32, 64, 96)  # channels of the stages, at 1/2, 1/4, 1/8 and 1/16 of the resolution
 SMALLEST_PX = 16
 HEAD_INIT = -3.0  # before softplus
 # added to the squared length of a feature, against division by nearly zero in flat dark cells
 LENGTH_EPS = 1e-4
-DOING = "measuring a perceptual distance"
 
 
 class FeatureNet(nn.Module):
-    """Four convolution stages, each at half the resolution of the previous one.
+    """Four convolution stages, each at half the resolution of the previous one."""
 
-    Args:
-        widths: Channels of the stages.
-    """
-
-    def __init__(self, widths: tuple[int, int, int, int] = WIDTHS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        one, two, three, four = widths
-        self.widths = widths
+        one, two, three, four = WIDTHS
         self.stages = nn.ModuleList(
             [
                 nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _activation()),
@@ -70,9 +61,6 @@ class FeatureNet(nn.Module):
 class PerceptualDistance(nn.Module):
     """Distance of two images in feature space.
 
-    Args:
-        widths: Channels of the stages.
-
     Example:
         >>> net = PerceptualDistance().requires_grad_(False)
         >>> a = torch.zeros(2, 3, 32, 48)
@@ -80,11 +68,11 @@ class PerceptualDistance(nn.Module):
         tensor([0., 0.])
     """
 
-    def __init__(self, widths: tuple[int, int, int, int] = WIDTHS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.trunk = FeatureNet(widths)
+        self.trunk = FeatureNet()
         # Before softplus, which keeps the weights positive.
-        self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_INIT)) for c in widths])
+        self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_INIT)) for c in WIDTHS])
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable in
@@ -106,51 +94,14 @@ class PerceptualDistance(nn.Module):
         ]
         return torch.stack(parts).sum(0)
 
-    def save(
-        self,
-        path: str | Path,
-        metadata: dict[str, str] | None = None,
-        dtype: torch.dtype = torch.float16,
-    ) -> None:
-        """Write the weights as safetensors."""
-        tensors = {key: value.to(dtype) for key, value in self.state_dict().items()}
-        write_safetensors(path, tensors, {**(metadata or {}), "format": FORMAT, "name": NAME})
 
-
-def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
-    """Load the distance `perceptual-syn`, frozen, in float32.
-
-    Args:
-        path: Weights that `simrun train perceptual` wrote; None takes those of the package.
-
-    Raises:
-        InputError: No such file, or weights of another network.
-    """
-    source = Path(path) if path is not None else shipped_weights()
-    _, do = (
-        "loading the perceptual network",
-        "give a file that 'simrun train perceptual' wrote",
+def load_perceptual() -> PerceptualDistance:
+    """Load the distance `perceptual-syn`, frozen, in float32."""
+    source = shipped_weights()
+    net = PerceptualDistance()
+    net.load_state_dict(
+        {key: weight(key, value, str(source)) for key, value in load_weights(source).items()}
     )
-    if not source.is_file():
-        raise InputError(f"{source}: no such file", do)
-    if read_metadata(source).get("format") != FORMAT:
-        raise InputError(
-            f"{source}: format {read_metadata(source).get('format')!r}, not {FORMAT!r}",
-            do,
-        )
-    tensors = {key: weight(key, value, str(source)) for key, value in load_weights(source).items()}
-    heads = [tensors.get(f"heads.{i}") for i in range(len(WIDTHS))]
-    if any(head is None for head in heads):
-        raise InputError(
-            f"{source}: {len(tensors)} tensors without the heads of {len(WIDTHS)} stages",
-            do,
-        )
-    one, two, three, four = (head.numel() for head in heads if head is not None)
-    net = PerceptualDistance((one, two, three, four))
-    try:
-        net.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise InputError(f"{source}: {str(error).splitlines()[-1].strip()}", do) from error
     return net.requires_grad_(False).eval()
 
 
