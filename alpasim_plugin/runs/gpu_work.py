@@ -98,7 +98,7 @@ def bytes_of(*parts: Any) -> int:
 
 
 def counted(
-    call: Callable[[], Sequence[Tensor]],
+    call: Callable[[], Any],
     precision: Literal["fp32", "bf16"] = "fp32",
     given: Sequence[Any] = (),
 ) -> Work:
