@@ -17,7 +17,8 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 if TYPE_CHECKING:
     from torch import Tensor, device, dtype
 
-S, T = TypeVar("S"), TypeVar("T")
+S = TypeVar("S")
+T = TypeVar("T")
 WARM_UP = 3  # calls before a function is recorded
 
 
@@ -35,7 +36,7 @@ def require_device(name: str) -> str:
         return name
     import torch
 
-    number = int(name.partition(":")[2] or os.environ.get("LOCAL_RANK", 0))
+    number = int(name.partition(":")[2] or os.environ.get("LOCAL_RANK", "0"))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if number >= count:
         raise InfrastructureError(
