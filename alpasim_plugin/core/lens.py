@@ -104,6 +104,12 @@ class Lens:
         return cv2.remap(covering, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
+def lens_camera(pinhole: str) -> str:
+    """Return the name of the camera whose lens a pinhole covers, by its name (see `Lens.spec`)."""
+    camera, _, side = pinhole.rpartition(".")
+    return camera or side
+
+
 class Rays(NamedTuple):
     """What the pixels of a lens see, row by row.
 

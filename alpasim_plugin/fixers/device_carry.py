@@ -1,7 +1,7 @@
 """Carry recorded frames into a view on a GPU: what `fixers.ground` does, with tensors, and without
 waiting for them. Only the first rows of the ground may differ, where a window ends at another row.
 
-V views have P = H W pixels each, K recorded frames each. Points are tensors ``(V, 3, P)`` float64.
+V views have P = H W pixels each, K recorded frames each, and N with the others of their lenses. Points are tensors ``(V, 3, P)`` float64.
 """
 
 from __future__ import annotations
@@ -44,12 +44,14 @@ class UploadedImage:
         rgb: ``(3, H, W)`` float32 levels.
         depth: ``(H, W)`` metres.
         hidden: Depth, `HIDING_M` where a road user stands: it hides all ground behind it.
+        others: See `RecordedImage`.
     """
 
     recorded: RecordedImage
     rgb: Tensor
     depth: Tensor
     hidden: Tensor
+    others: tuple[UploadedImage, ...] = ()
 
 
 def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage:
@@ -68,6 +70,11 @@ class CarriedView(NamedTuple):
     target: WarpTarget  # its depth is a tensor
     T_world_rig: F64  # (4, 4) of a rig near by
 
+    @property
+    def pinholes(self) -> list[UploadedImage]:
+        """Return each image and the others of its lens."""
+        return [part for image in self.images for part in (image, *image.others)]
+
 
 class Users(NamedTuple):
     """The boxes of the road users of V views, at most B of each; a box that stands for none holds
@@ -77,12 +84,13 @@ class Users(NamedTuple):
     ray: Tensor  # (V, B, 3, 3), this and the next two: see `warp.SeenBoxes`
     eye: Tensor  # (V, B, 3, 1)
     walls: Tensor  # (V, B, 2, 3, 1)
-    then: Tensor  # (V, B, 3 K, 4) from a box to the pixels of each recorded frame times depth
+    then: Tensor  # (V, B, 3 N, 4) from a box to the pixels of each recorded frame times depth
 
 
-def size_of(view: CarriedView) -> tuple[int, ...]:
+def size_of(view: CarriedView) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
     """Return what views share that are carried together."""
-    return *view.target.depth.shape, len(view.images), ground.window_px(view.target.K)
+    lenses = tuple(1 + len(image.others) for image in view.images)
+    return view.target.depth.shape, ground.window_px(view.target.K), lenses
 
 
 def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
@@ -90,27 +98,43 @@ def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     `ground.carry`.
     """
     depth = torch.stack([view.target.depth for view in views])  # type: ignore[arg-type]  # tensors here
-    height, width, count, size = size_of(views[0])
+    (height, width), size, lenses = size_of(views[0])
     rays, flat = _rays(depth[0]), depth.flatten(1)
     users = _users(views, depth.device)
     on_ground = _ground_depth(views, rays, flat, users)
     by_depth, by_ground = (
-        part.unflatten(2, (height, width))
+        _filled(part, lenses).unflatten(2, (height, width))
         for part in (
             _warp(views, "depth", rays, flat, users, np.inf),
             _warp(views, "hidden", rays, on_ground, None, FREE_SHARE),
         )
     )
     chosen = on_ground.view_as(depth) > 0
-    if count > 1:
+    if len(lenses) > 1:
         step = ground.step_px(size)
         across = size // step | 1
         by_both = (part[:, :, ::step, ::step] for part in (by_ground, by_depth))
         apart = torch.sub(*(_disagreement(part, across) for part in by_both))
-        agrees = (apart <= ground.PREFERENCE * across**2).repeat_interleave(step, dim=1)
+        share = (depth / on_ground.view_as(depth).clamp(min=ground.NEAREST_M))[:, ::step, ::step]
+        about = (share > ground.ABOUT[0]) & (share < ground.ABOUT[1])
+        most = torch.where(about, ground.NEAR_PREFERENCE, ground.PREFERENCE) * across**2
+        agrees = (apart <= most).repeat_interleave(step, dim=1)
         agrees = agrees.repeat_interleave(step, dim=2)[:, :height, :width]
         chosen &= agrees | (depth <= 0)
     return torch.where(chosen[:, None, :, :, None], by_ground, by_depth)
+
+
+def _filled(parts: Tensor, lenses: Sequence[int]) -> Tensor:
+    """Return recorded frames ``(V, K, P, 4)``, each filled in by the others of its lens, of all parts
+    ``(V, N, P, 4)``.
+    """
+    out = []
+    for lens in parts.split(list(lenses), dim=1):
+        image, *others = lens.unbind(1)
+        for other in others:
+            image = torch.where(image[..., 3:] == 0, other, image)
+        out.append(image)
+    return torch.stack(out, dim=1)
 
 
 def _rays(depth: Tensor) -> Tensor:
@@ -124,9 +148,9 @@ def _rays(depth: Tensor) -> Tensor:
 
 def _projections(view: CarriedView) -> F64:
     """Return the matrices from the world to the pixels of a view's recorded frames times depth,
-    ``(K, 3, 4)``.
+    ``(N, 3, 4)``.
     """
-    recorded = [image.recorded for image in view.images]
+    recorded = [image.recorded for image in view.pinholes]
     return np.array([one.K @ inverse(one.T_world_camera)[:3] for one in recorded])
 
 
@@ -142,13 +166,13 @@ def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
     shape = len(views), most
     ray, eye = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
     walls = np.ones((*shape, 2, 3))  # of equal ones nothing lies between
-    then = np.zeros((*shape, 3 * len(views[0].images), 4))
+    then = np.zeros((*shape, 3 * len(views[0].pinholes), 4))
     for v, view in enumerate(views):
         names, seen = view.target.placed
         count = len(names)
         ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
         for i, name in enumerate(names):
-            T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.images]
+            T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
             then[v, i] = (_projections(view) @ np.array(T_world_box)).reshape(-1, 4)
     parts = ray, eye[..., None], walls[..., None], then
     return Users(*(upload(part, device) for part in parts))
@@ -167,7 +191,7 @@ def _warp(
     users: Users | None,
     free_share: float,
 ) -> Tensor:
-    """Return the recorded frames in the views ``(V, K, P, 4)``; see `warp.warp`.
+    """Return the recorded frames in the views ``(V, N, P, 4)``; see `warp.warp`.
 
     Args:
         views: Their images are carried.
@@ -188,7 +212,7 @@ def _warp(
         there = torch.where(inside, _turned(users.then[:, i], local), there)
     u, v, w = there.unflatten(1, (-1, 3)).flatten(0, 1).unbind(1)
     u, v = u / w, v / w
-    images = [image for view in views for image in view.images]
+    images = [image for view in views for image in view.pinholes]
     surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
     sizes = upload(np.array([image.depth.shape for image in images]), depth.device)
     height, width = sizes[..., None].unbind(1)
@@ -235,7 +259,7 @@ def _ground_depth(
     slope = numbers[:, :3] @ rays
     z = -numbers[:, 3:] / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
-    free &= (depth <= 0) | (depth >= FREE_SHARE * z)
+    free &= (depth <= ground.FLOATING_M) | (depth >= FREE_SHARE * z)
     for i in range(users.ray.shape[1]):
         reaches = (users.walls[:, i] - users.eye[:, None, i]) / (users.ray[:, i] @ rays)[:, None]
         near = reaches.amin(dim=1).amax(dim=1).clamp(min=0)

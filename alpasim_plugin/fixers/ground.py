@@ -38,7 +38,11 @@ I32 = npt.NDArray[np.int32]
 
 NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
-PREFERENCE = 3  # grey levels by which the ground may agree less than the render's depth does
+# Grey levels by which the ground may agree less than the render's depth does; and where the render
+# itself shows a surface about as far away, which is the ground at a wrong depth.
+PREFERENCE, NEAR_PREFERENCE = 3, 10
+ABOUT = (0.75, 1.4)  # the render's depth as a share of the ground's
+FLOATING_M = 1.0  # nothing stands so near to a camera: it does not hide the ground
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
 SAMPLES = 15  # a larger window is sampled by so many rows and columns, or up to twice as many
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
@@ -72,9 +76,12 @@ def carry(
     view = _sampled(replace(target, depth=depth, ground=ground, actors={}), top, step)
     by_ground = _warp_all(compared, view, threads)
     own = [image[top // step :] for image in by_depth]
+    share = target.depth[top::step, ::step] / np.maximum(view.depth, NEAREST_M)
+    about = (share > ABOUT[0]) & (share < ABOUT[1])
     agrees = (
         _disagreement(by_ground[0], by_ground[1], across)
-        <= _disagreement(own[0], own[1], across) + PREFERENCE * across**2
+        <= _disagreement(own[0], own[1], across)
+        + np.where(about, NEAR_PREFERENCE, PREFERENCE) * across**2
     )
     rows, columns = ground[top:].shape
     agrees = agrees.repeat(step, axis=0)[:rows].repeat(step, axis=1)[:, :columns]
@@ -125,8 +132,8 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     the view may show it; elsewhere 0.
 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a
-    hole there or a surface that is not nearer than `FREE_SHARE` of that, and the ray meets no
-    actor's box. Arguments as of `carry`.
+    hole there, a surface that is not nearer than `FREE_SHARE` of that, or one within `FLOATING_M`,
+    and the ray meets no actor's box. Arguments as of `carry`.
     """
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
     down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
@@ -144,9 +151,8 @@ def _ground(depth, down, height_m, out):
         for column in range(out.shape[1]):
             slope, surface = down[0] * (column + 0.5) + below, np.float64(depth[row, column])
             z = -height_m / slope if slope < 0 else 0.0
-            free = (
-                (z > NEAREST_M) & (z < FARTHEST_M) & ((surface <= 0) | (surface >= FREE_SHARE * z))
-            )
+            hides = (surface > FLOATING_M) & (surface < FREE_SHARE * z)
+            free = (z > NEAREST_M) & (z < FARTHEST_M) & ~hides
             out[row, column] = z if free else 0.0
 
 

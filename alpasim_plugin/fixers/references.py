@@ -15,12 +15,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from alpasim_plugin.core.devices import batched
 from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.shutter import Band, bands, joined
 from alpasim_plugin.core.types import (
     F64,
@@ -42,7 +44,8 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread
 if TYPE_CHECKING:
     from alpasim_plugin.fixers.device_carry import UploadedImage
 
-KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
+# Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
+KEPT_FRAMES, KEPT_INSTANTS = 24, 4
 SECOND_M, TURN_M = (
     0.5,
     10.0,
@@ -69,6 +72,18 @@ class ReferenceIndex:
         self._centres, self._axes = T[:, :3, 3], T[:, :3, 2]
         self._t_us: I64 = np.array([frame.t_us for frame in recorded], np.int64)
         self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
+        self._lenses: dict[tuple[int, str], list[int]] = {}
+        for i, frame in enumerate(recorded):
+            self._lenses.setdefault((frame.t_us, lens_camera(frame.camera)), []).append(i)
+
+    def lens(self, i: int) -> list[int]:
+        """Return a frame and those of the other pinholes of its lens, of the same instant, in the
+        order in which they look away from it.
+        """
+        frame = self.recorded[i]
+        ahead = self._axes @ self._axes[i]
+        own = self._lenses[frame.t_us, lens_camera(frame.camera)]
+        return [i, *sorted((j for j in own if j != i), key=lambda j: -ahead[j])]
 
     def choose(
         self,
@@ -150,6 +165,8 @@ class ReferenceSession:
         self.threads = threads
         self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
+        cameras = len({frame.camera for frame in recorded})
+        self._kept = max(KEPT_FRAMES, KEPT_INSTANTS * cameras)
         self._recorded: OrderedDict[int, RecordedImage] = OrderedDict()
         self._uploaded: dict[int, Any] = {}  # those of them that lie on a device
 
@@ -180,7 +197,7 @@ class ReferenceSession:
 
         def with_references(index: int) -> Frame:
             request, frame, (mine, T_world_rig) = requests[index], frames[index], chosen[index]
-            images = [recorded[i] for i in mine]
+            images = self._whole_lenses(mine, recorded)
             windows = self._windows(request, frame.depth) if images else []
             parts = [carry(images, window.target, T_world_rig, threads) for window in windows]
             return frame.changed(references=_whole(request, windows, parts))
@@ -214,7 +231,8 @@ class ReferenceSession:
             for i, recorded in self._recorded_images(chosen).items():
                 if i not in self._uploaded:
                     self._uploaded[i] = upload_image(recorded, planes.rgb.device)
-            views.append((request, [self._uploaded[i] for i in chosen], T_world_rig))
+            images = self._whole_lenses(chosen, self._uploaded)
+            views.append((request, images, T_world_rig))
         carried = self._carried(views, drawn)
 
         def changed(index: int) -> DevicePlanes:
@@ -271,14 +289,22 @@ class ReferenceSession:
         recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
         return with_users(recorded, self._boxes)
 
-    def _recorded_images(self, numbers: Sequence[int]) -> dict[int, RecordedImage]:
-        """Return recorded frames by number; those that are not kept are read."""
+    def _whole_lenses(self, numbers: Sequence[int], images: Mapping[int, Any]) -> list[Any]:
+        """Return recorded frames that have those of the other pinholes of their lens."""
+        lenses = [[images[j] for j in self.index.lens(i)] for i in numbers]
+        return [replace(first, others=tuple(others)) for first, *others in lenses]
+
+    def _recorded_images(self, chosen: Sequence[int]) -> dict[int, RecordedImage]:
+        """Return recorded frames and those of their lenses by number; those that are not kept are
+        read.
+        """
+        numbers = [j for i in chosen for j in self.index.lens(i)]
         new = [i for i in dict.fromkeys(numbers) if i not in self._recorded]
         self._recorded.update(zip(new, map_on_threads(self.threads, self._read, new), strict=True))
         for i in numbers:
             self._recorded.move_to_end(i)
         out = {i: self._recorded[i] for i in numbers}
-        while len(self._recorded) > KEPT_FRAMES:
+        while len(self._recorded) > self._kept:
             dropped, _ = self._recorded.popitem(last=False)
             self._uploaded.pop(dropped, None)
         return out

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -57,6 +57,16 @@ class WarpTarget:
     boxes: Mapping[str, Box]
     ground: Bool | None = None
 
+    def window(self, rows: slice, columns: slice) -> WarpTarget:
+        """Return a part of the view."""
+        K = self.K.copy()
+        K[:2, 2] -= columns.start, rows.start
+        depth, ground = (
+            None if part is None else np.ascontiguousarray(part[rows, columns])
+            for part in (self.depth, self.ground)
+        )
+        return replace(self, K=K, depth=depth, ground=ground)
+
     @cached_property
     def placed(self) -> PlacedBoxes:
         """The boxes of the actors present, as the view sees them; found once for all recorded
@@ -67,8 +77,13 @@ class WarpTarget:
 
 @dataclass(frozen=True, eq=False)
 class RecordedImage:
-    """A recorded frame in memory: see `RecordedFrame`; ``users`` are the pixels of its road users
-    ``(H, W)``, None where there are none.
+    """A recorded frame in memory.
+
+    Attributes:
+        K, T_world_camera, rgb, depth, actors: See `RecordedFrame`.
+        users: The pixels of its road users ``(H, W)``; None where there are none.
+        others: The frames of the other pinholes of its lens, of the same instant; they fill in what
+            lies outside of this one.
     """
 
     K: F64
@@ -77,6 +92,7 @@ class RecordedImage:
     depth: F32
     actors: Mapping[str, F64]
     users: Bool | None = None
+    others: tuple[RecordedImage, ...] = ()
 
 
 def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
@@ -120,8 +136,16 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
-    return np.asarray(cv2.insertChannel(held, out, 3))
+    out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)  # type: ignore[assignment]
+    for other in recorded.others:
+        hole = out[..., 3] == 0
+        rows, columns = (np.flatnonzero(hole.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            break
+        around = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        filling = warp(other, target.window(*around))
+        cv2.copyTo(filling, hole[around].astype(np.uint8), out[around])  # in place
+    return out
 
 
 class PlacedBoxes(NamedTuple):

@@ -36,8 +36,10 @@ def test_images_equal_those_of_the_processor(count, wall_m, window_rad, monkeypa
         for i in range(count)
     ]
     images[-1] = replace(images[-1], actors={})
-    wanted = carry(images, view, rig(10.0))
-    uploaded = [upload_image(one, torch.device("cpu")) for one in images]
+    other = replace(images[0], T_world_camera=se2(0.0, 0.0, 0.5) @ images[0].T_world_camera)
+    wanted = carry([replace(images[0], others=(other,)), *images[1:]], view, rig(10.0))
+    first, *rest, other = (upload_image(one, torch.device("cpu")) for one in (*images, other))
+    uploaded = [replace(first, others=(other,)), *rest]
     on_device = replace(view, depth=torch.from_numpy(depth))
     alone = replace(on_device, actors={"car": view.actors["car"]})
     both = [CarriedView(uploaded, target, rig(10.0)) for target in (alone, on_device)]

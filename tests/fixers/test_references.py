@@ -96,6 +96,20 @@ def test_nothing_but_the_rotation_moves_the_sky():
     assert turned[HEIGHT // 2, 32, 0] == pytest.approx(4 * middle, abs=3)
 
 
+def test_the_pinholes_of_a_lens_show_together_what_one_of_them_does_not():
+    here, depth = at(0.0), np.zeros((HEIGHT, WIDTH), np.float32)
+    left, right = (picture(at(0.0, 0.0, yaw), depth) for yaw in (0.6, -0.6))
+    view = WarpTarget(K, here, depth, {}, {})
+    alone, other = warp(left, view), warp(right, view)
+    whole = warp(replace(left, others=(right,)), view)
+    shown = alone[..., 3:] > 0
+    assert 0.2 < shown.mean() < 0.8
+    assert_array_equal(whole, np.where(shown, alone, other))
+    one, another = recorded([(0, 0.6), (0, -0.6)], step_us=0)
+    lens = [replace(one, camera="wide.left"), one, replace(another, camera="wide.right")]
+    assert [ReferenceIndex(lens).lens(i) for i in range(3)] == [[0, 2], [1], [2, 0]]
+
+
 def test_a_car_is_looked_up_where_it_was():
     box = Box(4.0, 2.0, 1.5)
     now = se2(20.0, 0.0, 0.0, 0.75)
