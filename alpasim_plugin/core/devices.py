@@ -103,8 +103,9 @@ def join_ranks(place: device) -> tuple[int, int]:
     from torch import distributed
 
     if not distributed.is_initialized():
-        on_cards = {"backend": "nccl", "device_id": place}
-        distributed.init_process_group(**implementation(place, {"backend": "gloo"}, on_cards))
+        backend = implementation(place, "gloo", "nccl")
+        own: device | None = implementation(place, None, place)
+        distributed.init_process_group(backend, device_id=own)
     return distributed.get_rank(), distributed.get_world_size()
 
 
@@ -136,7 +137,7 @@ def side_stream(place: device) -> Callable[[], AbstractContextManager[None]]:
         return nullcontext
     import torch
 
-    stream = torch.cuda.Stream(place)
+    stream = torch.cuda.Stream(place)  # type: ignore[no-untyped-call]
 
     @contextmanager
     def beside() -> Iterator[None]:

@@ -110,7 +110,9 @@ def test_two_processes_train_to_the_weights_and_the_log_of_one(tmp_path):
 def test_processes_on_cards_join_by_nccl_each_with_a_card_of_its_own(monkeypatch):
     chosen = []
     monkeypatch.setattr(
-        torch.distributed, "init_process_group", lambda **options: chosen.append(options)
+        torch.distributed,
+        "init_process_group",
+        lambda backend, device_id: chosen.append((backend, device_id)),
     )
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
@@ -122,4 +124,4 @@ def test_processes_on_cards_join_by_nccl_each_with_a_card_of_its_own(monkeypatch
     assert require_device("cuda") == "cuda:1"
     card = torch.device("cuda:1")
     assert join_ranks(card) == join_ranks(torch.device("cpu")) == (1, 2)
-    assert chosen == [{"backend": "nccl", "device_id": card}, {"backend": "gloo"}]
+    assert chosen == [("nccl", card), ("gloo", None)]
