@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,13 +25,22 @@ def cutter(camera: CameraSpec, view: View, device: torch.device) -> Cut:
     `learned_input.level_view`, on which the network was trained, on a card the same within two grey
     levels.
     """
-    on_card: Callable[..., Cut] = DeviceView
-    return implementation(device, partial(partial, _on_host), on_card)(camera, view, device)
+    make: Callable[..., Cut] = implementation(device, HostView, DeviceView)
+    return make(camera, view, device)
 
 
-def _on_host(camera: CameraSpec, view: View, _: torch.device, image: Tensor) -> Tensor:
-    shown = torch.from_numpy(level_view(image.numpy(), camera, view=view))
-    return shown.permute(2, 0, 1).float()
+@dataclass(frozen=True, eq=False)
+class HostView:
+    """A level view that is cut from a camera's images on the CPU; see `cutter`."""
+
+    camera: CameraSpec
+    view: View
+    device: torch.device
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Cut the view."""
+        shown = level_view(image.numpy(), self.camera, view=self.view)
+        return torch.from_numpy(shown).permute(2, 0, 1).float()
 
 
 class DeviceView:

@@ -169,11 +169,11 @@ def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
     then = np.zeros((*shape, 3 * len(views[0].pinholes), 4))
     for v, view in enumerate(views):
         names, seen = view.target.placed
-        count = len(names)
+        count, project = len(names), _projections(view)
         ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
         for i, name in enumerate(names):
             T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
-            then[v, i] = (_projections(view) @ np.array(T_world_box)).reshape(-1, 4)
+            then[v, i] = (project @ np.array(T_world_box)).reshape(-1, 4)
     parts = ray, eye[..., None], walls[..., None], then
     return Users(*(upload(part, device) for part in parts))
 
