@@ -260,15 +260,14 @@ def joined_image(
         assert lens.weight is not None, "one of several pinholes"
         part = lens.shown(image)
         weight = lens.weight * (part[..., 3] + NOT_HELD) if holds else lens.weight
-        first = lens.first_column
-        columns = slice(first, max(first, min(end, first + part.shape[1])))
-        both = max(0, columns.stop - first)
-        given = out[:, columns], part[:, :both], shown[:, columns], weight[:, :both]
+        both = max(0, end - lens.first_column)
         if both:
-            out[:, columns] = cv2.blendLinear(*map(np.ascontiguousarray, given))
-        out[:, first + both : first + part.shape[1]] = part[:, both:]
+            given = out[lens.part], part, shown[lens.part], weight
+            mixed = cv2.blendLinear(*(np.ascontiguousarray(image[:, :both]) for image in given))
+            part[:, :both] = mixed
+        out[lens.part] = part
         shown[lens.part] += weight
-        end = max(end, first + part.shape[1])
+        end = max(end, lens.part[1].stop)
     if cv2.countNonZero(shown) < shown.size:
         out[shown == 0] = outside
     return out

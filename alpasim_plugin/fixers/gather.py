@@ -238,11 +238,8 @@ def _blend(repaired, references, weight, offset_px, correction, scale, first_row
             for row in (y0[y], y1[y]):
                 if row_of[k, 2 + row % 2] != row:
                     row_of[k, 2 + row % 2] = row
-                    if scale == 1:
-                        _correction_row(weight[k], correction[k], row, correction_rows[k, row % 2])
-                    else:
-                        _correction_row(weight[k], correction[k], row, coarse_correction)
-                        _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
+                    _correction_row(weight[k], correction[k], row, coarse_correction)
+                    _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
             upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
             for x in range(width):
                 logarithm = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
@@ -304,15 +301,14 @@ def smaller(x: Tensor, scale: int) -> Tensor:
     if scale == 1:
         return x
     height, width, channels = x.shape[-3:]
-    out = torch.empty(
-        *x.shape[:-3], -(-height // scale), -(-width // scale), channels, dtype=x.dtype
-    )
-    border = 0, -height % scale, 0, -width % scale
+    below, right = -height % scale, -width % scale
+    size = (height + below) // scale, (width + right) // scale
+    out = torch.empty(*x.shape[:-3], *size, channels, dtype=x.dtype)
     images, resized = (a.reshape(-1, *a.shape[-3:]) for a in (_array(x), out.numpy()))
 
     def average(i: int) -> None:
-        whole = cv2.copyMakeBorder(images[i], *border, cv2.BORDER_REPLICATE)
-        cv2.resize(whole, resized.shape[2:0:-1], dst=resized[i], interpolation=cv2.INTER_AREA)
+        whole = cv2.copyMakeBorder(images[i], 0, below, 0, right, cv2.BORDER_REPLICATE)
+        cv2.resize(whole, size[::-1], dst=resized[i], interpolation=cv2.INTER_AREA)
 
     map_on_threads(torch.get_num_threads(), average, range(len(images)))
     return out
