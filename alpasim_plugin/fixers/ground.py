@@ -72,8 +72,10 @@ def carry(
     across = size // step | 1
     top = int(ground.any(axis=1).argmax()) // step * step
     compared = recorded_images[:2]
-    by_depth = _warp_all(compared, _sampled(target, 0, step), threads)
-    view = _sampled(replace(target, depth=depth, ground=ground, actors={}), top, step)
+    columns = slice(0, None, step)
+    by_depth = _warp_all(compared, target.window(columns, columns), threads)
+    view = replace(target, depth=depth, ground=ground, actors={})
+    view = view.window(slice(top, None, step), columns)
     by_ground = _warp_all(compared, view, threads)
     own = [image[top // step :] for image in by_depth]
     share = target.depth[top::step, ::step] / np.maximum(view.depth, NEAREST_M)
@@ -83,8 +85,8 @@ def carry(
         <= _disagreement(own[0], own[1], across)
         + np.where(about, NEAR_PREFERENCE, PREFERENCE) * across**2
     )
-    rows, columns = ground[top:].shape
-    agrees = agrees.repeat(step, axis=0)[:rows].repeat(step, axis=1)[:, :columns]
+    height, width = ground[top:].shape
+    agrees = agrees.repeat(step, axis=0)[:height].repeat(step, axis=1)[:, :width]
     ground[top:] &= agrees | (target.depth[top:] <= 0)
     chosen = _by_two(target, depth, ground)
     if step > 1:
@@ -97,18 +99,6 @@ def carry(
 def _by_two(target: WarpTarget, depth: F32, ground: Bool) -> WarpTarget:
     """Return a view that has the depth of the ground where ``ground`` says so."""
     return replace(target, depth=np.where(ground, depth, target.depth), ground=ground)
-
-
-def _sampled(target: WarpTarget, top: int, step: int) -> WarpTarget:
-    """Return every ``step``-th pixel of the rows of a view from ``top`` on, as a view."""
-    K = target.K.copy()
-    K[:2, 2] += (step - 1) / 2 - np.array([0, top])
-    K[:2] /= step
-    depth, ground = (
-        None if part is None else np.ascontiguousarray(part[top::step, ::step])
-        for part in (target.depth, target.ground)
-    )
-    return replace(target, K=K, depth=depth, ground=ground)
 
 
 def _warp_all(

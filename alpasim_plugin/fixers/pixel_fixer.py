@@ -80,10 +80,14 @@ def fix_frame(
     """Fix one frame; a large one as a smaller one, whose changes are then enlarged."""
     net, operations = generator.net, generator.operations
     scale = settings.scale_of(*given.rgb.shape[1:3])
-    alpha = None if given.alpha is None else given.alpha[..., None]
-    rgb, alpha, maps, references = (
+    rgb = operations.smaller(given.rgb, scale)
+    alpha, maps, references = (
         None if part is None else operations.smaller(part, scale)
-        for part in (given.rgb, alpha, given.maps, given.references)
+        for part in (
+            None if given.alpha is None else given.alpha[..., None],
+            given.maps,
+            given.references,
+        )
     )
     _, height, width, _ = rgb.shape
     state = PixelState(given.output, given.render, given.hidden, given.recorded)

@@ -58,13 +58,12 @@ class WarpTarget:
     ground: Bool | None = None
 
     def window(self, rows: slice, columns: slice) -> WarpTarget:
-        """Return a part of the view."""
-        K = self.K.copy()
-        K[:2, 2] -= columns.start, rows.start
-        depth, ground = (
-            None if part is None else np.ascontiguousarray(part[rows, columns])
-            for part in (self.depth, self.ground)
-        )
+        """Return a part of the view, all its pixels or, as the slices' step says, some."""
+        K, step = self.K.copy(), columns.step or 1
+        K[:2, 2] += (step - 1) / 2 - np.array([columns.start, rows.start])
+        K[:2] /= step
+        depth = np.ascontiguousarray(self.depth[rows, columns])
+        ground = None if self.ground is None else np.ascontiguousarray(self.ground[rows, columns])
         return replace(self, K=K, depth=depth, ground=ground)
 
     @cached_property
@@ -136,7 +135,7 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)  # type: ignore[assignment]
+    out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
     for other in recorded.others:
         hole = out[..., 3] == 0
         rows, columns = (np.flatnonzero(hole.any(axis=axis)) for axis in (1, 0))
