@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +26,9 @@ def cutter(camera: CameraSpec, view: View, device: torch.device) -> Cut:
     `learned_input.level_view`, on which the network was trained, on a card the same within two grey
     levels.
     """
-    make: Callable[..., Cut] = implementation(device, HostView, DeviceView)
-    return make(camera, view, device)
+    make: Any = implementation(device, HostView, DeviceView)
+    cut: Cut = make(camera, view, device)
+    return cut
 
 
 @dataclass(frozen=True, eq=False)

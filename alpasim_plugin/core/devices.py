@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor, device, dtype
 
 S = TypeVar("S")
-T = TypeVar("T")
 WARM_UP = 3  # calls before a function is recorded
 
 
@@ -49,21 +48,21 @@ def require_device(name: str) -> str:
     return f"cuda:{number}"
 
 
-def implementation(place: device | str, host: T, card: T) -> T:
+def implementation(place: device | str, host: Any, card: Any) -> Any:
     """Return what serves a device: the CPU's own or that of cards. Nobody else compares devices."""
     return host if str(place) == "cpu" else card
 
 
 def batched(
-    items: Sequence[S], key: Callable[[S], Hashable], make: Callable[[list[S]], Sequence[T]]
-) -> list[T]:
+    items: Sequence[S], key: Callable[[S], Hashable], make: Callable[[list[S]], Any]
+) -> list[Any]:
     """Return what a function makes of each item, in order; it is called once for all that share a
     key, such as their size.
     """
     groups: dict[Hashable, list[int]] = {}
     for index, item in enumerate(items):
         groups.setdefault(key(item), []).append(index)
-    made: dict[int, T] = {}
+    made: dict[int, Any] = {}
     for mine in groups.values():
         made |= zip(mine, make([items[index] for index in mine]), strict=True)
     return [made[index] for index in range(len(items))]

@@ -97,13 +97,13 @@ def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     """Return the recorded frames in views of one `size_of`, ``(V, K, H, W, 4)`` uint8; see
     `ground.carry`.
     """
-    depth = torch.stack([view.target.depth for view in views])  # type: ignore[arg-type]  # tensors here
+    depth = torch.stack([view.target.depth for view in views])  # type: ignore[misc]  # tensors here
     (height, width), size, lenses = size_of(views[0])
     rays, flat = _rays(depth[0]), depth.flatten(1)
     users = _users(views, depth.device)
     on_ground = _ground_depth(views, rays, flat, users)
     by_depth, by_ground = (
-        _filled(part, lenses).unflatten(2, (height, width))
+        _filled(part, lenses).reshape(len(views), -1, height, width, 4)
         for part in (
             _warp(views, "depth", rays, flat, users, np.inf),
             _warp(views, "hidden", rays, on_ground, None, FREE_SHARE),
@@ -129,7 +129,7 @@ def _filled(parts: Tensor, lenses: Sequence[int]) -> Tensor:
     ``(V, N, P, 4)``.
     """
     out = []
-    for lens in parts.split(list(lenses), dim=1):
+    for lens in torch.split(parts, list(lenses), dim=1):
         image, *others = lens.unbind(1)
         for other in others:
             image = torch.where(image[..., 3:] == 0, other, image)
@@ -210,7 +210,7 @@ def _warp(
         inside = (local >= users.walls[:, i, 0]) & (local < users.walls[:, i, 1])
         inside = inside.all(dim=1, keepdim=True) & (depth > 0)[:, None]
         there = torch.where(inside, _turned(users.then[:, i], local), there)
-    u, v, w = there.unflatten(1, (-1, 3)).flatten(0, 1).unbind(1)
+    u, v, w = there.reshape(-1, 3, there.shape[2]).unbind(1)
     u, v = u / w, v / w
     images = [image for view in views for image in view.pinholes]
     surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
@@ -232,7 +232,7 @@ def _warp(
     )
     levels = (found[:, :, 0].mT + 0.5).clamp(0, 255)
     out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
-    return out.unflatten(0, (len(views), -1))
+    return out.view(len(views), -1, *out.shape[1:])
 
 
 def _stacked(images: Sequence[Tensor]) -> Tensor:

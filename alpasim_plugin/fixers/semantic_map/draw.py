@@ -115,13 +115,16 @@ View = tuple[CameraSpec, F64, Sequence[ActorBox], slice]  # its pose, road users
 
 
 def _on_host(threads: int | None, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
-    return [draw_map(scene, *seen, threads=threads, rows=rows) for *seen, rows in views]
+    return [
+        draw_map(scene, camera, T, actors, threads=threads, rows=rows)
+        for camera, T, actors, rows in views
+    ]
 
 
 def _on_card(device: Any, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
     from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles, size_of
 
-    seen = [(*seen_from(scene, *view), rows) for *view, rows in views]
+    seen = [(*seen_from(scene, camera, T, actors), rows) for camera, T, actors, rows in views]
     return batched(seen, size_of, partial(draw_tiles, scene, device))
 
 

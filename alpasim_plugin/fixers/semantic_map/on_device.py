@@ -115,7 +115,7 @@ def _rows(part: Segments | Triangles) -> F64:
 
 def _seen_at(points: Tensor, cameras: Tensor) -> Tensor:
     """Return points of the scene ``(V, N, K, 3)`` as pixels times depth, and depth."""
-    pose = cameras[:, None, :12].unflatten(2, (3, 4))
+    pose = cameras[:, None, :12].reshape(-1, 1, 3, 4)
     fx, skew, fy, cx, cy = cameras[:, 12:17, None, None].unbind(1)
     x, y, z = (points @ pose[..., :3].mT + pose[..., None, :, 3]).unbind(-1)
     return torch.stack([fx * x + skew * y + cx * z, fy * y + cy * z, z], dim=-1)
@@ -130,8 +130,8 @@ def _strokes(rows: Tensor, cameras: Tensor) -> Tensor:
             a stroke is as wide as it is high, and the first row.
     """
     size, pixels, scale = torch.split(cameras[:, None, 17:22], [2, 1, 2], dim=2)
-    ends, style = _seen_at(rows[..., :6].unflatten(2, (2, 3)), cameras), rows[..., 6:]
-    begin, end = ends.split(1, dim=2)
+    ends, style = _seen_at(rows[..., :6].reshape(*rows.shape[:2], 2, 3), cameras), rows[..., 6:]
+    begin, end = torch.split(ends, 1, dim=2)
     depth = ends[..., 2:]
     # Where a segment meets the near plane; beyond the far one the kernel draws nothing of it.
     met = begin + (NEAR_M - begin[..., 2:]) / (end - begin)[..., 2:] * (end - begin)
@@ -169,7 +169,7 @@ def _shapes(rows: Tensor, cameras: Tensor) -> Tensor:
     `_strokes`. Of a triangle that crosses the near plane the kernel draws what lies beyond.
     """
     corners, closed, shade, style = torch.split(rows, [9, 1, 3, 7], dim=2)
-    seen_at = _seen_at(corners.unflatten(2, (3, 3)), cameras)
+    seen_at = _seen_at(corners.reshape(*rows.shape[:2], 3, 3), cameras)
     planes = torch.linalg.cross(seen_at.roll(-1, 2), seen_at.roll(-2, 2))
     volume = (planes * seen_at)[:, :, :1].sum(3)  # negative where the front is seen
     planes = planes / volume[..., None]  # each 1/depth in a corner, and 0 on the opposite edge

@@ -20,7 +20,7 @@ sky), which is what the paper's opacity-mixed source needs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -215,7 +215,8 @@ class SceneGraph:
             for camera, poses in views
         ]
         one_by_one = partial(map, partial(self._draw_on_host, threads))
-        draw = implementation(device, one_by_one, partial(self._draw_on_card, device))
+        on_card = partial(self._draw_on_card, device)
+        draw: Callable[..., Iterable[RasterOutput]] = implementation(device, one_by_one, on_card)
         return list(draw(chosen))
 
     def _draw_on_host(
@@ -241,7 +242,13 @@ class SceneGraph:
 
         clouds, place = self._upload(device)
         placed = [
-            (camera, [DrawnCloud(place[one.name, level], *pose) for one, level, *pose in chosen])
+            (
+                camera,
+                [
+                    DrawnCloud(place[node.name, level], T, antialiased)
+                    for node, level, T, antialiased in chosen
+                ],
+            )
             for camera, chosen in views
         ]
 
