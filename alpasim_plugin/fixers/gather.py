@@ -23,6 +23,7 @@ from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
     DETAIL,
+    FINER_PX,
     HALF,
     NOWHERE,
     BlendHeads,
@@ -107,14 +108,15 @@ def blend(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tens
     """Return the same as `network.reference_blend.blend`, of references as bytes."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
     whole = _array(repaired), *_sources(references, heads), out.numpy(), recorded.numpy()
+    none = np.empty((0, 0, 0), np.float32)
     for image, pixels, weight, offset_px, correction, *made in zip(*whole, strict=True):
-        _blend(image, pixels, weight, offset_px, correction, 1, 0, *made)
+        _blend(image, pixels, weight, offset_px, correction, none, 1, 0, *made)
     return out, recorded
 
 
 def _sources(references: Tensor, heads: BlendHeads) -> tuple[np.ndarray, ...]:
     """Return references as one number a pixel, its first channel the lowest byte, and the heads."""
-    return _array(references).view(np.uint32)[..., 0], *(_array(part) for part in heads)
+    return _array(references).view(np.uint32)[..., 0], *(_array(part) for part in heads[:3])
 
 
 def enlarge(
@@ -130,21 +132,24 @@ def enlarge(
     height, width = rgb.shape[1:3]
     out = torch.empty_like(rgb)
     renders, changes, levels = _array(rgb), _array(change), out.numpy()
-    sources = None
+    sources = finer = None
     if references is not None and heads is not None:
         sources = _sources(references, heads)
+        if heads.finer is not None:
+            finer = _array(heads.finer.permute(0, 2, 3, 1))
 
     def enlarge_band(at: tuple[int, int]) -> None:
         b, first = at
         band = slice(first, min(first + BAND * scale, height))
-        above = max(first // scale - 1, 0)
-        around = changes[b, above : first // scale + BAND + 1]
-        added = cv2.resize(around, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-        added = added[first - above * scale :][: band.stop - first, :width]
+        added = _enlarged_rows(changes[b], scale, band)[:, :width]
         image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
         if sources is not None:
             mixed, recorded = np.empty_like(image), np.empty_like(image[..., :1])
-            _blend(image, *(part[b] for part in sources), scale, first, mixed, recorded)
+            of_image = (part[b] for part in sources)
+            more = np.empty((0, 0, 0), np.float32)
+            if finer is not None:
+                more = _enlarged_rows(finer[b], FINER_PX, band)
+            _blend(image, *of_image, more, scale, first, mixed, recorded)
             image = mixed
         levels[b, band] = cv2.addWeighted(image, HALF, image, 0, HALF, dtype=cv2.CV_8U)
 
@@ -153,13 +158,27 @@ def enlarge(
     return out
 
 
+def _enlarged_rows(coarse: np.ndarray, side: int, rows: slice) -> np.ndarray:
+    """Return some rows ``(n, W, C)`` of an image whose cells of ``side`` pixels have the values
+    ``(h, w, C)``, interpolated bilinearly.
+    """
+    above = max(rows.start // side - 1, 0)
+    around = coarse[above : -(-rows.stop // side) + 1]
+    out = cv2.resize(around, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)
+    own = out[rows.start - above * side :][: rows.stop - rows.start]
+    return own.reshape(*own.shape[:2], -1)
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _blend(repaired, references, weight, offset_px, correction, scale, first_row, out, recorded):
+def _blend(
+    repaired, references, weight, offset_px, correction, finer, scale, first_row, out, recorded
+):
     """Blend a row at a time: where each pixel is looked up, what is found there, its share; channel
     by channel, so that rows are vectors.
 
     What the heads say is ``scale`` times coarser than the image, offsets twice that, and is
-    interpolated between the middles. ``repaired`` holds the rows from ``first_row`` on.
+    interpolated between the middles. ``repaired`` holds the rows from ``first_row`` on, and
+    ``finer``, of shape ``(n, W, K)``, what is added to the logarithms there; it may be empty.
     """
     count, height, width = references.shape
     cells_down, cells_across = weight.shape[1:3]
@@ -242,7 +261,8 @@ def _blend(repaired, references, weight, offset_px, correction, scale, first_row
                     _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
             upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
             for x in range(width):
-                logarithm = min(upper[3, x] + fy[y] * (lower[3, x] - upper[3, x]), largest)
+                logarithm = upper[3, x] + fy[y] * (lower[3, x] - upper[3, x])
+                logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
                 share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
                 total[x] += share[x]
             for c in range(3):

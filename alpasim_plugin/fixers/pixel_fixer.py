@@ -32,7 +32,7 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     content_key,
     noise_key,
 )
-from alpasim_plugin.fixers.network.reference_blend import HALF, enlarged, in_bytes
+from alpasim_plugin.fixers.network.reference_blend import FINER_PX, HALF, enlarged, in_bytes
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -45,6 +45,8 @@ from alpasim_plugin.fixers.views import (
     planes_of,
     stacked,
 )
+
+FINER_FROM = 4  # how many times smaller an image is seen, at least, where it is weighed anew
 
 
 class GivenFrame(NamedTuple):
@@ -127,7 +129,11 @@ def fix_frame(
     measured = guard.measures(video[visible], levels, rgb, *before)
     sums = trust_sums(output, after.render[visible], after.recorded[visible])
     if scale > 1:
-        levels = operations.enlarge(given.rgb, change, given.references, repaired.heads, scale)
+        heads = repaired.heads
+        if heads is not None and net.finer is not None and scale >= FINER_FROM:
+            parts = (operations.smaller(part, FINER_PX) for part in (given.rgb, given.references))
+            heads = heads._replace(finer=net.finer(*parts, change, heads.weight, scale))
+        levels = operations.enlarge(given.rgb, change, given.references, heads, scale)
     return FixedFrame(levels, measured, sums, *after)
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from alpasim_plugin.fixers.gather import CPU
+from alpasim_plugin.fixers.network.finer_weights import FinerWeights
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.network.reference_blend import (
     BlendHeads,
@@ -57,6 +58,27 @@ def test_the_order_of_references_does_not_matter():
     one, _ = call(net, render, opacity, sdmap, images)
     other, _ = call(net, render, opacity, sdmap, images[:, [2, 0, 3, 1]])
     assert torch.allclose(one, other, atol=1e-5)
+
+
+def test_finer_weights_follow_the_order_of_references_and_begin_as_none():
+    draw = torch.Generator().manual_seed(0)
+    net = FinerWeights(8).requires_grad_(False)
+    rgb, images = (
+        torch.randint(0, 256, shape, dtype=torch.uint8, generator=draw)
+        for shape in ((2, HEIGHT, WIDTH, 3), (2, 3, HEIGHT, WIDTH, 4))
+    )
+    change = torch.zeros(2, 32, 48, 3)
+    weight = torch.randn(2, 3, 16, 24, 4, generator=draw)
+    assert not net(rgb, images, change, weight, 6).any()
+    for parameter in net.parameters():
+        parameter.add_(0.2 * torch.randn(parameter.shape, generator=draw))
+    order = [2, 0, 1]
+    added = net(rgb, images, change, weight, 6)
+    other = net(rgb, images[:, order], change, weight[:, order], 6)
+    assert added.shape == (2, 3, HEIGHT, WIDTH)
+    assert torch.allclose(added[:, order], other, atol=1e-5)
+    alone = net(rgb, images[:, :1], change, weight[:, :1], 6)
+    assert not torch.allclose(alone, added[:, :1], atol=1e-2)
 
 
 @pytest.mark.parametrize(("batch", "references"), [(1, 0), (1, 1), (2, 3)])

@@ -29,6 +29,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import F32, I64, U8
 from alpasim_plugin.fixers.network.checkpoints import load_checked
+from alpasim_plugin.fixers.network.finer_weights import FinerWeights
 from alpasim_plugin.fixers.network.pixel_layers import (
     Conv3,
     Downsample,
@@ -179,6 +180,8 @@ class PixelSizes:
         hidden: Recurrent channels at 1/4; 0: none.
         blend: Channels of the head that blends references with the image (`reference_blend`); 0:
             references are not read.
+        finer: Channels by which they are weighed in large images (`finer_weights`); 0: they are
+            weighed in the smaller image alone.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)
@@ -186,6 +189,7 @@ class PixelSizes:
     detail: int = 16
     hidden: int = 16
     blend: int = 0
+    finer: int = 0
 
 
 class PixelState(NamedTuple):
@@ -246,6 +250,7 @@ class PixelGenerator(nn.Module):
         self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
         repeat_per_pixel(self.write, DETAIL)
         self.blend = ReferenceBlend(at4, sizes.detail, sizes.blend) if sizes.blend else None
+        self.finer = FinerWeights(sizes.finer) if sizes.finer else None
         nn.init.zeros_(self.time.weight)
 
     @classmethod
@@ -391,4 +396,5 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
         width("refine.weight"),
         width("remember.weight") if "remember.weight" in tensors else 0,
         width("blend.head.weight") if "blend.head.weight" in tensors else 0,
+        width("finer.first.weight") if "finer.first.weight" in tensors else 0,
     )

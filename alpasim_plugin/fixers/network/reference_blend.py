@@ -38,6 +38,7 @@ from alpasim_plugin.fixers.network.pixel_layers import (
 )
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+FINER_PX = 4  # pixels of the side of a cell in which large images are weighed
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 # of a reference: colour minus that of the render where the reference holds, and where it holds
 CHANNELS = 4
@@ -70,6 +71,8 @@ class BlendHeads(NamedTuple):
     offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
     # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
     correction: Tensor
+    # (B, K, H / 4, W / 4) what is added to the logarithms, of a large image; see `finer_weights`
+    finer: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -228,7 +231,7 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
         scale: How many times.
     """
     b, k, h, w, _ = references.shape
-    weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
+    weight, offset_px, correction = (part.flatten(0, 1) for part in heads[:3])
     weight, correction = (
         larger(pixels(part, DETAIL).to(repaired.dtype), scale)[:, :h, :w]
         for part in (weight, correction)
@@ -236,6 +239,8 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     moved = _sampled(references.flatten(0, 1), scale * offset_px, scale * DETAIL)
     colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
+    if heads.finer is not None:
+        weight = weight + larger(heads.finer.flatten(0, 1)[..., None], FINER_PX)[:, :h, :w]
     logit = (weight + holds.log()).view(b, k, h, w, 1)
     own = torch.zeros_like(logit[:, :1])
     return Sources(
