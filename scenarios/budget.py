@@ -3,8 +3,7 @@
 `check_record` looks at what a reader returned, `check_scenario` at the finished scenario. Ranges of
 single quantities are in `alpasim_plugin.core.limits`.
 
-The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km
-(docs/runs.md): ground and kerbs by the drive's length, trees and walls by the surroundings, and for
+The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km: ground and kerbs by the drive's length, trees and walls by the surroundings, and for
 sharp cameras lane markings, kerbs and road users once more for every halving of their cells.
 """
 

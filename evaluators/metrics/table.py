@@ -181,7 +181,7 @@ class MetricTable(Mapping[str, MetricInfo]):
             other: The other run's table.
             names: The metrics that are compared: unit, better side and reduction must agree. What
                 is said about them need not.
-            doing, who: For the error.
+            who: For the error.
 
         Raises:
             InputError: A metric is not the same quantity in both.

@@ -164,7 +164,7 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
         path = LIBRARY / f"{path_or_name}.yaml"
     if not os.path.isfile(path):
         raise InputError(
-            f"{path_or_name}: no such file",
+            f"{path_or_name}: {'a folder, not a file' if os.path.isdir(path_or_name) else 'no such file'}",
             f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",
         )
     document = load_yaml(path)
