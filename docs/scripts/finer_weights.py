@@ -1,8 +1,8 @@
 """Train how references are weighed in large images (`alpasim_plugin.fixers.network.finer_weights`).
 
-    python docs/scripts/finer_weights.py pairs FOLDER            # two to four CPU minutes a scene
-    python docs/scripts/finer_weights.py train FOLDER head.pt
-    python docs/scripts/finer_weights.py add head.pt onefixer.safetensors out.safetensors
+python docs/scripts/finer_weights.py pairs FOLDER            # two to four CPU minutes a scene
+python docs/scripts/finer_weights.py train FOLDER head.pt
+python docs/scripts/finer_weights.py add head.pt onefixer.safetensors out.safetensors
 """
 
 from __future__ import annotations
@@ -158,7 +158,9 @@ def train(folder, out):
             optimiser.step()
             schedule.step()
         gain = np.array(decibels()) - before
-        print(f"{epoch}: val {before.mean():.2f} dB, {np.percentile(gain, [0, 50, 100])}", flush=True)
+        print(
+            f"{epoch}: val {before.mean():.2f} dB, {np.percentile(gain, [0, 50, 100])}", flush=True
+        )
     torch.save(net.state_dict(), out)
 
 
