@@ -40,6 +40,11 @@ class PixelSizesSettings(Part):
         ge=0,
         description="Channels of the head that blends references with the image; 0: none are read.",
     )
+    finer: int = Field(
+        default=0,
+        ge=0,
+        description="Channels by which references are weighed once more in large images; 0: they are not.",
+    )
 
 
 USUAL_PX = 256 * 144  # of most images of the training

@@ -110,8 +110,8 @@ def train_per_frame(
 
 
 def initial_generator(run: PixelRun) -> PixelGenerator:
-    """Return the network that a run begins with: a bundle may lack the blending head or have fewer
-    residual blocks than the settings.
+    """Return the network that a run begins with: a bundle may lack the heads for references or have
+    fewer residual blocks than the settings.
 
     What it lacks is untrained; a block that it lacks leaves its input as it is.
 
@@ -133,7 +133,9 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
         )
     own = net.state_dict()
     lacking = {
-        key for key in own.keys() - tensors.keys() if key.startswith("blend.") or BLOCK.match(key)
+        key
+        for key in own.keys() - tensors.keys()
+        if key.startswith(("blend.", "finer.")) or BLOCK.match(key)
     }
     wrong = sorted(
         key
