@@ -12,7 +12,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import wrap_angle
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Scenario
+from alpasim_plugin.core.types import F64, U8, CameraSpec, Scenario
 from policies.base import front_camera
 
 Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
@@ -23,9 +23,7 @@ AHEAD_M, NOW_M = 40.0, 6.0
 
 SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther apart
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
-MEAN, STD = 115.0, 64.0  # grey levels
 _RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
@@ -154,11 +152,3 @@ def sampled_at(camera: CameraSpec, view: View, yaw_rad: float = 0.0) -> tuple[tu
     # Pixel centres lie at halves.
     centre = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     return smaller, np.linalg.inv(centre) @ scale @ centre @ to_camera
-
-
-def network_input(now: U8, before: U8) -> F32:
-    """Return the network's input ``(4, H, W)`` from a view now and before, ``(H, W, 3)``."""
-    out = np.empty((CHANNELS, *now.shape[:2]), np.float32)
-    out[:3] = now.transpose(2, 0, 1)
-    out[3] = before.astype(np.float32) @ GREY
-    return (out - np.float32(MEAN)) / np.float32(STD)

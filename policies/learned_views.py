@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.devices import implementation, upload
-from alpasim_plugin.core.types import F32, CameraSpec
-from policies.learned_input import GREY, MEAN, STD, View, level_view, sampled_at
+from alpasim_plugin.core.types import F32, U8, CameraSpec
+from policies.learned_input import View, level_view, sampled_at
 
 PARTS = 32  # of a pixel, between which OpenCV interpolates
+MEAN, STD = 115.0, 64.0  # grey levels
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 Cut = Callable[[Tensor], Tensor]  # a view of an image (H, W, 3) uint8: whole levels (3, h, w)
@@ -26,23 +26,17 @@ def cutter(camera: CameraSpec, view: View, device: torch.device) -> Cut:
     `learned_input.level_view`, on which the network was trained, on a card the same within two grey
     levels.
     """
-    make: Any = implementation(device, HostView, DeviceView)
-    cut: Cut = make(camera, view, device)
+    cut: Cut = implementation(device, _host_view, DeviceView)(camera, view, device)
     return cut
 
 
-@dataclass(frozen=True, eq=False)
-class HostView:
-    """A level view that is cut from a camera's images on the CPU; see `cutter`."""
+def _host_view(camera: CameraSpec, view: View, _: torch.device) -> Cut:
+    return lambda image: in_planes(level_view(image.numpy(), camera, view=view))
 
-    camera: CameraSpec
-    view: View
-    device: torch.device
 
-    def __call__(self, image: Tensor) -> Tensor:
-        """Cut the view."""
-        shown = level_view(image.numpy(), self.camera, view=self.view)
-        return torch.from_numpy(shown).permute(2, 0, 1).float()
+def in_planes(levels: U8) -> Tensor:
+    """Return an image ``(h, w, 3)`` as whole levels ``(3, h, w)``."""
+    return torch.from_numpy(levels).permute(2, 0, 1).float()
 
 
 class DeviceView:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -70,10 +69,8 @@ def batched(
 
 def facts_of(place: str) -> dict[str, Any]:
     """Return a card's name, memory, compute capability and version of CUDA; nothing of the CPU."""
-    return implementation(place, dict[str, Any], partial(_card_facts, place))()
-
-
-def _card_facts(place: str) -> dict[str, Any]:
+    if implementation(place, True, False):
+        return {}
     import torch
 
     properties = torch.cuda.get_device_properties(place)
@@ -91,21 +88,6 @@ def autocast(place: device, dtype: dtype | None = None) -> AbstractContextManage
 
     kind = place.type.replace("meta", "cpu")  # nothing is rounded where nothing is computed
     return torch.autocast(kind, dtype or torch.bfloat16, enabled=dtype is not None)
-
-
-def join_ranks(place: device) -> tuple[int, int]:
-    """Join the processes that torchrun started, by NCCL on cards and by gloo on CPUs; return this
-    one's number and their count.
-    """
-    if "WORLD_SIZE" not in os.environ:
-        return 0, 1
-    from torch import distributed
-
-    if not distributed.is_initialized():
-        backend = implementation(place, "gloo", "nccl")
-        own: device | None = implementation(place, None, place)
-        distributed.init_process_group(backend, device_id=own)
-    return distributed.get_rank(), distributed.get_world_size()
 
 
 def share_card(device: str, workers: int) -> None:
@@ -126,25 +108,6 @@ def upload(array: npt.ArrayLike | Tensor, place: device | str) -> Tensor:
     if str(place).startswith("cuda") and tensor.device.type == "cpu":
         tensor = tensor.pin_memory()
     return tensor.to(place, non_blocking=True)
-
-
-def side_stream(place: device) -> Callable[[], AbstractContextManager[None]]:
-    """Return what makes contexts in which tensors are sent to a card beside what it computes; what
-    it computes afterwards waits for them. Hold them until the host has waited for the card.
-    """
-    if implementation(place, True, False):
-        return nullcontext
-    import torch
-
-    stream = torch.cuda.Stream(place)  # type: ignore[no-untyped-call]
-
-    @contextmanager
-    def beside() -> Iterator[None]:
-        with torch.cuda.stream(stream):
-            yield
-        torch.cuda.current_stream(place).wait_stream(stream)
-
-    return beside
 
 
 def download(*parts: Tensor) -> list[Any]:

@@ -71,7 +71,7 @@ def measure(
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
     present = {name: T for name, T in view.actors.items() if name in graph.actors}
     out = graph.render(view.camera, present)
-    shown = replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0)).to_uint8()
+    shown = out.exposed(gain).to_uint8()
     return Comparison(view.name, shown, view.rgb, psnr_db(shown, view.rgb), ssim(shown, view.rgb))
 
 

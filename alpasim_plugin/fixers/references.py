@@ -14,9 +14,9 @@ own future is looked at.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -40,9 +40,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import planes_of
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
 from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
-
-if TYPE_CHECKING:
-    from alpasim_plugin.fixers.device_carry import UploadedImage
 
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
 KEPT_FRAMES, KEPT_INSTANTS = 24, 4
@@ -123,6 +120,10 @@ class ReferenceIndex:
         return tuple(int(i) for i in order if usable[i])
 
 
+View = tuple[RenderRequest, Sequence[Any], F64]  # its recorded frames, and a rig's pose near by
+Placed = tuple[Sequence[Any], WarpTarget, F64]  # the same with a window of the view
+
+
 class Window(NamedTuple):
     """Rows of a view, and of what is carried into them its own part."""
 
@@ -182,27 +183,39 @@ class ReferenceSession:
             on_device: Whether those of frames that a device drew may stay there.
         """
         drawn = planes_of(frames) if on_device else []
-        if len(drawn) == len(frames):
-            carried = self._on_device(requests, drawn)
-            return [
-                frame.changed(on_device=planes)
-                for frame, planes in zip(frames, carried, strict=True)
-            ]
-        chosen = [
-            ((), np.eye(4)) if frame.depth is None else self._choose(request)
-            for request, frame in zip(requests, frames, strict=True)
-        ]
+        stays = len(drawn) == len(frames)
+        chosen = [self._choose(request) for request in requests]
         recorded = self._recorded_images([i for mine, _ in chosen for i in mine])
-        threads = max(1, self.threads // len(frames))
+        images: Mapping[int, Any] = recorded
+        if stays:
+            import torch
+
+            from alpasim_plugin.fixers.device_carry import upload_image
+
+            images = self._uploaded
+            for i in recorded.keys() - images.keys():
+                self._uploaded[i] = upload_image(recorded[i], drawn[0].rgb.device)
+        views = [
+            (request, self._whole_lenses(mine, images), T_world_rig)
+            for request, (mine, T_world_rig) in zip(requests, chosen, strict=True)
+        ]
+        carry_all = _carry_on_device if stays else self._carry_on_host
+        carried = self._carried(views, drawn if stays else frames, carry_all)
+        if not stays:
+            return [
+                frame.changed(references=mine) for frame, mine in zip(frames, carried, strict=True)
+            ]
 
         def with_references(index: int) -> Frame:
-            request, frame, (mine, T_world_rig) = requests[index], frames[index], chosen[index]
-            images = self._whole_lenses(mine, recorded)
-            windows = self._windows(request, frame.depth) if images else []
-            parts = [carry(images, window.target, T_world_rig, threads) for window in windows]
-            return frame.changed(references=_whole(request, windows, parts))
+            def references(planes: DevicePlanes) -> Mapping[str, Any]:
+                mine = carried[index]
+                if planes is not drawn[index]:  # drawn again
+                    (mine,) = self._carried([views[index]], [planes], carry_all)
+                return {"references": torch.stack(list(mine)) if mine else None}
 
-        return map_on_threads(self.threads, with_references, range(len(frames)))
+            return frames[index].changed(on_device=drawn[index].changed(references))
+
+        return [with_references(index) for index in range(len(frames))]
 
     def _windows(self, request: RenderRequest, depth: Any) -> list[Window]:
         """Return the windows of a view ``(H, W)`` into which recorded frames are carried."""
@@ -219,57 +232,28 @@ class ReferenceSession:
             windows.append(Window(band, target, own))
         return windows
 
-    def _on_device(
-        self, requests: Sequence[RenderRequest], drawn: Sequence[DevicePlanes]
-    ) -> list[DevicePlanes]:
-        """Return the planes of rendered frames with their references, all on their device."""
-        from alpasim_plugin.fixers.device_carry import upload_image
-
-        views = []
-        for request, planes in zip(requests, drawn, strict=True):
-            chosen, T_world_rig = self._choose(request)
-            for i, recorded in self._recorded_images(chosen).items():
-                if i not in self._uploaded:
-                    self._uploaded[i] = upload_image(recorded, planes.rgb.device)
-            images = self._whole_lenses(chosen, self._uploaded)
-            views.append((request, images, T_world_rig))
-        carried = self._carried(views, drawn)
-
-        def changed(index: int) -> DevicePlanes:
-            def references(planes: DevicePlanes) -> Mapping[str, Any]:
-                if planes is drawn[index]:
-                    return {"references": carried[index]}
-                return {"references": self._carried([views[index]], [planes])[0]}
-
-            return drawn[index].changed(references)
-
-        return [changed(index) for index in range(len(drawn))]
-
     def _carried(
-        self,
-        views: Sequence[tuple[RenderRequest, Sequence[UploadedImage], F64]],
-        drawn: Sequence[DevicePlanes],
-    ) -> list[Any]:
-        """Return the recorded frames in each view ``(K, H, W, 4)``, None where there are none."""
-        import torch
-
-        from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, size_of
-
+        self, views: Sequence[View], shown: Sequence[Any], carry_all: Callable[[Any], Any]
+    ) -> list[tuple[Any, ...]]:
+        """Return the recorded frames in each view ``(H, W, 4)``; none without depth."""
         cuts = [
-            self._windows(request, planes.depth) if images else []
-            for (request, images, _), planes in zip(views, drawn, strict=True)
+            self._windows(request, one.depth) if images and one.depth is not None else []
+            for (request, images, _), one in zip(views, shown, strict=True)
         ]
         placed = [
-            CarriedView(images, window.target, T_world_rig)
+            (images, window.target, T_world_rig)
             for (_, images, T_world_rig), windows in zip(views, cuts, strict=True)
             for window in windows
         ]
-        parts = iter(batched(placed, size_of, carry_on_device))
-        out = []
-        for (request, *_), windows in zip(views, cuts, strict=True):
-            images = _whole(request, windows, [next(parts) for _ in windows])
-            out.append(torch.stack(images) if images else None)
-        return out
+        parts = iter(carry_all(placed))
+        return [
+            _whole(request, windows, [next(parts) for _ in windows])
+            for (request, *_), windows in zip(views, cuts, strict=True)
+        ]
+
+    def _carry_on_host(self, placed: Sequence[Placed]) -> list[Any]:
+        threads = max(1, self.threads // max(1, len(placed)))
+        return map_on_threads(self.threads, lambda view: carry(*view, threads), placed)
 
     def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""
@@ -308,6 +292,12 @@ class ReferenceSession:
             dropped, _ = self._recorded.popitem(last=False)
             self._uploaded.pop(dropped, None)
         return out
+
+
+def _carry_on_device(placed: Sequence[Placed]) -> list[Any]:
+    from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, size_of
+
+    return batched([CarriedView(*view) for view in placed], size_of, carry_on_device)
 
 
 def _whole(

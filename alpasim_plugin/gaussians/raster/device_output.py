@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, Self, cast
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from alpasim_plugin.core.devices import download, upload
-from alpasim_plugin.core.types import F32, Bool, DevicePlanes, Frame
-from alpasim_plugin.gaussians.raster.output import OPAQUE, RasterOutput
+from alpasim_plugin.core.types import Bool, DevicePlanes, FloatArray, Frame
+from alpasim_plugin.gaussians.raster.output import RasterOutput
 
 PLANES = ("rgb", "alpha", "depth")
 
@@ -70,38 +69,15 @@ class DeviceOutput(RasterOutput):
             again=lambda: again()[0],
         )
 
-    def surface(self) -> DeviceOutput:
-        """See `RasterOutput.surface`."""
-        return self.changed(lambda out: {"depth": out.depth * (out.alpha >= OPAQUE)})
-
-    def covered(self, share: F32) -> DeviceOutput:
-        """See `RasterOutput.covered`."""
-        cover = upload(share, self.alpha.device)
-        return self.changed(lambda out: {"alpha": torch.maximum(out.alpha, cover)})
-
-    def with_sky(self, above: Bool) -> DeviceOutput:
-        """See `RasterOutput.with_sky`."""
-        high = upload(above, self.alpha.device)
-
-        def change(out: DeviceOutput) -> Mapping[str, Tensor]:
-            sky = (out.alpha < OPAQUE) & high
-            return {
-                "alpha": out.alpha.masked_fill(sky, 1.0),
-                "depth": out.depth.masked_fill(sky, 0.0),
-            }
-
-        return self.changed(change)
-
-    def exposed(self, gain: F32) -> DeviceOutput:
-        """See `RasterOutput.exposed`."""
-        factor = upload(gain.astype(np.float32), self.alpha.device)
-        return self.changed(lambda out: {"rgb": (out.rgb * factor).clamp(0, 1)})
+    def beside(self, array: FloatArray | Bool) -> Tensor:
+        """Return an array as a tensor of the device."""
+        return upload(array, self.alpha.device)
 
     def frame(self, t_us: int, camera: str) -> Frame:
         """Return the view as a camera's frame, whose planes stay on the device."""
         shown = self.changed(lambda out: {"rgb": (out.rgb * 255 + 0.5).to(torch.uint8)})
         return Frame(t_us, camera, on_device=cast(DevicePlanes, shown))
 
-    def changed(self, change: Callable[[DeviceOutput], Mapping[str, Any]]) -> DeviceOutput:
+    def changed(self, change: Callable[[Any], Mapping[str, Any]]) -> Self:
         """Return the view with other planes, which it also has when it is drawn again."""
         return replace(self, **change(self), again=lambda: self.again().changed(change))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
-import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
@@ -55,35 +55,47 @@ class RasterOutput:
         rgb, alpha = np.zeros((height, width, 3), np.float32), np.ones((height, width), np.float32)
         return RasterOutput(rgb, alpha, np.zeros_like(alpha))
 
-    def surface(self) -> RasterOutput:
+    def beside(self, array: FloatArray | Bool) -> Any:
+        """Return an array where the planes are."""
+        return array
+
+    def changed(self, change: Callable[[Any], Mapping[str, Any]]) -> Self:
+        """Return the view with other planes."""
+        return replace(self, **change(self))
+
+    def surface(self) -> Self:
         """Return the view with depth only where the splats are at least half opaque; 0 where the
         background shows through.
         """
-        shown = cv2.compare(self.alpha, OPAQUE, cv2.CMP_GE)
-        return replace(self, depth=cv2.copyTo(self.depth, shown))
+        return self.changed(lambda out: {"depth": out.depth * (out.alpha >= OPAQUE)})
 
-    def covered(self, share: F32) -> RasterOutput:
+    def covered(self, share: F32) -> Self:
         """Return the view with an opacity of at least ``share``, ``(H, W)`` or one number."""
-        return replace(self, alpha=np.maximum(self.alpha, share))
+        least = self.beside(share)
+        return self.changed(lambda out: {"alpha": out.alpha.clip(least)})
 
-    def with_sky(self, above: Bool) -> RasterOutput:
+    def with_sky(self, above: Bool) -> Self:
         """Return the view with an opaque sky without depth where no surface is shown.
 
         Args:
             above: ``(H, W)`` the pixels above the horizon.
         """
-        sky = (self.alpha < OPAQUE) & above
-        alpha = np.where(sky, np.float32(1), self.alpha)
-        return replace(self, alpha=alpha, depth=np.where(sky, np.float32(0), self.depth))
+        high = self.beside(above)
+
+        def change(out: Any) -> Mapping[str, Any]:
+            sky = (out.alpha < OPAQUE) & high
+            return {"alpha": out.alpha.clip(sky), "depth": out.depth * ~sky}
+
+        return self.changed(change)
+
+    def exposed(self, gain: F32) -> Self:
+        """Return the view with another exposure, a factor ``(3,)`` for the channels."""
+        factor = self.beside(gain)
+        return self.changed(lambda out: {"rgb": (out.rgb * factor).clip(0, 1)})
 
     def frame(self, t_us: int, camera: str) -> Frame:
         """Return the view as a camera's frame."""
         return Frame(t_us, camera, self.to_uint8(), self.alpha, self.depth)
-
-    def exposed(self, gain: F32) -> RasterOutput:
-        """Return the view with another exposure, a factor ``(3,)`` for the channels."""
-        shown = np.clip(self.rgb * gain, 0.0, 1.0)
-        return replace(self, rgb=np.asarray(shown, np.float32))
 
     def to_uint8(self) -> U8:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""

@@ -18,7 +18,7 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstrations_digest
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M
 from alpasim_plugin.lab.training.trainer import Loss
-from policies.learned_input import FRONT, level_view, network_input
+from policies.learned_input import FRONT, level_view
 from policies.learned_net import (
     GRID_M,
     KNOTS_M,
@@ -27,6 +27,7 @@ from policies.learned_net import (
     LearnedNet,
     knot_weights,
 )
+from policies.learned_views import in_planes, network_input
 
 SIGMA_KNOT = KNOTS_M.index(16.0)
 
@@ -116,7 +117,7 @@ class PolicyTask:
         rows = [self._sample(int(number), random) for number in which]
         images = zip(*(views for views, *_ in rows), strict=True)
         return PolicyBatch(
-            tuple(torch.from_numpy(np.stack(view)) for view in images),
+            tuple(map(torch.stack, images)),
             *(torch.from_numpy(np.stack([row[i] for row in rows])) for i in range(1, 9)),
         )
 
@@ -205,7 +206,7 @@ class PolicyTask:
             )
             if random is not None and view != FRONT and random.random() < self.recipe.black_share:
                 now, before = np.zeros_like(now), np.zeros_like(before)
-            images.append(network_input(now, before))
+            images.append(network_input(in_planes(now), in_planes(before))[0])
         inputs = np.array([*(state / SPEED_UNIT_MPS), real], dtype=np.float32)
         gap = float(a["gap"][row])
         leader = np.array(

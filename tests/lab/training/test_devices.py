@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
-from alpasim_plugin.core.devices import join_ranks, require_device
+from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training import vae
 from alpasim_plugin.lab.training.clips import CropSize
 from alpasim_plugin.lab.training.fixer_run import train_fixer
+from alpasim_plugin.lab.training.processes import join_ranks
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
 from tests.examples import first_of
