@@ -129,11 +129,12 @@ def fix_frame(
     measured = guard.measures(video[visible], levels, rgb, *before)
     sums = trust_sums(output, after.render[visible], after.recorded[visible])
     if scale > 1:
-        heads = repaired.heads
-        if heads is not None and net.finer is not None and scale >= FINER_FROM:
-            parts = (operations.smaller(part, FINER_PX) for part in (given.rgb, given.references))
-            heads = heads._replace(finer=net.finer(*parts, change, heads.weight, scale))
-        levels = operations.enlarge(given.rgb, change, given.references, heads, scale)
+        heads, recorded = repaired.heads, given.references
+        finer = net.finer if scale >= FINER_FROM else None
+        if heads is not None and recorded is not None and finer is not None:
+            parts = (operations.smaller(part, FINER_PX) for part in (given.rgb, recorded))
+            heads = heads._replace(finer=finer(*parts, change, heads.weight, scale))
+        levels = operations.enlarge(given.rgb, change, recorded, heads, scale)
     return FixedFrame(levels, measured, sums, *after)
 
 

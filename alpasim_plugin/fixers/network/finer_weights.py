@@ -57,7 +57,9 @@ class FinerWeights(nn.Module):
             (torch.arange(size, device=render.device) * FINER_PX + FINER_PX // 2) // scale
             for size in (h, w)
         )
-        said = pixels(weight.flatten(0, 1).float(), DETAIL).unflatten(0, weight.shape[:2])
+        b, k = weight.shape[:2]
+        said = pixels(weight.flatten(0, 1).float(), DETAIL)
+        said = said.reshape(b, k, *said.shape[1:])
         said = said[:, :, rows][:, :, :, columns]
         seen = in_floats(references)
         shown, holds = seen[..., :3], seen[..., 3:]
@@ -75,4 +77,4 @@ class FinerWeights(nn.Module):
         x = features.flatten(0, 1).to(self.first.weight.dtype)
         for layer in (self.first, self.second):
             x = activation(layer(x), inplace=True)
-        return self.write(x)[..., 0].float().unflatten(0, references.shape[:2])
+        return self.write(x)[..., 0].float().reshape(b, k, h, w)
