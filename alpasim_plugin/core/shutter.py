@@ -102,8 +102,8 @@ def joined(request: RenderRequest, exposed: Sequence[Band], parts: Sequence[Any]
     """
     if request.exposure is None:
         return parts[0]
-    first, size = parts[0], (request.camera.height, request.camera.width)
-    shape = *size, *first.shape[2:]
+    first = parts[0]
+    shape = request.camera.height, request.camera.width, *first.shape[2:]
     on_host = isinstance(first, np.ndarray)
     whole = np.zeros(shape, first.dtype) if on_host else first.new_zeros(shape)
     for band, part in zip(exposed, parts, strict=True):

@@ -99,8 +99,8 @@ def card(device: str) -> Facts:
     """Return what the card is, after one product of matrices on it."""
     name = require_device(device)
     ones = torch.ones(64, 64, device=name)
-    facts: Facts = {"ok": float((ones @ ones).sum()) == 64.0**3, "torch": torch.__version__}
-    return facts | facts_of(name)
+    ok = float((ones @ ones).sum()) == 64.0**3
+    return {"ok": ok, "torch": torch.__version__, **facts_of(name)}
 
 
 def rasteriser(device: str) -> Facts:
@@ -187,8 +187,7 @@ def fixer_rate(device: str) -> Facts:
     """Time a frame of one and of six cameras beside what it costs at least."""
     facts: Facts = {"ok": True}
     for count in (1, 6):
-        cameras = [f"camera {i}" for i in range(count)]
-        fixes = partial(_streaming, "onefixer", cameras, *MIDDLE, device)
+        fixes = partial(_streaming, "onefixer", list(map(str, range(count))), *MIDDLE, device)
         facts[f"cameras: {count}"] = _rated(device, fixer_work(count, *MIDDLE), fixes)
     return facts
 
@@ -235,15 +234,14 @@ AVOIDED_BY = {
 
 def _rated(device: str, work: Work, make: Callable[[], Call]) -> Facts:
     """Return what a call costs at least and, on a card, its time and share of the card's peak."""
-    facts: Facts = work._asdict() | {"h100_least_ms": work.least_ms(H100)}
+    facts: Facts = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
     name = facts_of(device).get("card")
-    if name is not None:
-        ms = _median_ms(make())
-        facts["ms"] = ms
-        facts["roofline_share"] = "not known for this card"
-        if name in PEAKS:
-            facts["roofline_share"] = round(work.least_ms(name) / ms, 3)
-    return facts
+    if name is None:
+        return facts
+    ms = _median_ms(make())
+    known = name in PEAKS
+    share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
+    return {**facts, "ms": ms, "roofline_share": share}
 
 
 def compared(

@@ -61,12 +61,15 @@ PEAKS = {
 }
 
 
+Precision = Literal["fp32", "bf16"]
+
+
 class Work(NamedTuple):
     """What is computed, and what is read and written."""
 
     gflop: float
     gb: float
-    precision: Literal["fp32", "bf16"] = "fp32"
+    precision: Precision = "fp32"
 
     def least_ms(self, card: str) -> float:
         """Return the time that a card of `PEAKS` takes at its peak rates."""
@@ -99,7 +102,7 @@ def bytes_of(*parts: Any) -> int:
 
 def counted(
     call: Callable[[], Any],
-    precision: Literal["fp32", "bf16"] = "fp32",
+    precision: Precision = "fp32",
     given: Sequence[Any] = (),
 ) -> Work:
     """Return the work of a call, with the bytes of what it is given and returns."""
