@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from evaluators.metrics import MetricInfo
 
-DASH, NARROW = "\u2014", "\u202f"
+DASH = "\u2014"
+NARROW = "\u202f"
 ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
 

@@ -210,7 +210,8 @@ def speed_profile(speed_mps: float, limits: F64, t_s: F64) -> F64:
     """Return the progress ``(T,)`` at times ``(T,)`` of a car that nears the limits ``(N,)`` along
     its path within its comfort.
     """
-    progress, speed = np.zeros_like(t_s), speed_mps
+    progress = np.zeros_like(t_s)
+    speed = speed_mps
     ahead = limits.tolist()
     for k in range(1, len(t_s)):
         dt = float(t_s[k] - t_s[k - 1])
@@ -240,7 +241,8 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
     nearest = 0
     for ds in np.diff(progress).tolist():
         nearest, target = _targets(points, x, y, nearest, lookahead * lookahead)
-        dx, dy = points[target][0] - x, points[target][1] - y
+        dx = points[target][0] - x
+        dy = points[target][1] - y
         left = -math.sin(yaw) * dx + math.cos(yaw) * dy
         curvature = min(max(2 * left / max(dx * dx + dy * dy, 1e-6), -limit), limit)
         half = 0.5 * curvature * ds

@@ -139,7 +139,8 @@ def speed_fault(fast: Plan, slow: Plan) -> str:
         t_s = (plan.times_us - plan.times_us[0]) * 1e-6
         x, y = (float(np.interp(BEGIN_S, t_s, plan.xy[:, axis])) for axis in (0, 1))
         begins_mps.append(math.hypot(x, y) / BEGIN_S)
-    at_fast, at_slow = begins_mps[0] / STRAIGHT.speed_mps, begins_mps[1] / SLOW_LEFT.speed_mps
+    at_fast = begins_mps[0] / STRAIGHT.speed_mps
+    at_slow = begins_mps[1] / SLOW_LEFT.speed_mps
     where = f"at 10 m/s plans begin with {begins_mps[0]:.4g} m/s, at 4 m/s with {begins_mps[1]:.4g}"
     unit = unit_guess(at_fast)
     if unit and unit_guess(at_slow) == unit:
@@ -401,7 +402,8 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
 
     for step in range(situation.steps):
         now = START_US + step * STEP_US
-        shown, ahead = road, road
+        shown = road
+        ahead = road
         if step >= CHANGE:
             shown = road if situation.image_1pm is None else PaintedRoad(situation.image_1pm)
             ahead = road if situation.route_1pm is None else PaintedRoad(situation.route_1pm)

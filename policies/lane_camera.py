@@ -55,12 +55,16 @@ NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = (
 )  # a satellite receiver knows the lane, not the place in it
 MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
-UNCERTAIN_M, UNCERTAIN_PAINT_M = 1.2, 3.0
-LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
+UNCERTAIN_M = 1.2
+UNCERTAIN_PAINT_M = 3.0
+LOST_SIGMA_M = 0.9
+LOST_BLIND_M = 25.0
 OTHER_LANE = 0.55  # the route is in the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
-SAME_HEADING_RAD, TURN_OFF_RAD = 0.25, 0.3
-CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2
+SAME_HEADING_RAD = 0.25
+TURN_OFF_RAD = 0.3
+CHOOSE_AT_M = 12.0
+CHOOSE_AT_S = 1.2
 SIGMA_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
 
@@ -87,7 +91,8 @@ class LaneCamera(Policy):
 
     def reset(self, seed: int, route: Route) -> None:
         """Forget everything of the drive before."""
-        self.seed, self.step = seed, 0
+        self.seed = seed
+        self.step = 0
         error_m = NAVIGATION_SIGMA_M * float(
             stream(self.scene_id, seed, "policy/navigation").normal()
         )
@@ -123,10 +128,12 @@ class LaneCamera(Policy):
         blended = blend(lane, route, speed)
         random = stream(self.scene_id, self.seed, "policy", self.step)
         self.noise = correlated_noise(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
-        self.step, self.acted_us = self.step + 1, observation.t_us
+        self.step = self.step + 1
+        self.acted_us = observation.t_us
         wanted_mps = self.cruise_mps * (1.0 + NOISE_SPEED * float(self.noise[0, 1]))
         times = plan_times(observation.t_us)
-        limits, obstacle = curve_speeds(blended.path, wanted_mps), self._obstacle_now(observation)
+        limits = curve_speeds(blended.path, wanted_mps)
+        obstacle = self._obstacle_now(observation)
         progress = idm_progress(speed, limits, seconds(times), obstacle, self.bumper_m, wanted_mps)
         lane_sigma_m = 0.0 if lane is None else float(lane.sigma(np.array([SIGMA_AT_M]))[0])
         sigma_m = sample_sigma_m(lane_sigma_m)
@@ -143,7 +150,8 @@ class LaneCamera(Policy):
         dt_s = 0.0 if self.seen_us is None else (frame.t_us - self.seen_us) * 1e-6
         if self.lane is not None:
             self.lane = _moved(self.lane, self.seen_pose, pose)
-        self.seen_us, self.seen_pose = frame.t_us, pose
+        self.seen_us = frame.t_us
+        self.seen_pose = pose
         ground = self.grid.warp(frame.rgb)
         lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
         not_road = None if self.road is None else anomaly(lab, self.road, self.grid)
@@ -244,7 +252,8 @@ class LaneCamera(Policy):
             ):
                 return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
-        heading, width = float(lane.mean[1]), float(lane.mean[4])
+        heading = float(lane.mean[1])
+        width = float(lane.mean[4])
         return (
             sigma > LOST_SIGMA_M
             or lane.blind_m > LOST_BLIND_M

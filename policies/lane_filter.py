@@ -113,7 +113,8 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
         row_m: (N,) length of road that each point covers.
     """
     near = points.x_m < MAX_RANGE_M
-    x, y = points.x_m[near], points.y_m[near]
+    x = points.x_m[near]
+    y = points.y_m[near]
     if not len(x):
         return lane
     var = CORRELATION * (points.sigma_m[near] ** 2 + (SHAPE_ERROR_1PM * x**2) ** 2)
@@ -138,7 +139,8 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     residual, _, side = _residuals(mean, x, y, basis)
     used = np.abs(residual) < GATE_M[0]
     rows = row_m[near]
-    left, right = _length(x, rows, used & (side > 0)), _length(x, rows, used & (side < 0))
+    left = _length(x, rows, used & (side > 0))
+    right = _length(x, rows, used & (side < 0))
     seen = left + right > 2.0
     far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
     return LaneState(
@@ -153,7 +155,8 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
 
 def shift(lane: LaneState, lanes_left: int) -> LaneState:
     """Return the estimate of a neighbouring lane of the same width, positive to the left."""
-    mean, cov = lane.mean.copy(), lane.cov.copy()
+    mean = lane.mean.copy()
+    cov = lane.cov.copy()
     mean[OFFSET] += lanes_left * mean[WIDTH]
     cov[OFFSET, OFFSET] += 0.3**2
     return replace(lane, mean=mean, cov=cov)
@@ -169,7 +172,8 @@ def search(
     sharpest histogram the pair of piles that is a lane wide and nearest to the guess wins.
     """
     near = points.x_m < 30.0
-    x, y = points.x_m[near], points.y_m[near]
+    x = points.x_m[near]
+    y = points.y_m[near]
     paint = row_m[near] * np.minimum(points.strength[near], 2.0) / 2.0
     if paint.sum() < 3.0:
         return None
@@ -177,7 +181,8 @@ def search(
     curvatures = curvature_1pm + np.array([-0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03])
     shapes = np.array([(h, c) for h in headings for c in curvatures])
     lateral = y[None, :] - shapes[:, :1] * x - shapes[:, 1:] * x**2 / 2
-    cell, half = 0.1, 7.0
+    cell = 0.1
+    half = 7.0
     n = round(2 * half / cell)
     bins = np.floor((lateral + half) / cell).astype(np.intp)
     valid = (bins >= 0) & (bins < n)
@@ -216,11 +221,13 @@ def search(
     i, j = np.unravel_index(int(np.argmax(score)), score.shape)
     if left[i, j] + right[i, j] < 3.0 or abs(centres[i] - offset_m) > 2.0:
         return None
-    centre, width = float(centres[i]), float(widths[j])
+    centre = float(centres[i])
+    width = float(widths[j])
     if min(left[i, j], right[i, j]) < ONE_SIDED_M:
         # One border does not determine the width: use the mean width from the border that is seen.
         side = 1.0 if left[i, j] > right[i, j] else -1.0
-        centre, width = centre + side * (width - MEAN_WIDTH_M) / 2, MEAN_WIDTH_M
+        centre = centre + side * (width - MEAN_WIDTH_M) / 2
+        width = MEAN_WIDTH_M
     return start(centre, float(shapes[best, 0]), float(shapes[best, 1]), width)
 
 

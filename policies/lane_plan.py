@@ -22,7 +22,8 @@ LEAVE_M, LEAVE_RAD = (
 )  # the route leaves the lane where it is this far off and points this much elsewhere
 LEAVE_BEFORE_M = 8.0
 
-HEADWAY_S, MIN_GAP_M = 1.3, 3.5
+HEADWAY_S = 1.3
+MIN_GAP_M = 3.5
 IDM_ACCEL_MPS2 = 1.5
 IDM_BRAKE_MPS2 = 2.0
 HARD_BRAKE_MPS2 = 7.0
@@ -50,7 +51,8 @@ def route_prior(points: F64) -> RoutePrior:
     """Fit the next 20 m of route points ``(M, 2)`` by a parabola in the rig frame."""
     s = arc_lengths(points)
     near = resample(points, np.arange(0.0, min(20.0, max(float(s[-1]), 2.0)) + 0.5, 1.0), s)
-    x, y = near[:, 0], near[:, 1]
+    x = near[:, 0]
+    y = near[:, 1]
     if x[-1] - x[0] < 5.0:
         return RoutePrior(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
     half_curvature, heading, offset = np.polyfit(x, y, 2)
@@ -96,7 +98,8 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
     step = np.gradient(points, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     usable = np.logical_and.accumulate((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
     sigma = lane.sigma(np.maximum(x, 0.0))
@@ -142,7 +145,8 @@ def idm_progress(
     speed.
     """
     ahead = limits.tolist()
-    end, cruise = len(ahead) - 1, max(float(cruise_mps), 0.1)
+    end = len(ahead) - 1
+    cruise = max(float(cruise_mps), 0.1)
     progress = [0.0]
     s = 0.0
     v = max(float(speed_mps), 0.0)
@@ -232,12 +236,14 @@ def _retimed(lines: F64, s: F64, at: F64) -> F64:
     if s[-1] < 0.1:
         return lines
     keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-9])
-    knots, kept = s[keep], lines[:, keep]
+    knots = s[keep]
+    kept = lines[:, keep]
     out = np.empty_like(lines)
     for k in range(len(lines)):
         for d in range(3):
             out[k, :, d] = np.interp(at[k], knots, kept[k, :, d])
-    over, end = np.maximum(at - s[-1], 0.0), lines[:, -1:, 2]
+    over = np.maximum(at - s[-1], 0.0)
+    end = lines[:, -1:, 2]
     out[..., 0] += over * np.cos(end)
     out[..., 1] += over * np.sin(end)
     return out

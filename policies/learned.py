@@ -29,7 +29,8 @@ FOLDER = Path(__file__).parent / "weights"
 WEIGHTS = FOLDER / "learned.safetensors"
 EARLIER_US = 500_000  # age of the earlier frame, which shows motion
 EARLIEST_US = 700_000
-MAX_SIGMA_M, MAX_SIGMA_SPEED = 0.5, 0.15
+MAX_SIGMA_M = 0.5
+MAX_SIGMA_SPEED = 0.15
 STANDS_MPS = 0.3
 
 
@@ -67,13 +68,15 @@ class Learned(Policy):
                 f"temperature: {temperature}",
                 "give 0 or a positive number",
             )
-        self.scene_id, self.temperature = scenario.scene_id, float(temperature)
+        self.scene_id = scenario.scene_id
+        self.temperature = float(temperature)
         self.net = load_net(type(self).files[0] if weights is None else Path(weights))
         self.cameras = [view_camera(scenario, view) for view in self.net.views]
         self.sensors: Sequence[SensorSpec] = tuple(
             SensorSpec(c.name, device=True) for c in self.cameras
         )
-        self.grid_m, self.weights = path_grid(), knot_weights()
+        self.grid_m = path_grid()
+        self.weights = knot_weights()
         self.reset(0, scenario.route)
 
     def reset(self, seed: int, route: Route) -> None:
@@ -108,7 +111,8 @@ class Learned(Policy):
         xy, yaw = self._mean(heading, speed_change, speed, seconds(times))
         random = stream(self.scene_id, self.seed, "policy", self.step)
         self.noise = correlated_noise(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
-        self.step, self.acted_us = self.step + 1, observation.t_us
+        self.step = self.step + 1
+        self.acted_us = observation.t_us
         lateral_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
         drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
         plans = (
@@ -151,7 +155,8 @@ class Learned(Policy):
             t_us, now = history[-1]
             earlier_us, earlier = min(history, key=lambda seen: abs(t_us - EARLIER_US - seen[0]))
             if t_us - earlier_us <= EARLIER_US // 2:
-                earlier, real = now, False
+                earlier = now
+                real = False
             images.append(network_input(now, earlier))
         assert self.desired_mps is not None
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]

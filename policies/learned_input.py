@@ -19,7 +19,8 @@ Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
 COMMANDS: tuple[Command, ...] = get_args(Command)
 
 TURN_RADIUS_M = 28.0  # tighter curves are turns and are announced; wider ones belong to the road
-AHEAD_M, NOW_M = 40.0, 6.0
+AHEAD_M = 40.0
+NOW_M = 6.0
 
 SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther apart
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
@@ -119,7 +120,8 @@ def view_homography(camera: CameraSpec, yaw_rad: float = 0.0, view: View = FRONT
     pure rotation, so no depth is needed.
     """
     yaw_rad = yaw_rad + np.deg2rad(view.yaw_deg)
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     rotation = camera.T_rig_camera[:3, :3].T @ turn @ _RIG_FROM_LEVEL_CAMERA
     return camera.K @ rotation @ np.linalg.inv(view.K)

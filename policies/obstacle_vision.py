@@ -144,7 +144,8 @@ def find_foot(
     u = np.rint(grid.sight_column(centre_y[:, None] + EDGES_M, rows)).astype(np.intp)
     u = np.minimum(np.maximum(u, 0), grid.sight_index.shape[1])
     begin = rows[:, None]
-    narrow, in_curve = _sums_along_sight(value, NARROW_M, grid), last < full[:, None]
+    narrow = _sums_along_sight(value, NARROW_M, grid)
+    in_curve = last < full[:, None]
     filled = _box_mean(narrow, begin, last, u)
     if (in_curve & usable).any():
         filled = np.where(
@@ -194,7 +195,8 @@ def _box_mean(
     width = table.shape[1]
     left = u[:, :-1]
     right = np.minimum(np.maximum(u[:, 1:], left + 1), width - 1)
-    a, b = first * width, last * width
+    a = first * width
+    b = last * width
     total = (
         table.take(b + right) - table.take(a + right) - table.take(b + left) + table.take(a + left)
     )

@@ -41,8 +41,10 @@ def pinhole_camera(
     """
     f = width / 2 / np.tan(np.radians(hfov_deg) / 2)
     K = np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
-    pitch, yaw = np.radians(pitch_deg), np.radians(yaw_deg)
-    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.radians(pitch_deg)
+    yaw = np.radians(yaw_deg)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     forward = np.array([np.cos(pitch) * c, np.cos(pitch) * s, -np.sin(pitch)])
     right = np.array([s, -c, 0.0])
     T = np.eye(4)
@@ -89,7 +91,8 @@ class PaintedRoad:
         k = self.curvature_1pm
         if k == 0:
             return x_m, y_m
-        sign, radius = float(np.sign(k)), np.hypot(x_m, y_m - 1 / k)
+        sign = float(np.sign(k))
+        radius = np.hypot(x_m, y_m - 1 / k)
         angle = np.arctan2(x_m * sign, (1 / k - y_m) * sign)
         return angle / k * sign, sign * (abs(1 / k) - radius)
 
@@ -104,12 +107,14 @@ class PaintedRoad:
         """Draw the road at `SUPERSAMPLE` times the camera's size, or at `MOST_PX` columns, seen
         from the pose ``(4, 4)``.
         """
-        K, rotation = camera.K, T[:3, :3]
+        K = camera.K
+        rotation = T[:3, :3]
         scale = min(SUPERSAMPLE, MOST_PX / camera.width)
         u = (np.arange(round(camera.width * scale)) + 0.5) / scale
         v = (np.arange(round(camera.height * scale)) + 0.5) / scale
         # A ray is linear in the pixel: one outer sum per axis.
-        across, down = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+        across = (u - K[0, 2]) / K[0, 0]
+        down = (v - K[1, 2]) / K[1, 1]
         ray = [
             rotation[i, 0] * across[None, :] + (rotation[i, 1] * down + rotation[i, 2])[:, None]
             for i in range(3)

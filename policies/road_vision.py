@@ -87,7 +87,8 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
             rear axle.
     """
     T_camera_rig = inverse(camera.T_rig_camera)
-    x_camera, height = float(camera.T_rig_camera[0, 3]), float(camera.T_rig_camera[2, 3])
+    x_camera = float(camera.T_rig_camera[0, 3])
+    height = float(camera.T_rig_camera[2, 3])
     near = max(NEAR_M, x_camera + 1.0)
     candidates = np.geomspace(near, FAR_M, 2000)
     rows_v = _project(
@@ -99,7 +100,8 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
             f"camera {camera.name!r} {height:.2f} m above the ground: the ground from {near:.1f} to {FAR_M:.0f} m ahead falls on image rows {v[0]:.1f} to {v[1]:.1f} of {camera.height}",
             "give the policy a front camera that sees the road",
         )
-    first, last = min(v[0], camera.height - 1.0), v[1]
+    first = min(v[0], camera.height - 1.0)
+    last = v[1]
     n = int(min(MAX_ROWS, max(first - last, 8) + 1))
     # Equal steps in the image row are steps of x^2 on the ground: each grid row has its own image
     # row.
@@ -109,13 +111,15 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     uv = _project(camera, T_camera_rig, points).reshape(len(x), len(y), 2)
     inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
     distance = x - x_camera
-    f, y_camera = float(camera.K[0, 0]), float(camera.T_rig_camera[1, 3])
+    f = float(camera.K[0, 0])
+    y_camera = float(camera.T_rig_camera[1, 3])
     column = np.arange(camera.width) + 0.5 - camera.width / 2
     sight = (HALF_WIDTH_M - y_camera + column[None, :] * distance[:, None] / f) / CELL_M
     seen = (
         np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
     )
-    map_u, map_v = uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+    map_u = uv[..., 0].astype(np.float32)
+    map_v = uv[..., 1].astype(np.float32)
     pixel_m = np.hypot(distance, height) / f
     return GroundGrid(
         x,
@@ -195,7 +199,8 @@ class RidgeFilter:
         """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the
         image.
         """
-        total, n = _running_sums(value), value.shape[1]
+        total = _running_sums(value)
+        n = value.shape[1]
         out = np.zeros(value.shape, np.float32)
         for rows, half, gap, flank in self._runs:
             reach = gap + flank
@@ -220,11 +225,14 @@ class RidgeFilter:
         """Return the larger mean ``(N,)`` of a map ``(R, C)`` over the near halves of the two
         flanks of cells.
         """
-        total, n = _running_sums(value), value.shape[1]
-        gap, beside = self._gap[rows], self._beside[rows]
+        total = _running_sums(value)
+        n = value.shape[1]
+        gap = self._gap[rows]
+        beside = self._beside[rows]
 
         def mean(first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]) -> F32:
-            a, b = np.minimum(np.maximum(first, 0), n), np.minimum(np.maximum(last + 1, 0), n)
+            a = np.minimum(np.maximum(first, 0), n)
+            b = np.minimum(np.maximum(last + 1, 0), n)
             return (total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(
                 np.float32
             )
@@ -275,7 +283,8 @@ def find_paint(
     is_peak = (smooth >= peak) & (smooth > threshold[:, None])
     rows, cols = np.divmod(np.flatnonzero(is_peak), smooth.shape[1])
     inner = (cols > 0) & (cols < smooth.shape[1] - 1)
-    rows, cols = rows[inner], cols[inner]
+    rows = rows[inner]
+    cols = cols[inner]
     before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
     bend = np.maximum(2 * here - before - after, 1e-6)
     shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
@@ -304,7 +313,8 @@ def _cells_around(
     mask = np.zeros(shape, np.uint8)
     if len(rows):
         count = np.bincount(rows, minlength=shape[0])
-        high, low = np.full(shape[0], -np.inf), np.full(shape[0], np.inf)
+        high = np.full(shape[0], -np.inf)
+        low = np.full(shape[0], np.inf)
         np.maximum.at(high, rows, y)
         np.minimum.at(low, rows, y)
         wide = (count >= 4) & (high - low > CROSSWALK_M)

@@ -108,7 +108,8 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
     """
     document = files.read_json(path)
     with parsing(path, "use a log_map_archive file of the Argoverse 2 sensor set"):
-        raw_lanes, raw_areas = document["lane_segments"], document["drivable_areas"]
+        raw_lanes = document["lane_segments"]
+        raw_areas = document["drivable_areas"]
         raw_crossings = document["pedestrian_crossings"]
         if not raw_lanes or not raw_areas:
             raise ValueError("a map without lanes or without drivable areas")
@@ -307,7 +308,8 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     """
     table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS})
     t_ns = table["timestamp_ns"].astype(np.int64)
-    xyz, quat = _columns(table, POSE[4:]), _columns(table, POSE[:4])
+    xyz = _columns(table, POSE[4:])
+    quat = _columns(table, POSE[:4])
     checked = checked_trajectory(path, t_ns, xyz, quat, least=2)
     return EgoPoses(checked.t_us, checked.xyz, checked.quat)
 
@@ -328,7 +330,8 @@ def read_actors(
         path, {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers}
     )
     t_ns = table["timestamp_ns"].astype(np.int64)
-    uuid, category = table["track_uuid"].astype(str), table["category"].astype(str)
+    uuid = table["track_uuid"].astype(str)
+    category = table["category"].astype(str)
     others = np.nonzero(category != EGO_CATEGORY)[0]
     if len(others) == 0:
         return (), (NOBODY,)
@@ -346,7 +349,8 @@ def read_actors(
         raise InputError(f"{path}: {found}", "give unit quaternions")
     T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
     T_local_box = T_local_ego @ se3(_columns(table, POSE[4:]), quat)
-    xyz, turns = T_local_box[:, :3, 3].copy(), quat_from_matrix(T_local_box[:, :3, :3])
+    xyz = T_local_box[:, :3, 3].copy()
+    turns = quat_from_matrix(T_local_box[:, :3, :3])
     size = _columns(table, sizes)
     actors = []
     unknown: Counter[str] = Counter()
@@ -360,7 +364,8 @@ def read_actors(
         if kind not in LABELS:
             unknown[kind] += 1
         box = Box(*np.median(size[mine], axis=0).tolist())
-        label, fixed = LABELS.get(kind, "other"), kind in FIXED
+        label = LABELS.get(kind, "other")
+        fixed = kind in FIXED
         parts = actors_of_track(str(name), label, box, track, fixed=fixed)
         split += len(parts) > 1
         actors += parts

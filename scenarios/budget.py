@@ -104,7 +104,8 @@ def gaussians_of(scenario: Scenario) -> float:
     halved = halvings(scenario)
     if not halved:
         return usual
-    low, high = xyz[:, :2].min(axis=0) - REACH_M, xyz[:, :2].max(axis=0) + REACH_M
+    low = xyz[:, :2].min(axis=0) - REACH_M
+    high = xyz[:, :2].max(axis=0) + REACH_M
     lanes_m = 0.0
     for lane in scenario.lane_map.lanes.values():
         near = ((lane.centre[1:, :2] > low) & (lane.centre[1:, :2] < high)).all(axis=1)

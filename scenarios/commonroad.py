@@ -103,7 +103,8 @@ def read_obstacles(path: Path, root: Element) -> tuple[list[Obstacle], list[str]
             label = LABELS.get(str(element.findtext("type")), "other")
             yaw = np.array([number(state, "orientation/exact") for state in states])
             centre = np.array([point(place) for place in element.iterfind(".//position/point")])
-            c, s = np.cos(yaw), np.sin(yaw)
+            c = np.cos(yaw)
+            s = np.sin(yaw)
             centre[:, 0] += c * offset[0] - s * offset[1]
             centre[:, 1] += s * offset[0] + c * offset[1]
             times = [number(state, "time/exact") for state in states]

@@ -143,7 +143,8 @@ def read_drive(folder: Path) -> RecordedLog:
             it.
     """
     files = SourceFiles()
-    path, model = folder / DRIVE_FILE, folder / MODEL_FOLDER
+    path = folder / DRIVE_FILE
+    model = folder / MODEL_FOLDER
     document = files.read_json(path)
     _note_files(files, model)
     with parsing(path, DO_THIS, "no drive of simrun"):
@@ -217,7 +218,8 @@ def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightFiel
 
 def _obstacle_actor(one: JsonObject, ego: Trajectory) -> Actor:
     """Return an obstacle as an actor that stands for the whole drive."""
-    xyz, quat = np.tile(_rows(one["xyz"]), (2, 1)), quat_from_yaw([one["yaw_rad"]] * 2)
+    xyz = np.tile(_rows(one["xyz"]), (2, 1))
+    quat = quat_from_yaw([one["yaw_rad"]] * 2)
     track = Trajectory(ego.t_us[[0, -1]], xyz, quat)
     return Actor(one["id"], "other", Box(*one["size_m"]), track, is_static=True)
 

@@ -98,7 +98,8 @@ def _change(
             "choose a lane that exists there",
         )
     target = road.forward_chain(change.to_lane, first)
-    out, new_chain = parts[:first], chain[:first]
+    out = parts[:first]
+    new_chain = chain[:first]
     for n, (lane_id, k) in enumerate(target):
         i = first + n
         goal = road.lane_map.lanes[lane_id].centre
@@ -206,7 +207,8 @@ def track_on_path(
         keep = np.arange(len(s_m)) < (int(np.argmin(keep)) or 0)
     xyz, yaw = path.at(s_m, offset)
     if len(s_m) > 1 and np.ptp(offset) > 0:
-        ds, dd = np.gradient(s_m), np.gradient(offset)
+        ds = np.gradient(s_m)
+        dd = np.gradient(offset)
         yaw = yaw + np.arctan2(dd, np.maximum(ds, 1e-6))
     xyz = xyz + np.array([0.0, 0.0, box.height_m / 2])
     return Trajectory(t_us[keep], xyz[keep], quat_from_yaw(yaw[keep]))

@@ -90,7 +90,8 @@ class ScriptedTracks:
         self.present = np.zeros((n, len(going)), np.bool_)
         for j, script in enumerate(going):
             track = script.track
-            first_us, last_us = int(track.t_us[0]), int(track.t_us[-1])
+            first_us = int(track.t_us[0])
+            last_us = int(track.t_us[-1])
             t = np.clip(self.times, first_us, last_us)
             for d in range(2):
                 self.xy[:, j, d] = np.interp(t, track.t_us, track.xyz[:, d])
@@ -230,7 +231,8 @@ def drive(
     ]
     lines = Lines([car.f.path for car in cars]) if cars else None
     half_widths = np.array([car.f.box.width_m / 2 for car in cars])
-    log_s, log_t = [expert.s], [0]
+    log_s = [expert.s]
+    log_t = [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
         ahead = _predicted(table, cars, lines, t)
@@ -344,7 +346,8 @@ class _Car:
     ) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
         self.params = IdmParams(**f.params)
-        self.lights, self.give_way = lights, give_way
+        self.lights = lights
+        self.give_way = give_way
         self.wanted_mps = bend_speeds(f.path, self.params)
         self.log_s = [self.s]
 
@@ -370,7 +373,8 @@ class _Car:
 
     def driven(self, times: I64) -> Actor:
         """Return the road user with the track that it drove."""
-        s_m, f = np.array(self.log_s[: len(times)]), self.f
+        s_m = np.array(self.log_s[: len(times)])
+        f = self.f
         track = track_on_path(f.path, times, s_m, f.box, f.offset_m)
         return Actor(f.actor_id, f.label, f.box, track, behaviour=Behaviour("idm", f.params))
 
@@ -382,8 +386,10 @@ def _predicted(
     own lines.
     """
     rows = table.rows(t_us)
-    xy, yaw = [table.xy[rows]], [table.yaw[rows]]
-    velocity, present = [table.velocity[rows]], [table.present[rows]]
+    xy = [table.xy[rows]]
+    yaw = [table.yaw[rows]]
+    velocity = [table.velocity[rows]]
+    present = [table.present[rows]]
     if lines is not None:
         s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
         at = s + v * TIMES_S[:, None]  # (1 + n, K)

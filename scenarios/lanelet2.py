@@ -72,7 +72,8 @@ class Osm:
     """
 
     def __init__(self, files: SourceFiles, path: Path) -> None:
-        self.files, self.path = files, path
+        self.files = files
+        self.path = path
         root = files.read_xml(path)
         if root.tag != "osm":
             raise InputError(f"{path}: root element {root.tag!r}", "give a Lanelet2 map (OSM XML)")
@@ -173,7 +174,8 @@ class Osm:
                 row[: len(axes)] = [float(place[axis]) for axis in axes]
                 if not (np.abs(row) <= most).all():
                     raise ValueError(f"no place on the earth: {row.tolist()}")
-        xy, z = table[:, :2], table[:, 2]
+        xy = table[:, :2]
+        z = table[:, 2]
         notes = [] if high else ["not all points have a height (ele): the map is level"]
         if local:
             shift = np.round(xy[0])
@@ -286,7 +288,8 @@ def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
         if left_way == right_way or min(float(arc_lengths(line)[-1]) for line in lines) <= 0.0:
             raise ValueError("a bound without length, or one for both sides")
     if not is_left_of(*lines):
-        left, right = left.turned(), right.turned()
+        left = left.turned()
+        right = right.turned()
     return left, right
 
 
@@ -331,7 +334,8 @@ def _linked(
 
 def _mark_type(way: Item) -> LaneMarkType:
     """Return the lane marking of a bound; colours other than yellow are white."""
-    kind, subtype = way.tags.get("type"), way.tags.get("subtype", "")
+    kind = way.tags.get("type")
+    subtype = way.tags.get("subtype", "")
     if kind in UNMARKED:
         return "none"
     if kind not in MARKS or (not subtype and kind != "bike_marking"):

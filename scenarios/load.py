@@ -223,8 +223,10 @@ def _reactive(actor: Actor) -> Actor:
 
 def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
     """Check the periods and the length with the loop's own clock."""
-    document, timing = drawn.document, drawn.spec.timing
-    control_us, warmup_us = scenario.rates.control_us, scenario.warmup_us
+    document = drawn.document
+    timing = drawn.spec.timing
+    control_us = scenario.rates.control_us
+    warmup_us = scenario.warmup_us
     try:
         clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     except InputError as e:
@@ -268,7 +270,8 @@ def _vehicle(v: VehicleSpec) -> Vehicle:
 
 
 def _background(drawn: Drawn) -> BackgroundFile | None:
-    document, background = drawn.document, drawn.spec.background
+    document = drawn.document
+    background = drawn.spec.background
     if background is None:
         return None
     path = document.folder_of(("background", "file")) / background.file

@@ -154,7 +154,8 @@ def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Wa
         way = graph.drawn(spot, ROUTE_M, rng)
         length_m = graph.driven_m(way)
         if length_m > longest_m:
-            best, longest_m = way, length_m
+            best = way
+            longest_m = length_m
         if length_m >= ROUTE_M:
             break
     if best is None or longest_m < SHORTEST_ROUTE_M:
@@ -242,7 +243,8 @@ def _timed(
     begins_us: dict[str, int] = {}
     if first is not None:
         number = next(n for n, signal in enumerate(signals) if signal is first.signal)
-        head, shown = heads[number], with_cycles(heads, {})[number]
+        head = heads[number]
+        shown = with_cycles(heads, {})[number]
         arrival_s = (first.s_m - front_m) / cruise_mps
         green_us = round((arrival_s - YELLOW_AHEAD_S - GREEN_S) * 1e6)
         begins_us[head.junction] = green_us - shown.offset_us

@@ -71,7 +71,8 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     line = thinned(ego.xyz[:, :2], 0.5)
     if len(line) == 1:
         line = np.stack([line[0], line[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
-    first, last = line[1] - line[0], line[-1] - line[-2]
+    first = line[1] - line[0]
+    last = line[-1] - line[-2]
     before = line[0] - first / np.linalg.norm(first) * BEFORE_M
     beyond = line[-1] + last / np.linalg.norm(last) * BEYOND_M
     path = polyline_path(np.concatenate([[before], line, [beyond]]))

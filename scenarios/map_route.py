@@ -129,7 +129,8 @@ class LaneGraph:
     def line(self, way: Way) -> Path:
         """Return the smooth line of a way, from its start to the end of its last lane."""
         parts: list[F64] = []
-        begin_m, ids = way.start_m, list(way.lane_ids)
+        begin_m = way.start_m
+        ids = list(way.lane_ids)
         while ids:
             key = ids.pop(0)
             stations = np.arange(begin_m, max(self.length_m[key], begin_m + 0.1), STATION_M)

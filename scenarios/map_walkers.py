@@ -89,5 +89,6 @@ def _ends(ring: F64, heading_rad: float, height_m: float) -> tuple[F64, F64]:
     walked = sides[int(np.argmax(ways @ across))]
     half = walked / 2 + MARGIN_M * walked / np.linalg.norm(walked)
     middle = corners.mean(axis=0)
-    start, goal = middle - half, middle + half
+    start = middle - half
+    goal = middle + half
     return np.array([*start, height_m]), np.array([*goal, height_m])

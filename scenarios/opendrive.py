@@ -120,7 +120,8 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
     turns: dict[tuple[str, str, int], list[tuple[str, bool, int]]] = {}
     n_bare = 0
     for one in odr.connections:
-        incoming, connecting = roads.get(one.incoming), roads.get(one.connecting)
+        incoming = roads.get(one.incoming)
+        connecting = roads.get(one.connecting)
         if incoming is None or connecting is None:
             continue
         after = incoming.successor
@@ -202,7 +203,8 @@ def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
         # AlpaSim passes over words it cannot read; real files hold some.
         with contextlib.suppress(ValueError):
             values["alt_0" if name == "h_0" else name] = float(text)
-    lat_deg, lon_deg = values.get("lat_0", np.nan), values.get("lon_0", np.nan)
+    lat_deg = values.get("lat_0", np.nan)
+    lon_deg = values.get("lon_0", np.nan)
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         return None
     return lat_deg, lon_deg, values.get("alt_0", 0.0)
@@ -222,7 +224,8 @@ def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
     """Return the ``(4, 4)`` transform from earth-centred coordinates to east, north, up at a
     place.
     """
-    lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
+    lat = np.deg2rad(lat_deg)
+    lon = np.deg2rad(lon_deg)
     place = earth_xyz(lat_deg, lon_deg, height_m)
     east = [-np.sin(lon), np.cos(lon), 0.0]
     north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
@@ -260,7 +263,8 @@ def read_lanes(
     """
     lanes: dict[str, Lane] = {}
     left_out: Counter[str] = Counter()
-    unlike, apart = [], []
+    unlike = []
+    apart = []
     for road in odr.roads:
         place = f"{where}, road {road.road_id}"
         for index, section in enumerate(road.sections):
@@ -314,7 +318,8 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     roads = {road.road_id: road for road in odr.roads if road.records and road.sections}
 
     def spots(name: str, s_m: float) -> list[Spot]:
-        road, found = roads[name], []
+        road = roads[name]
+        found = []
         for _, key, inner_t, outer_t in lanes_at(road, s_m):
             if key in lanes:
                 middle = np.array([[s_m, (inner_t + outer_t) / 2]])

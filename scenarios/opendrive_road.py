@@ -78,11 +78,14 @@ class Geometry:
             p, along, across = self._along_poly3(s_m), Polynomial([0.0, 1.0]), self.numbers
         else:
             p = s_m / self.length_m if self.normalised and self.length_m > 0 else s_m
-            along, across = Polynomial(self.numbers[:4]), self.numbers[4:]
+            along = Polynomial(self.numbers[:4])
+            across = self.numbers[4:]
         left = Polynomial(across)
-        u, v = along(p), left(p)
+        u = along(p)
+        v = left(p)
         heading = self.heading_rad + np.arctan2(left.deriv()(p), along.deriv()(p))
-        c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        c = np.cos(self.heading_rad)
+        s = np.sin(self.heading_rad)
         return np.column_stack([self.x_m + u * c - v * s, self.y_m + u * s + v * c, heading])
 
     def _along_poly3(self, s_m: F64) -> F64:

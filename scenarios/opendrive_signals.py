@@ -124,7 +124,8 @@ def _heads(
         ]
         s_m = min(stop_lines, key=lambda stop_m: abs(stop_m - one.s_m), default=one.s_m)
         if road.junction != "-1":
-            junction, s_m = road.junction, 0.0 if along else road.length_m
+            junction = road.junction
+            s_m = 0.0 if along else road.length_m
         elif link is not None and link.kind == "junction":
             junction = link.target
         if one.kind == PEDESTRIAN_LIGHT:
@@ -151,10 +152,12 @@ def _for_people(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_
     that the light stands on.
     """
     rings = [ring for ring in road.crosswalks if abs(ring[:, 0].mean() - one.s_m) <= STOP_REACH_M]
-    low_m, high_m = one.s_m - CROSSWALK_M / 2, one.s_m + CROSSWALK_M / 2
+    low_m = one.s_m - CROSSWALK_M / 2
+    high_m = one.s_m + CROSSWALK_M / 2
     if rings:
         ring = min(rings, key=lambda ring: abs(float(ring[:, 0].mean()) - one.s_m))
-        low_m, high_m = float(ring[:, 0].min()), float(ring[:, 0].max())
+        low_m = float(ring[:, 0].min())
+        high_m = float(ring[:, 0].max())
     ends = placed(road, np.array([[low_m, one.t_m], [high_m, one.t_m]]), T_local_map)
     towards = -np.pi / 2 if one.t_m > 0 else np.pi / 2
     heading = _heading_rad(road, one.s_m, True, T_local_map) + towards

@@ -85,7 +85,8 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     file = Path(path)
     files = SourceFiles()
     tracks: dict[int, _Track] = {}
-    count, why = 0, f"object {ego}"
+    count = 0
+    why = f"object {ego}"
     roads: Any = None
     notes: list[str] = []
     for message in ground_truths(files, file):
@@ -94,16 +95,19 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
             notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
         count += 1
         if ego is None and message.HasField("host_vehicle_id"):
-            ego, why = str(message.host_vehicle_id.value), "the host vehicle"
+            ego = str(message.host_vehicle_id.value)
+            why = "the host vehicle"
         if roads is None and message.lane:
             roads = message
         t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
         for one in message.moving_object:
-            place, turn = one.base.position, one.base.orientation
+            place = one.base.position
+            turn = one.base.orientation
             row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
             tracks.setdefault(one.id.value, _Track(one)).rows.append(row)
     if ego is None:
-        ego, why = _usual_ego(file, tracks, count), "the first vehicle that is always there"
+        ego = _usual_ego(file, tracks, count)
+        why = "the first vehicle that is always there"
     chosen = next((key for key in tracks if str(key) == ego), None)
     if chosen is None:
         raise InputError(
@@ -167,7 +171,8 @@ def _usual_ego(path: Path, tracks: Mapping[int, _Track], n_messages: int) -> str
 def _vehicle(track: _Track) -> Vehicle:
     """Return the ego's body; axles that the trace does not place are in proportion to its length."""
     scale = track.box.length_m / DEFAULT.box.length_m
-    rear_m, wheelbase_m = DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale
+    rear_m = DEFAULT.rear_axle_to_centre_m * scale
+    wheelbase_m = DEFAULT.wheelbase_m * scale
     attributes = track.first.vehicle_attributes
     if attributes.HasField("bbcenter_to_rear"):
         rear_m = -attributes.bbcenter_to_rear.x
@@ -187,7 +192,8 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
     after = {key: list(lane.successors) for key, lane in lanes.items()}
     for one in (one for one in roads.lane if one.classification.type == INTERSECTION):
         for pair in one.classification.lane_pairing:
-            begin, end = str(pair.antecessor_lane_id.value), str(pair.successor_lane_id.value)
+            begin = str(pair.antecessor_lane_id.value)
+            end = str(pair.successor_lane_id.value)
             if begin in lanes and end in lanes and begin != end:
                 # From the end of one lane to the start of another.
                 sides = zip(rails(lanes[begin]), rails(lanes[end]), strict=True)
@@ -244,7 +250,8 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
     ]
     if not facts.centerline_is_driving_direction:
         sides = [(edge[::-1], mark_type) for edge, mark_type in sides[::-1]]
-        ahead, beside = behind, beside[::-1]
+        ahead = behind
+        beside = beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):
         sides = sides[::-1]
     (left, left_mark_type), (right, right_mark_type) = sides
@@ -282,9 +289,11 @@ def _curve(begin: F64, end: F64) -> F64:
     """Return the cubic ``(N, 3)`` that leaves one line's end and meets another line's start in
     their directions.
     """
-    first, last = begin[-1], end[0]
+    first = begin[-1]
+    last = end[0]
     reach_m = float(np.linalg.norm(last - first))
-    out, into = begin[-1] - begin[-2], end[1] - end[0]
+    out = begin[-1] - begin[-2]
+    into = end[1] - end[0]
     out, into = (reach_m * way / np.linalg.norm(way) for way in (out, into))
     t = np.linspace(0.0, 1.0, JOIN_STEPS)[:, None]
     return np.asarray(

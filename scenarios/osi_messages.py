@@ -84,7 +84,8 @@ def ground_truths(files: SourceFiles, path: Path) -> Iterator[Any]:
     """
     data = files.read_bytes(path)
     truth, view = message_classes()
-    start, number = 0, 0
+    start = 0
+    number = 0
     while start < len(data):
         length = int.from_bytes(data[start : start + 4], "little")
         part = data[start + 4 : start + 4 + length]
@@ -121,7 +122,8 @@ def message_classes() -> tuple[Any, Any]:
             field = message.field.add(name=field_name, number=int(number), label=label)
             kind = kind.lstrip("*")
             if kind in FIELDS:
-                field.type, field.type_name = proto.TYPE_MESSAGE, f".{PACKAGE}.{kind}"
+                field.type = proto.TYPE_MESSAGE
+                field.type_name = f".{PACKAGE}.{kind}"
             else:
                 field.type = getattr(proto, f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()

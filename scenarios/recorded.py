@@ -123,7 +123,8 @@ class SourceFiles:
             InputError: The file is damaged or truncated, lacks a column, or has one of another type
                 or with empty values.
         """
-        data, do = self.read_bytes(path), "fetch the file again; it may be truncated"
+        data = self.read_bytes(path)
+        do = "fetch the file again; it may be truncated"
         with reading.parsing(path, do, "no readable Arrow IPC file"):
             table = feather.read_table(pa.BufferReader(data))
             table.validate(full=True)
@@ -239,6 +240,7 @@ def actors_of_track(
     actors = []
     for run, (t, xyz, quat) in enumerate(zip(*columns, strict=True), start=1):
         name = actor_id if run == 1 else f"{actor_id}~{run}"
-        part, still = Trajectory(t, xyz, quat), stands_still(t, xyz, label, fixed)
+        part = Trajectory(t, xyz, quat)
+        still = stands_still(t, xyz, label, fixed)
         actors.append(Actor(name, label, box, part, is_static=still))
     return actors

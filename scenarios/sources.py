@@ -189,7 +189,8 @@ def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:
         InputError: Nothing is there, anything is wrong with the log, or the reader gives something
             else than a `RecordedLog`.
     """
-    document, log = drawn.document, drawn.spec.log
+    document = drawn.document
+    log = drawn.spec.log
     assert log is not None
     kind, text, key = log.recorded
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)

@@ -78,10 +78,12 @@ def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Si
         cycle_s = TURN_S * max(len(known), 2)
         if head.signal.pedestrians:
             walk_s = cycle_s - TURN_S - WALK_END_S
-            phases, first_s = [("green", walk_s), ("red", cycle_s - walk_s)], TURN_S
+            phases = [("green", walk_s), ("red", cycle_s - walk_s)]
+            first_s = TURN_S
         else:
             rest_s = cycle_s - GREEN_S - YELLOW_S
-            phases, first_s = [("green", GREEN_S), ("yellow", YELLOW_S), ("red", rest_s)], 0.0
+            phases = [("green", GREEN_S), ("yellow", YELLOW_S), ("red", rest_s)]
+            first_s = 0.0
         offset_us = begins_us.get(head.junction, 0) + round((turn * TURN_S + first_s) * 1e6)
         timed = tuple((colour, round(lasts_s * 1e6)) for colour, lasts_s in phases)
         out.append(replace(head.signal, phases=timed, offset_us=offset_us))

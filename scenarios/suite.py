@@ -62,7 +62,8 @@ def find(path_or_name: str | Path) -> Path:
     Raises:
         InputError: Neither exists; the nearest shipped names are given.
     """
-    path, shipped = Path(path_or_name), shipped_names()
+    path = Path(path_or_name)
+    shipped = shipped_names()
     if os.path.exists(path):
         return path
     name = str(path_or_name).removesuffix(".yaml")

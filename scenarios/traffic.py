@@ -113,7 +113,8 @@ class _Placer:
         """Return a lane's line and the arc length on it abreast of the ego's line at ``s_m`` from
         the ego's start.
         """
-        start_m, ego_line = self.spec.ego.start_m, self.ego_path.path
+        start_m = self.spec.ego.start_m
+        ego_line = self.ego_path.path
         at = start_m + s_m
         chain = lane_chain(self.road, self.ego_path, lane, at)
         path = polyline_path(polyline(self.road.lane_map, chain))
@@ -138,7 +139,8 @@ def box_of(actor: ActorSpec) -> Box:
 
 def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
     """Return the actors of an entry whose tracks are known in advance."""
-    box, t = box_of(actor), placer.t_us
+    box = box_of(actor)
+    t = placer.t_us
     rows: Sequence[tuple[float, float]]  # time in seconds and speed
     match actor:
         case ParkedActor():
@@ -150,15 +152,19 @@ def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
             track = Trajectory(t_us, xyz, quat_from_yaw(points[:, 3]))
             return [Actor(actor.id, actor.label, box, track, behaviour=_walking(actor))]
         case DriveActor():
-            lane, rows = actor.lane, actor.speeds
+            lane = actor.lane
+            rows = actor.speeds
         case OncomingActor():
-            lane, rows = -1 - actor.lane, [(0.0, actor.speed_mps)]
+            lane = -1 - actor.lane
+            rows = [(0.0, actor.speed_mps)]
         case HardBrakeActor():
-            lane, brake_s = actor.lane, actor.brake_at_us * 1e-6
+            lane = actor.lane
+            brake_s = actor.brake_at_us * 1e-6
             slow_s = brake_s + (actor.speed_mps - actor.end_speed_mps) / actor.decel_mps2
             rows = [(brake_s, actor.speed_mps), (slow_s, actor.end_speed_mps)]
         case CutInActor():
-            lane, begin_s = actor.from_lane, actor.at_us * 1e-6
+            lane = actor.from_lane
+            begin_s = actor.at_us * 1e-6
             end_mps = actor.speed_mps if actor.end_speed_mps is None else actor.end_speed_mps
             change_s = max(abs(end_mps - actor.speed_mps) / actor.decel_mps2, 1e-3)
             rows = [(begin_s, actor.speed_mps), (begin_s + change_s, end_mps)]
@@ -237,8 +243,10 @@ def _outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tupl
     turned = side == "left" and bool(oncoming)
     edge = lane.right if side == "right" or turned else lane.left
     assert edge is not None
-    c, s = np.cos(float(yaw)), np.sin(float(yaw))
-    along, normal = np.array([c, s]), np.array([-s, c])
+    c = np.cos(float(yaw))
+    s = np.sin(float(yaw))
+    along = np.array([c, s])
+    normal = np.array([-s, c])
     rest = edge[:, :2] - xyz[:2]
     # The edge's vertex most nearly abreast; edges are sampled every metre and nearly parallel to
     # the line.
@@ -253,7 +261,8 @@ def _gap_cars(placer: _Placer) -> list[Actor]:
     for i, segment in enumerate(placer.spec.road.segments):
         if not isinstance(segment, NarrowGapSegment):
             continue
-        begin, end = placer.ego_path.stretch_s[i], placer.ego_path.stretch_s[i + 1]
+        begin = placer.ego_path.stretch_s[i]
+        end = placer.ego_path.stretch_s[i + 1]
         for side, count in (("left", segment.cars_left), ("right", segment.cars_right)):
             sign = 1.0 if side == "left" else -1.0
             for n in range(count):
@@ -296,7 +305,8 @@ def _road_edges(road: Road, path: Path, at: float) -> tuple[float, float]:
     left, looking square to the line.
     """
     xyz, yaw = path.at(at)
-    c, s = np.cos(float(yaw)), np.sin(float(yaw))
+    c = np.cos(float(yaw))
+    s = np.sin(float(yaw))
     found = []
     for edge in road.lane_map.road_edges:
         x: F64 = (edge[:, 0] - xyz[0]) * c + (edge[:, 1] - xyz[1]) * s
@@ -304,7 +314,8 @@ def _road_edges(road: Road, path: Path, at: float) -> tuple[float, float]:
         cross = np.flatnonzero((x[:-1] <= 0) != (x[1:] <= 0))
         found.append(y[cross] - x[cross] * (y[cross + 1] - y[cross]) / (x[cross + 1] - x[cross]))
     away_m = np.concatenate(found)
-    right, left = away_m[away_m < 0], away_m[away_m > 0]
+    right = away_m[away_m < 0]
+    left = away_m[away_m > 0]
     if not len(right) or not len(left):
         raise InputError(f"{at:.0f} m: no road edge on one side", "choose a place on the road")
     return float(right.max()), float(left.min())

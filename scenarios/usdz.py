@@ -250,7 +250,8 @@ def _actors(archive: Archive) -> tuple[Actor, ...]:
                 raise InputError(f"{where}: track {name!r} twice", "give each track its own id")
             table = np.array(poses, np.float64).reshape(len(times), 7)
             t_us = np.array(times, np.int64)
-            xyz, quat = table[:, :3].copy(), table[:, [6, 3, 4, 5]].copy()
+            xyz = table[:, :3].copy()
+            quat = table[:, [6, 3, 4, 5]].copy()
             track = checked_trajectory(f"{where}, track {name}", t_us, xyz, quat)
             box = Box(*map(float, size))
             still = "CONTROLLABLE" not in flags
@@ -293,7 +294,8 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
 
 
 def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[str, F64]) -> None:
-    rows, passed_m = [], 0.0
+    rows = []
+    passed_m = 0.0
     for record in road.records:
         if record.kind not in ("line", "arc"):
             continue

@@ -28,7 +28,8 @@ class Archive:
     """
 
     def __init__(self, files: SourceFiles, path: Path) -> None:
-        self.files, self.path = files, path
+        self.files = files
+        self.path = path
         with contextlib.ExitStack() as opening:
             stream = opening.enter_context(open_regular(path, ARCHIVE_BYTES))
             with parsing(path, "fetch the file again; it may be truncated", "no readable ZIP"):
@@ -87,7 +88,8 @@ class Archive:
         """Read a YAML member; only plain data is built, within the bounds of a configuration
         file.
         """
-        where, data = f"{self.path}, {member}", self.read(member)
+        where = f"{self.path}, {member}"
+        data = self.read(member)
         YAML_BYTES.check(len(data), where)
         with parsing(where, "fetch the file again", "broken YAML"):
             return parse(data.decode("utf-8"), where).data

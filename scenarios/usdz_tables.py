@@ -101,7 +101,8 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
         lane_id = str(key["map_id"])
         do_this = "give every lane two rails with the same number of points, at least two"
         with parsing(f"{archive.path}, {folder}, lane {lane_id}", do_this):
-            left, right = points(own["left_rail"]), points(own["right_rail"])
+            left = points(own["left_rail"])
+            right = points(own["right_rail"])
             if len(left) != len(right) or len(left) < 2:
                 raise ValueError(f"rails of {len(left)} and {len(right)} points")
         rails_of[lane_id] = left, right

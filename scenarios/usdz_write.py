@@ -34,7 +34,8 @@ from scenarios.ftheta import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables
 
 SHUTTER_US = 30_000  # of a camera that has none: AlpaSim wants every frame's end after its start
-GROUND_MARGIN_M, GROUND_NODES = 30.0, 200_000
+GROUND_MARGIN_M = 30.0
+GROUND_NODES = 200_000
 _LABELS = {
     "car": "automobile",
     "truck": "heavy_truck",
@@ -178,7 +179,8 @@ def frame_times(scenario: Scenario, camera: CameraSpec) -> list[list[int]]:
     would begin before the first recorded pose is left out, since AlpaSim cannot place the camera at
     its start.
     """
-    first_us, last_us = int(scenario.ego_log.t_us[0]), int(scenario.ego_log.t_us[-1])
+    first_us = int(scenario.ego_log.t_us[0])
+    last_us = int(scenario.ego_log.t_us[-1])
     shutter_us = camera.shutter_us or SHUTTER_US
     ends = range(scenario.start_us, last_us + 1, scenario.rates.camera_us)
     frames = [[end - shutter_us, end] for end in ends if end - shutter_us >= first_us]
@@ -225,7 +227,8 @@ def ground_mesh(scenario: Scenario) -> bytes:
     xy = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     vertices = np.column_stack([xy, height_at(ground, xy)]).astype("<f4")
     corner = (np.arange(len(ys) - 1)[:, None] * len(xs) + np.arange(len(xs) - 1)).ravel()
-    right, up = corner + 1, corner + len(xs)
+    right = corner + 1
+    up = corner + len(xs)
     faces = np.concatenate(
         [np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])]
     )

@@ -149,7 +149,8 @@ def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[A
     """Return every key whose value the scene seed has changed, dotted, with the value as written
     (None: absent) and as drawn.
     """
-    before, after = _flat(written, ()), _flat(drawn, ())
+    before = _flat(written, ())
+    after = _flat(drawn, ())
     return {
         key: (before.get(key), value) for key, value in after.items() if before.get(key) != value
     }

@@ -74,6 +74,7 @@ def pytest_terminal_summary(terminalreporter, config):
     file.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
     terminalreporter.section("files that became slower")
     lines = slower(before, now) if before else ["there is nothing to compare with"]
-    total, was = sum(now.values()), sum(before.get(name, 0.0) for name in now)
+    total = sum(now.values())
+    was = sum(before.get(name, 0.0) for name in now)
     for line in [*lines, f"all {len(now)} files: {was:.0f} s -> {total:.0f} s"]:
         terminalreporter.write_line(line)

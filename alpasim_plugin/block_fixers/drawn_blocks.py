@@ -40,7 +40,8 @@ def drawn_blocks(
         The weights of all networks, and the call, which returns frames ``(1, 3, T, H, W)``.
     """
     sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
-    frames, latents = GROUP * settings.block_latents, settings.block_latents
+    frames = GROUP * settings.block_latents
+    latents = settings.block_latents
     with torch.device(device):  # weights are those that torch's layers begin with
         plain = CosmosCausalDiT(sizes, settings.rope_ratios)
         dit = at_precision(plain, settings.precision, FLOAT32_KEYS)

@@ -48,7 +48,8 @@ class BlockCache(ABC):
     ) -> None:
         self.rope, self.batch, self.height, self.width = rope, batch, height, width
         self.window, self.sink, self.device = window, sink, device
-        self.rows, self.columns = height // 2, width // 2
+        self.rows = height // 2
+        self.columns = width // 2
         self.tokens = self.rows * self.columns
         self.reset()
 

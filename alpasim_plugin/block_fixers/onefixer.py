@@ -151,7 +151,8 @@ class OneFixer(Fixer):
             [(part.cameras, part.shape) for part in parts] for parts in (views, self._history)
         )
         if given != known and not self._done:
-            self._history, self._pending = tuple(self._open(view) for view in views), ()
+            self._history = tuple(self._open(view) for view in views)
+            self._pending = ()
         elif given != known:
             raise InputError(
                 f"block {self._done}: cameras and sizes {given} after {known}",

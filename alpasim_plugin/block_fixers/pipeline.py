@@ -120,12 +120,14 @@ class BlockPipeline:
             ``(B, 3, T, H, W)``, not clipped to [-1, 1], and the state after the block, which is
             still open: give it to `keep`, or run the block again.
         """
-        settings, nets = self.settings, self.networks
+        settings = self.settings
+        nets = self.networks
         is_first = state.latent == 0
         shown = map_video(settings, rgb, sdmap)
         views = rgb if shown is None else torch.cat([rgb, shown])
         latents, encoder = nets.vae.encode_next(views, state.encoder)
-        z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
+        z_render = latents[: len(rgb)].float()
+        z_map = latents[len(rgb) :].float()
         if shown is None:
             z_map = torch.zeros_like(z_render)
         sources = list(noise[: len(self.schedule)])
@@ -164,5 +166,6 @@ class BlockPipeline:
         def clean(codec: State | None) -> State | None:
             return codec and tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in codec)
 
-        encoder, decoder = clean(state.encoder), clean(state.decoder)
+        encoder = clean(state.encoder)
+        decoder = clean(state.decoder)
         return replace(state, encoder=encoder, decoder=decoder, write=None)

@@ -145,7 +145,8 @@ class TinyDecoder(StreamingDecoder):
         first_convs = [
             f"decoder.{FIRST + STAGE * stage}.conv.0.bias" for stage in range(len(GROWTH))
         ]
-        stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) - 1}.weight"
+        stem = "decoder.1.weight"
+        last = f"decoder.{FIRST + STAGE * len(GROWTH) - 1}.weight"
         *widths, _ = first_axes(tensors, [*first_convs, last, stem], source, DO)
         with torch.device("meta"):
             net = cls(tensors[stem].shape[1], widths, scaled)

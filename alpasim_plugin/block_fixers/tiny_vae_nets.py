@@ -149,7 +149,8 @@ def _cosines(n: int) -> Tensor:
     compiler, which takes seconds.
     """
     index = torch.arange(n, dtype=torch.float64, device="cpu")
-    k, i = index[:, None], index[None]
+    k = index[:, None]
+    i = index[None]
     matrix = torch.cos(math.pi * (i + 0.5) * k / n) * math.sqrt(2 / n)
     matrix[0] /= math.sqrt(2)
     return matrix
@@ -229,7 +230,8 @@ class TinyVAEEncoder(nn.Module):
 
     def __init__(self, sizes: TinySizes) -> None:
         super().__init__()
-        quarter, eighth = sizes.encoder_quarter, sizes.encoder_eighth
+        quarter = sizes.encoder_quarter
+        eighth = sizes.encoder_eighth
         self.stem = FrameConv(GROUP * PIXELS, quarter)
         self.near = TemporalResidualBlock(quarter)
         self.fold = FrameConv(quarter, eighth, side=2, stride=2, around=0)

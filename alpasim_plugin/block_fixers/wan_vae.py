@@ -41,7 +41,8 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
 )
 from alpasim_plugin.fixers.network.checkpoints import clean, load_checked, unwrap
 
-COLOURS, LATENT = 3, 16
+COLOURS = 3
+LATENT = 16
 STEM = "encoder.conv1.bias"
 
 

@@ -199,7 +199,8 @@ class Upsample(nn.Module):
         """
         if self.time_conv is not None:
             first = 1 if streaming.first else 0
-            alone, rest = x[:, :first], x[:, first:]
+            alone = x[:, :first]
+            rest = x[:, first:]
             if rest.shape[1]:
                 rest = channels_to_frames(self.time_conv.next(rest, streaming), 2)
             else:

@@ -186,7 +186,8 @@ def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[st
         >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk", "difix:fixer.weights.bundle=d.safetensors"])
         (('timing.warmup_us=400000',), ('mode=chunk', 'difix:weights.bundle=d.safetensors'))
     """
-    of_scene, of_fixer = [], []
+    of_scene = []
+    of_fixer = []
     for text in overrides:
         key, equals, value = text.partition("=")
         renderer, fixer, rest = key.rpartition(FIXER_PREFIX)

@@ -29,7 +29,8 @@ if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its ke
     from evaluators.opening import Run
     from evaluators.statistics.decision import State
 
-SHOWN_CHANGES, SHOWN_SCENES = 4, 5
+SHOWN_CHANGES = 4
+SHOWN_SCENES = 5
 MAX_LINES = 1000  # of finished rollouts on a pipe
 LARGE_PX = 1_000_000  # of the cameras of a scene, from which on a run says what they cost
 PX_PER_S = 5e6  # that one core draws of a built scene, within a factor of two
@@ -149,7 +150,8 @@ class Progress(progress.Progress):
         task = self.tasks[-1]
         self.printed_s = time.monotonic()
         self.advance(task.id)
-        done, total = int(task.completed), int(task.total or 0)
+        done = int(task.completed)
+        total = int(task.total or 0)
         is_shown = done == total or done % max(1, total // MAX_LINES) == 0
         if manifest["status"] != "ok" or (self.disable and is_shown):
             self.say(f"[{done}/{total}] {describe(manifest, reused)}")
@@ -170,7 +172,8 @@ class Progress(progress.Progress):
 
 def report_lines(root: Path) -> list[str]:
     """Return the lines that name a run's report and the command that replays its rollouts."""
-    page, run = root / "report.html", shlex.quote(str(root))
+    page = root / "report.html"
+    run = shlex.quote(str(root))
     report = shlex.quote(str(page)) if os.path.exists(page) else f"not written; simrun report {run}"
     return [f"report   {report}", f"watch    simrun view {run}"]
 

@@ -30,7 +30,8 @@ from evaluators.report.birdseye import chord_angle, drawn_map
 MOMENTS = 5  # that are shown, evenly from the first frame to the end
 MARGIN_M = 15.0
 SIZE = (13.0, 7.0)  # inches
-SHOWN_CHANGES, SHOWN_NOTES = 6, 4
+SHOWN_CHANGES = 6
+SHOWN_NOTES = 4
 ROAD, MARKING, CROSSWALK, EDGE, EGO = "#d7dadd", "#ffffff", "#c3c8cd", "#7d858c", "#0b6bb3"
 OTHERS = ("#c2540a", "#00806a", "#9a4f8f", "#8a6a00", "#b3344a", "#3f51b5", "#5b6470")
 
@@ -128,7 +129,8 @@ def _draw_map(
         _draw_user(axes, world, actor.track, actor.box, 0.0, times, colour)
     vehicle = scenario.vehicle
     _draw_user(axes, world, log, vehicle.box, vehicle.rear_axle_to_centre_m, times, EGO)
-    low, high = turn.transform(driven).min(axis=0), turn.transform(driven).max(axis=0)
+    low = turn.transform(driven).min(axis=0)
+    high = turn.transform(driven).max(axis=0)
     axes.set_xlim(low[0] - MARGIN_M, high[0] + MARGIN_M, auto=True)
     axes.set_ylim(low[1] - MARGIN_M, high[1] + MARGIN_M, auto=True)
 

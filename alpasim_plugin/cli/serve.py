@@ -21,7 +21,8 @@ from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.runs.score_logs import scenario_finder
 
-RENDERER_ADDRESS, DRIVER_ADDRESS = "127.0.0.1:50051", "127.0.0.1:50052"
+RENDERER_ADDRESS = "127.0.0.1:50051"
+DRIVER_ADDRESS = "127.0.0.1:50052"
 CALLS_AT_A_TIME = 32  # further ones wait
 MIB = 1 << 20
 

@@ -157,7 +157,8 @@ def _rk4(
     yaw_a = s.yaw_rad + 0.5 * h * w0
     yaw_b = s.yaw_rad + 0.5 * h * w1
     yaw_c = s.yaw_rad + h * w1
-    cos, sin = math.cos, math.sin
+    cos = math.cos
+    sin = math.sin
     x = s.x_m + h / 6 * (v0 * cos(s.yaw_rad) + 2 * v1 * (cos(yaw_a) + cos(yaw_b)) + v2 * cos(yaw_c))
     y = s.y_m + h / 6 * (v0 * sin(s.yaw_rad) + 2 * v1 * (sin(yaw_a) + sin(yaw_b)) + v2 * sin(yaw_c))
     return BicycleState(

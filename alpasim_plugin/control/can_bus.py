@@ -53,7 +53,8 @@ class Address:
         options = options_of(query, ("map", "dbc", "timeout_ms"), f"can://{text}")
         interface, colon, channel = place.partition(":")
         if not colon or interface not in INTERFACES:
-            interface, channel = "virtual", place
+            interface = "virtual"
+            channel = place
         timeout = options.get("timeout_ms", "100")
         if not channel or not timeout.isdigit() or not 0 < int(timeout) <= 10_000:
             raise InputError(
@@ -166,7 +167,8 @@ class Exchange:
         if not waiting:
             self.latencies_s.append(self.clock() - began)
         self._began_us = t_us if self._began_us is None else self._began_us
-        wheel, accel = self._steer.value, self._accel.value
+        wheel = self._steer.value
+        accel = self._accel.value
         since_us = min(self._steer.t_us, self._accel.t_us)
         mark: Mark = "held" if waiting else "fresh"
         if wheel is None or accel is None:  # nothing to hold: the ramp begins at once

@@ -273,8 +273,10 @@ def _range(signal: Any) -> tuple[float, float]:
         low = -high
     else:
         scaled = [raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal)]
-        low, high = min(scaled), max(scaled)
-    least, most = signal.minimum, signal.maximum
+        low = min(scaled)
+        high = max(scaled)
+    least = signal.minimum
+    most = signal.maximum
     half = abs(float(signal.scale)) / 2
     if least is None or most is None or not low - half <= least < most <= high + half:
         return low, high

@@ -30,7 +30,8 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 
-PLAN_US, PLAN_STEP_US = 5_000_000, 100_000
+PLAN_US = 5_000_000
+PLAN_STEP_US = 100_000
 TRACK_M = 1.6  # between the wheels of an axle
 SAME_M = 1e-3  # the ego is where the last plan put it
 PATH_REACH_M = 40.0  # of the route ahead that is sent
@@ -50,7 +51,8 @@ class CanPolicy(Policy):
     is_remote = True
 
     def __init__(self, scenario: Scenario, address: str) -> None:
-        self._vehicle, self._period_us = scenario.vehicle, scenario.rates.policy_us
+        self._vehicle = scenario.vehicle
+        self._period_us = scenario.rates.policy_us
         self._address = Address.parse(address)
         can_map, database = load_map(self._address.map, self._address.dbc)
         self._ratio = can_map.steering_ratio
@@ -87,7 +89,8 @@ class CanPolicy(Policy):
         Raises:
             PolicyError: The bus refuses to send.
         """
-        now, start = observation.t_us, self._start(observation)
+        now = observation.t_us
+        start = self._start(observation)
         path = observation.route_rig[np.isfinite(observation.route_rig).all(axis=1)]
         states = [start]
         state = start
@@ -151,7 +154,8 @@ class CanPolicy(Policy):
             at = ego.T_world_rig[:2, 3]
             if np.hypot(state.x_m - at[0], state.y_m - at[1]) < SAME_M:
                 return BicycleState(0.0, 0.0, 0.0, state.speed_mps, state.steer_rad)
-        self._steer_rate, self._accel = 0.0, ego.accel_mps2
+        self._steer_rate = 0.0
+        self._accel = ego.accel_mps2
         return BicycleState(0.0, 0.0, 0.0, ego.speed_mps, _steer_of(ego, self._vehicle))
 
     def _command(self, commands: Commands) -> Command:
@@ -213,7 +217,8 @@ def path_cubic(path: F64, state: BicycleState) -> tuple[float, float, float, flo
     A lane camera's usual form: y(x) = offset + heading x + curvature x^2 / 2 + rate x^3 / 6. All
     are 0 where there is no route ahead.
     """
-    cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
+    cos = np.cos(state.yaw_rad)
+    sin = np.sin(state.yaw_rad)
     away = path[:, :2] - np.array([state.x_m, state.y_m])
     xy = away @ np.array([[cos, -sin], [sin, cos]])
     xy = xy[(xy[:, 0] > -5.0) & (xy[:, 0] < PATH_REACH_M)]

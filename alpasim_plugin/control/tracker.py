@@ -204,7 +204,8 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     # Knots in the order of time while the plan drives one way; the way is the sign of the furthest
     # excursion.
     sign = 1.0 if s[np.argmax(np.abs(s))] >= 0 else -1.0
-    keep, places = [0], list(zip(s.tolist(), *xy.T.tolist(), strict=True))
+    keep = [0]
+    places = list(zip(s.tolist(), *xy.T.tolist(), strict=True))
     s_kept, x_kept, y_kept = places[0]
     for i, (s_i, x, y) in enumerate(places):
         # Headings that contradict the motion can make progress where nothing moves: such a step has
@@ -217,12 +218,14 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
             s_kept = s_i
             x_kept = x
             y_kept = y
-    path_s, path_xy = s[keep], xy[keep]
+    path_s = s[keep]
+    path_xy = xy[keep]
     if len(keep) == 1:
         path_s = np.array([s[0] - 1.0, s[0] + 1.0])
         path_xy = np.stack([xy[0] - heading[0], xy[0] + heading[0]])
     elif sign < 0:
-        path_s, path_xy = path_s[::-1], path_xy[::-1]
+        path_s = path_s[::-1]
+        path_xy = path_xy[::-1]
     return ReferencePath((plan.t_us - t_us).astype(np.float64) * 1e-6, s, path_s, path_xy)
 
 

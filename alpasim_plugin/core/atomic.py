@@ -83,7 +83,8 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     Raises:
         InfrastructureError: The disk refuses.
     """
-    partial, old = temporary_path(folder), temporary_path(folder)
+    partial = temporary_path(folder)
+    old = temporary_path(folder)
     try:
         partial.mkdir(parents=True)
         yield partial

@@ -8,7 +8,8 @@ from alpasim_plugin.core.types import Scenario
 
 # Pixels per radian from which a camera sees that the usual cells are soft; 1.2 for 512 pixels across
 # 70 degrees, and 2.5 for 1900 across 120.
-USUAL_PX_PER_RAD, MOST_HALVINGS = 450.0, 2
+USUAL_PX_PER_RAD = 450.0
+MOST_HALVINGS = 2
 
 
 def halvings_of(px_per_rad: float) -> int:

@@ -153,7 +153,8 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
         InputError: A time lies outside ``[t_us[0], t_us[-1]]``; poses are never extrapolated.
     """
     t = np.asarray(t_us, np.int64)
-    first, last = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    first = int(trajectory.t_us[0])
+    last = int(trajectory.t_us[-1])
     if t.size and (int(t.min()) < first or int(t.max()) > last):
         raise InputError(
             f"times {int(t.min())}..{int(t.max())} us: the trajectory covers {first}..{last} us",
@@ -209,7 +210,8 @@ def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
     rises = s[1:] > s[:-1]
     if not rises.all():
         keep = np.concatenate([[True], rises])
-        s, line = s[keep], line[keep]
+        s = s[keep]
+        line = line[keep]
     at = np.asarray(s_m, np.float64)
     out = np.empty((*at.shape, line.shape[1]))
     for d in range(line.shape[1]):
@@ -221,7 +223,8 @@ def project(line: F64, xy: F64) -> tuple[float, float]:
     """Return (arc length, signed distance; left positive) of the point of a polyline ``(N, 2+)``
     nearest to ``xy``.
     """
-    a, b = line[:-1, :2], line[1:, :2]
+    a = line[:-1, :2]
+    b = line[1:, :2]
     d = b - a
     length2 = np.maximum(np.sum(d * d, axis=1), 1e-300)
     f = np.clip(np.sum((xy[:2] - a) * d, axis=1) / length2, 0.0, 1.0)
@@ -243,8 +246,10 @@ def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:
     (length, width) ``(N, 2)``.
     """
     local = UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    x, y = local[..., 0], local[..., 1]
+    c = np.cos(yaw)[:, None]
+    s = np.sin(yaw)[:, None]
+    x = local[..., 0]
+    y = local[..., 1]
     return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)
 
 
@@ -270,13 +275,12 @@ def centre_line(left: F64, right: F64, max_step_m: float = 2.0) -> F64:
     Points at equal shares of both edges' lengths are averaged, at every vertex of either edge and
     at most ``max_step_m`` apart.
     """
-    share_left, share_right = _shares(left), _shares(right)
+    share_left = _shares(left)
+    share_right = _shares(right)
     shares = np.unique(np.round(np.concatenate([share_left, share_right]), 9))
     length = max(float(arc_lengths(left)[-1]), float(arc_lengths(right)[-1]))
-    at_left, at_right = (
-        resample(left, shares * arc_lengths(left)[-1]),
-        resample(right, shares * arc_lengths(right)[-1]),
-    )
+    at_left = resample(left, shares * arc_lengths(left)[-1])
+    at_right = resample(right, shares * arc_lengths(right)[-1])
     middle = (at_left + at_right) / 2
     steps = np.linalg.norm(np.diff(middle[:, :2], axis=0), axis=1)
     keep = np.concatenate([[True], steps > 1e-6 * max(length, 1.0)])

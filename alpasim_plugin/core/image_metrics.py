@@ -16,7 +16,8 @@ import numpy.typing as npt
 from alpasim_plugin.core.types import F32, U8
 
 CAP_DB = 100.0  # of identical images, whose ratio is infinite
-WINDOW_PX, SIGMA_PX = 11, 1.5
+WINDOW_PX = 11
+SIGMA_PX = 1.5
 C1, C2 = 0.01**2, 0.03**2  # for values in 0 to 1
 # uint8 sRGB value, 0..255: an image is black when no channel of any pixel is above it; AlpaSim's
 # img_is_black
@@ -55,7 +56,8 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
         1.0
     """
     a, b = (np.ascontiguousarray(x, np.float32) / np.float32(peak) for x in (image, truth))
-    mu_a, mu_b = gaussian_blur(a), gaussian_blur(b)
+    mu_a = gaussian_blur(a)
+    mu_b = gaussian_blur(b)
     both = mu_a * mu_b
     square_a = mu_a * mu_a
     square_b = mu_b * mu_b

@@ -173,7 +173,8 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
             assert whole.resample is not None, "a pinhole that covers a lens"
             share = weight.astype(np.float32).reshape(camera.height, camera.width)
             own = np.flatnonzero(share.any(axis=0))
-            first, end = int(own[0]), int(own[-1]) + 1
+            first = int(own[0])
+            end = int(own[-1]) + 1
             place, share = (
                 np.ascontiguousarray(part[:, first:end]) for part in (whole.resample, share)
             )
@@ -188,7 +189,8 @@ def _panels(rays: Rays) -> dict[str, F64]:
     """
     ray = rays.ray[rays.seen]
     azimuth = np.arctan2(ray[:, 0], ray[:, 2])
-    low, high = float(azimuth.min()), float(azimuth.max())
+    low = float(azimuth.min())
+    high = float(azimuth.max())
     middles = low + (high - low) * np.array([1, 3, 5]) / 6
     return {
         name: cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
@@ -200,7 +202,8 @@ def part_of(request: RenderRequest, side: Lens, share: F32 | None = None) -> Ren
     """Return the request of one pinhole of a request's lens, exposed as ``share`` says where the
     lens's shutter rolls.
     """
-    camera, exposure = request.camera, request.exposure
+    camera = request.camera
+    exposure = request.exposure
     if exposure is not None and share is not None:
         exposure = replace(exposure, share=share)
     return replace(
@@ -336,7 +339,8 @@ def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
             reach = 2 * float(np.linalg.norm(corners - K[:2, 2], axis=1).max())
             radius, good = _inverse(np.array(lens.pixel_to_angle), angle, reach, camera.name)
         else:
-            radius, good = _value(_radius_of_angle(lens), angle), angle <= _growing(lens)
+            radius = _value(_radius_of_angle(lens), angle)
+            good = angle <= _growing(lens)
         plane = ray[:, :2] / np.maximum(across, 1e-12)[:, None] * radius[:, None]
         pixel = plane * K[[0, 1], [0, 1]] if lens.kind == "fisheye" else plane @ _linear(lens).T
     pixel = pixel + K[:2, 2]
@@ -424,7 +428,8 @@ def _require_cover(camera: CameraSpec, rays: Rays) -> None:
 
 
 def _checked(camera: CameraSpec) -> tuple[LensModel, F64]:
-    lens, K = camera.lens, camera.K
+    lens = camera.lens
+    K = camera.K
     assert lens is not None, "a pinhole is its own lens"
     numbers = [*lens.coefficients, *lens.pixel_to_angle, *lens.linear, lens.max_angle_rad]
     _require(
@@ -531,7 +536,8 @@ def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tup
     """Invert `_distorted` by Newton's method with a numerical Jacobian, from the distorted points;
     the flag says where that is right within `CLOSE_PX`.
     """
-    xy, h = given.copy(), 1e-6
+    xy = given.copy()
+    h = 1e-6
     with np.errstate(all="ignore"):
         for _ in range(8):
             at = _distorted(xy, lens)
@@ -554,10 +560,12 @@ def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str, turn: F64 = 
     xy = np.divide(
         local[:, :2], local[:, 2:], where=local[:, 2:] > 0.05, out=np.zeros_like(local[:, :2])
     )
-    low, high = xy[mine].min(0), xy[mine].max(0)
+    low = xy[mine].min(0)
+    high = xy[mine].max(0)
     size = (high - low) * rays.focal
     shrink = min(1.0, float(np.sqrt(MAX_COVER_PX / max(size[0] * size[1], 1.0))))
-    fx, fy = rays.focal[0] * shrink, rays.focal[1] * shrink
+    fx = rays.focal[0] * shrink
+    fy = rays.focal[1] * shrink
     cover = int(np.ceil(size[0] * shrink)) + 2, int(np.ceil(size[1] * shrink)) + 2
     K = np.array([[fx, 0.0, 1.0 - low[0] * fx], [0.0, fy, 1.0 - low[1] * fy], [0.0, 0.0, 1.0]])
     # cv2 counts from the centre of the first pixel

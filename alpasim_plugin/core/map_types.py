@@ -97,7 +97,8 @@ class Signal:
             line: Metres, relative to ``origin``.
             origin: ``(3,)`` world point.
         """
-        start, along = self.stop[0] - origin, self.stop[1, :2] - self.stop[0, :2]
+        start = self.stop[0] - origin
+        along = self.stop[1, :2] - self.stop[0, :2]
         normal = np.array([-along[1], along[0]])
         normal *= np.sign(normal @ (np.cos(self.heading_rad), np.sin(self.heading_rad)))
         beyond = (line[:, :2] - start[:2]) @ normal

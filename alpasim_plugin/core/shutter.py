@@ -87,7 +87,8 @@ def bands(request: RenderRequest) -> list[Band]:
     """Return the bands of a request's frame, in the order of their time; without an exposure one,
     at the shutter's end.
     """
-    height, width = request.camera.height, request.camera.width
+    height = request.camera.height
+    width = request.camera.width
     if request.exposure is None:
         return [
             Band(slice(0, height), slice(0, width), None, request.T_world_camera[1], request.actors)
@@ -117,14 +118,16 @@ def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:
     """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
     share = request.exposure.share
-    height, width = request.camera.height, request.camera.width
+    height = request.camera.height
+    width = request.camera.width
     part = np.full(share.shape, -1, np.int32)
     np.minimum(share * count, count - 1, out=part, where=~np.isnan(share), casting="unsafe")
     for index in range(count):
         mine = part == index
         if not mine.any():
             continue
-        rows, columns = extent(mine.any(axis=1), height), extent(mine.any(axis=0), width)
+        rows = extent(mine.any(axis=1), height)
+        columns = extent(mine.any(axis=0), width)
         window = np.broadcast_to(mine, (height, width))[rows, columns]
         within = share[mine]
         T, actors = at_share(request, (float(within.min()) + float(within.max())) / 2)
@@ -176,12 +179,14 @@ def motion_px(request: RenderRequest) -> float:
     """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
     K, (start, end) = request.camera.K, request.T_world_camera
-    width, height = request.camera.width, request.camera.height
+    width = request.camera.width
+    height = request.camera.height
     u, v = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     to_start = inverse(start) @ end
-    turned, moved = rays @ to_start[:3, :3].T, to_start[:3, 3] / NEAR_M
+    turned = rays @ to_start[:3, :3].T
+    moved = to_start[:3, 3] / NEAR_M
     moves = [angle_between(rays, turned), angle_between(rays, turned + moved)]
     if request.actors:
         first = np.array([request.exposure.actors_start[name][:3, 3] for name in request.actors])

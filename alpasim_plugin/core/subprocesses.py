@@ -92,7 +92,8 @@ class _Output(io.TextIOBase):
             shown = text
             self._written += len(text)
             if self._written >= MOST_BYTES:
-                shown, self._rest = self._rest, ""
+                shown = self._rest
+                self._rest = ""
             sys.stderr.write(shown)
             if self._path is not None:
                 if self._file is None:

@@ -365,7 +365,8 @@ def _write_transforms(
 ) -> None:
     frames = []
     for one in shown:
-        lens, K = one.photograph.lens, one.photograph.lens.straight_K()
+        lens = one.photograph.lens
+        K = one.photograph.lens.straight_K()
         frame = {
             "file_path": one.file,
             "transform_matrix": one.T_world_camera.tolist(),
@@ -414,10 +415,12 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
 
 def _in_view(view: PosedView) -> list[str]:
     """Return the road users whose middle lies in an image."""
-    camera, found = view.camera, []
+    camera = view.camera
+    found = []
     for name, T in view.actors.items():
         x, y, depth = (camera.T_camera_world @ T[:, 3])[:3]
-        column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        column = camera.fx * x / depth + camera.cx
+        row = camera.fy * y / depth + camera.cy
         if depth > 0 and 0 <= column < camera.width and 0 <= row < camera.height:
             found.append(name)
     return found

@@ -113,7 +113,8 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
             raise InputError(f"{model}: images of camera {one.camera}, which it lacks", DO_THIS)
         name = f"camera-{one.camera}" if shared else _folder(one.name)
         where = f"{model}, image {one.name}"
-        time_us, lens = times_us.get(one.number), lenses[one.camera]
+        time_us = times_us.get(one.number)
+        lens = lenses[one.camera]
         shot = PosedPhotograph(root / one.name, lens, one.T_world_camera, where, time_us, name, {})
         shots.setdefault(name, []).append(shot)
         if one.camera == reference:
@@ -217,7 +218,8 @@ class _Binary:
     """Take values off binary data, one after the other."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.at = data, 0
+        self.data = data
+        self.at = 0
 
     def take(self, form: str) -> tuple[Any, ...]:
         values = struct.unpack_from("<" + form, self.data, self.at)

@@ -232,7 +232,8 @@ class _Strip:
         self.tilt_knots = np.linspace(
             stations[0], stations[-1], max(2, round(span / TILT_KNOTS) + 1)
         )
-        n, m = len(self.knots), len(self.tilt_knots)
+        n = len(self.knots)
+        m = len(self.tilt_knots)
         bend = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) / BEND
         rise = scipy.sparse.diags([1.0, -1.0], [0, 1], shape=(n - 1, n)) / RISE
         turn = scipy.sparse.diags([1.0, -1.0], [0, 1], shape=(m - 1, m)) / TURN

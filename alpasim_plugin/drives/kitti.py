@@ -81,7 +81,8 @@ def read_kitti(folder: Path) -> SourceDrive:
                 spare.append(path.name)
                 continue
             lens = Lens(*check_image(read_bytes(path), path), K)
-            where, camera = f"{folder}, photograph {i}", "left" if name == left else "right"
+            where = f"{folder}, photograph {i}"
+            camera = "left" if name == left else "right"
             pose = poses[i] @ T_left_camera
             photographs.append(PosedPhotograph(path, lens, pose, where, times[i], camera, {}))
         if spare:
@@ -159,7 +160,8 @@ def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     for i, line in enumerate(lines):
         head = re.match(r"\s*(?:(\w+):|(P\d)\s)", line)
-        name, words = f"P{i}", line
+        name = f"P{i}"
+        words = line
         if head is not None:
             name = (head[1] or head[2]).replace("P_rect_0", "P")
             words = line[head.end() :]

@@ -152,7 +152,8 @@ def _boxes(
         k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))
         along = frame.along[k]
         across = left_of(along)
-        u, v = at[mine] @ along, at[mine] @ across
+        u = at[mine] @ along
+        v = at[mine] @ across
         middle = along * (u.max() + u.min()) / 2 + across * (v.max() + v.min()) / 2
         top = float(tops[mine].max())
         base = float(height_at(ground, middle[None])[0])

@@ -87,7 +87,8 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     shift = np.eye(4)
     first = poses[drive.front][0, :3, 3]
     shift[:3, 3] = -first[0], -first[1], -float(height_at(field, first[None])[0])
-    T, moved = shift @ T, moved.moved(shift)
+    T = shift @ T
+    moved = moved.moved(shift)
     poses = {name: shift @ values for name, values in poses.items()}
     field = HeightField(
         field.x0_m + shift[0, 3], field.y0_m + shift[1, 3], field.cell_m, field.z + shift[2, 3]
@@ -143,7 +144,8 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
             "check the unit of the times (t_us: microseconds) and of the poses",
         )
     if speed[fast] > MOST_MPS:
-        at, found = fast + 1, f"{speed[fast]:.0f} m/s"
+        at = fast + 1
+        found = f"{speed[fast]:.0f} m/s"
     elif len(jumps):
         at = int(jumps[0]) + 2
         found = f"its speed changes by {change[jumps[0]]:.0f} m/s in {dt_s[jumps[0] + 1]:.2g} s"
@@ -167,7 +169,8 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
         if strip is None:
             break
         own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
-        line, along = strip.frame.line[own], strip.frame.along[own]
+        line = strip.frame.line[own]
+        along = strip.frame.along[own]
         left = left_of(along)
         xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
         A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
@@ -239,7 +242,8 @@ def _rig(
     drive: SourceDrive, poses: Mapping[str, F64], field: HeightField
 ) -> tuple[Trajectory, dict[str, F64]]:
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
-    front, photographs = poses[drive.front], drive.of(drive.front)
+    front = poses[drive.front]
+    photographs = drive.of(drive.front)
     centres = front[:, :3, 3]
     step = np.gradient(centres, axis=0)
     moving = np.linalg.norm(step[:, :2], axis=1) > 0.3 * np.median(

@@ -84,7 +84,8 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     found = place(tracks, cameras)
-    worst, count = np.zeros(tracks.count), np.bincount(tracks.point, minlength=tracks.count)
+    worst = np.zeros(tracks.count)
+    count = np.bincount(tracks.point, minlength=tracks.count)
     np.maximum.at(worst, tracks.point, found.error_px)
     good = (
         (count >= FEWEST_VIEWS)
@@ -109,7 +110,8 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
 
 
 def _colour(view: PosedView, at: F64) -> F64:
-    row, column = min(int(at[1]), view.camera.height - 1), min(int(at[0]), view.camera.width - 1)
+    row = min(int(at[1]), view.camera.height - 1)
+    column = min(int(at[0]), view.camera.width - 1)
     return view.rgb[row, column] / 255.0
 
 
@@ -124,7 +126,8 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
         [[m.first, *m.at_first] for m in found] + [[m.second, *m.at_second] for m in found]
     )
     seen, number = np.unique(ends, axis=0, return_inverse=True)
-    number, n = number.ravel(), len(found)
+    number = number.ravel()
+    n = len(found)
     graph = scipy.sparse.coo_matrix(
         (np.ones(n), (number[:n], number[n:])), shape=(len(seen), len(seen))
     )

@@ -78,7 +78,8 @@ def read_py123d(folder: Path) -> SourceDrive:
         ego = checked_trajectory(where, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
         for name in ("length", "width", "height", "wheel_base"):
             BODY_M.check(body[name], f"{where}: {name}")
-        T_imu_axle, T_imu_centre = _T(body["rear_axle_to_imu_se3"]), _T(body["center_to_imu_se3"])
+        T_imu_axle = _T(body["rear_axle_to_imu_se3"])
+        T_imu_centre = _T(body["center_to_imu_se3"])
         vehicle = Vehicle(
             Box(body["length"], body["width"], body["height"]),
             float(T_imu_centre[0, 3] - T_imu_axle[0, 3]),
@@ -153,7 +154,8 @@ def _numbered(members: Sequence[_Member], number: int, what: str) -> _Member:
 
 def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[PosedPhotograph]:
     """Return the photographs of a camera in order of time; none of a camera that is no pinhole."""
-    path, name = folder / f"{key}.arrow", key.removeprefix(CAMERA)
+    path = folder / f"{key}.arrow"
+    name = key.removeprefix(CAMERA)
     columns = ("timestamp_us", "data", "camera_to_global_se3")
     facts, (times, data, stated) = _modality(folder, key, columns)
     with parsing(path, DO_THIS):
@@ -180,7 +182,8 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
         for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
             where = f"{path}, row {i}"
             T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), where)
-            file, encoded = path, None
+            file = path
+            encoded = None
             if pa.types.is_string(data.type):
                 name_in_log = Path(value.as_py())
                 if name_in_log.is_absolute() or ".." in name_in_log.parts:

@@ -165,7 +165,8 @@ def _page(
     notes = list(quality["notes"])
     if not drive.actors:
         notes.append("no tracks of other road users: nobody moves")
-    boxes, ground = quality["obstacles"], quality["ground"]
+    boxes = quality["obstacles"]
+    ground = quality["ground"]
     sides = (
         f", whose sides are known to {boxes['uncertainty_m']} m (median)" if boxes["boxes"] else ""
     )

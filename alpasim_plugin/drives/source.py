@@ -140,7 +140,8 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
     for one in drive.photographs:
         if need_files:
             one.encoded()
-        size, first = (one.lens.width, one.lens.height), drive.of(str(one.camera))[0].lens
+        size = (one.lens.width, one.lens.height)
+        first = drive.of(str(one.camera))[0].lens
         if size != (first.width, first.height):
             raise InputError(
                 f"{one.where}, {one.file}: {size} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
@@ -153,12 +154,14 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
             f"{camera}: it moves {length:.2f} m over {len(photographs)} photographs: it stands, or only turns",
             "give a part of the drive in which the car moves: depth comes from moving",
         )
-    usual, far = float(np.median(steps[steps > 0])), int(np.argmax(steps))
+    usual = float(np.median(steps[steps > 0]))
+    far = int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
         found = f"a step of {steps[far]:.4g}, where the usual step is {usual:.4g}"
         raise _two_units(photographs[far + 1], found)
     medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, 5), axis=1)
-    before, after = medians[:-5], medians[5:]
+    before = medians[:-5]
+    after = medians[5:]
     changes = np.flatnonzero(
         (np.maximum(before, after) > UNITS * np.minimum(before, after)) & (before * after > 0)
     )
@@ -209,7 +212,8 @@ def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]
                 "give each photograph its time (t_us), or photographs of one time names of one number",
             )
         numbers = [list(range(count)) for count in counts]
-        every, step = numbers[0], 1
+        every = numbers[0]
+        step = 1
     return [
         replace(one, t_us=round((number - every[0]) * PERIOD_US / step))
         for camera, column in zip(cameras, numbers, strict=True)
@@ -236,8 +240,10 @@ def in_order(photographs: Sequence[PosedPhotograph]) -> tuple[list[PosedPhotogra
     path along the names, in natural order, is shorter, the names count.
     """
     by_name = sorted(photographs, key=lambda one: natural_order(one.file.as_posix()))
-    listed, named = _length(photographs), _length(by_name)
-    name, rate = photographs[0].camera, 1_000_000 // PERIOD_US
+    listed = _length(photographs)
+    named = _length(by_name)
+    name = photographs[0].camera
+    rate = 1_000_000 // PERIOD_US
     if named < (1 - SAME_LENGTH) * listed:
         note = f"in the order of their names: in the file's order the path is {listed / max(named, 1e-12):.1f} times as long"
         return by_name, f"no times: photographs of {name} are taken {note}; {rate} a second"

@@ -143,7 +143,8 @@ def _in_frame(
     }
     shares = {name: _covered(model, drive) for name, model in models.items()}
     best = max(shares, key=lambda name: shares[name])
-    covered, moved = shares[best], models[best]
+    covered = shares[best]
+    moved = models[best]
     notes: tuple[str, ...] = ()
     if stated is not None:
         seen = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
@@ -194,7 +195,8 @@ def _covered(cloud: GaussianCloud, drive: SourceDrive) -> float:
     photographs = drive.of(drive.front)
     shares = []
     for i in np.unique(np.linspace(0, len(photographs) - 1, VIEWS).astype(int)):
-        lens, pose = photographs[i].lens.resized(VIEW_PX), photographs[i].T_world_camera.copy()
+        lens = photographs[i].lens.resized(VIEW_PX)
+        pose = photographs[i].T_world_camera.copy()
         pose[:3, 3] *= unit
         camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose)
         alpha = rasterize(scaled, camera).alpha
@@ -234,7 +236,8 @@ def _check_frame(file: Path, placed: PlacedDrive) -> None:
         )
     away_m, _ = scipy.spatial.KDTree(placed.ego.xyz[:, :2]).query(xyz[:, :2])
     height_m = (xyz[:, 2] - height_at(placed.ground, xyz))[away_m < ROADSIDE_M]
-    above, below = int((height_m > CLEARLY_M).sum()), int((height_m < -CLEARLY_M).sum())
+    above = int((height_m > CLEARLY_M).sum())
+    below = int((height_m < -CLEARLY_M).sum())
     if below > above:
         raise InputError(
             f"{file}: upside down: beside the path {below} of its surfaces lie below the road and {above} stand on it",

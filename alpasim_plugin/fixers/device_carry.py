@@ -99,7 +99,8 @@ def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     """
     depth = torch.stack([view.target.depth for view in views])  # type: ignore[misc]  # tensors here
     (height, width), size, lenses = size_of(views[0])
-    rays, flat = _rays(depth[0]), depth.flatten(1)
+    rays = _rays(depth[0])
+    flat = depth.flatten(1)
     users = _users(views, depth.device)
     on_ground = _ground_depth(views, rays, flat, users)
     by_depth, by_ground = (
@@ -164,12 +165,14 @@ def _lifted(view: CarriedView) -> F64:
 def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
     most = max(len(view.target.placed.names) for view in views)
     shape = len(views), most
-    ray, eye = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    ray = np.tile(np.eye(3), (*shape, 1, 1))
+    eye = np.zeros((*shape, 3))
     walls = np.ones((*shape, 2, 3))  # of equal ones nothing lies between
     then = np.zeros((*shape, 3 * len(views[0].pinholes), 4))
     for v, view in enumerate(views):
         names, seen = view.target.placed
-        count, project = len(names), _projections(view)
+        count = len(names)
+        project = _projections(view)
         ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
         for i, name in enumerate(names):
             T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
@@ -211,13 +214,15 @@ def _warp(
         inside = inside.all(dim=1, keepdim=True) & (depth > 0)[:, None]
         there = torch.where(inside, _turned(users.then[:, i], local), there)
     u, v, w = there.reshape(-1, 3, there.shape[2]).unbind(1)
-    u, v = u / w, v / w
+    u = u / w
+    v = v / w
     images = [image for view in views for image in view.pinholes]
     surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
     sizes = upload(np.array([image.depth.shape for image in images]), depth.device)
     height, width = sizes[..., None].unbind(1)
     shown = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u, v = torch.where(shown, u, 0.5), torch.where(shown, v, 0.5)
+    u = torch.where(shown, u, 0.5)
+    v = torch.where(shown, v, 0.5)
     place = v.long() * surfaces.shape[2] + u.long()
     surface = surfaces.flatten(1).gather(1, place).double()
     surface = torch.where(surface > 0, surface, INFINITY_M)
@@ -240,7 +245,8 @@ def _stacked(images: Sequence[Tensor]) -> Tensor:
     height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
     padded = []
     for image in images:
-        below, right = height - image.shape[1], width - image.shape[2]
+        below = height - image.shape[1]
+        right = width - image.shape[2]
         if below or right:
             image = F.pad(image[None], (0, right, 0, below), mode="replicate")[0]
         padded.append(image)

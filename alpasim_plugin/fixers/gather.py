@@ -60,7 +60,8 @@ def _gather_references(references, render, mean4, mean2, each4, each2):
     count = references.shape[1]
     height = render.shape[1]
     width = render.shape[2]
-    share, level = np.float32(1.0) / np.float32(count), np.float32(1.0 / HALF)
+    share = np.float32(1.0) / np.float32(count)
+    level = np.float32(1.0 / HALF)
     size = CHANNELS * width
     row = np.empty(size, np.float32)
     mean = np.empty(size, np.float32)
@@ -106,7 +107,8 @@ def _put_runs(row, cells, at, run):
 
 def blend(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
     """Return the same as `network.reference_blend.blend`, of references as bytes."""
-    out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
+    out = torch.empty_like(repaired)
+    recorded = torch.empty_like(repaired[..., :1])
     whole = _array(repaired), *_sources(references, heads), out.numpy(), recorded.numpy()
     none = np.empty((0, 0, 0), np.float32)
     for image, pixels, weight, offset_px, correction, *made in zip(*whole, strict=True):
@@ -144,7 +146,8 @@ def enlarge(
         added = _enlarged_rows(changes[b], scale, band)[:, :width]
         image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
         if sources is not None:
-            mixed, recorded = np.empty_like(image), np.empty_like(image[..., :1])
+            mixed = np.empty_like(image)
+            recorded = np.empty_like(image[..., :1])
             of_image = (part[b] for part in sources)
             more = np.empty((0, 0, 0), np.float32)
             if finer is not None:
@@ -186,7 +189,8 @@ def _blend(
     zero = np.float32(0.0)
     largest = np.float32(LARGEST)
     nowhere = np.float32(NOWHERE)
-    level, half = np.float32(1.0 / HALF), np.float32(0.5 / HALF)
+    level = np.float32(1.0 / HALF)
+    half = np.float32(0.5 / HALF)
     y0, y1, fy = _between(height, scale, DETAIL * cells_down)
     x0, x1, fx = _between(width, scale, DETAIL * cells_across)
     v0, v1, fv = _between(height, scale * DETAIL, cells_down)
@@ -220,7 +224,8 @@ def _blend(
                         for c in range(2):
                             coarse_offset[c, j] = np.float32(scale) * offset_px[k, row, j, c]
                     _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
-            upper, lower = offset_rows[k, v0[y] % 2], offset_rows[k, v1[y] % 2]
+            upper = offset_rows[k, v0[y] % 2]
+            lower = offset_rows[k, v1[y] % 2]
             for x in range(width):
                 px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
                 py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
@@ -259,7 +264,8 @@ def _blend(
                     row_of[k, 2 + row % 2] = row
                     _correction_row(weight[k], correction[k], row, coarse_correction)
                     _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
-            upper, lower = correction_rows[k, y0[y] % 2], correction_rows[k, y1[y] % 2]
+            upper = correction_rows[k, y0[y] % 2]
+            lower = correction_rows[k, y1[y] % 2]
             for x in range(width):
                 logarithm = upper[3, x] + fy[y] * (lower[3, x] - upper[3, x])
                 logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
@@ -308,7 +314,8 @@ def _correction_row(weight, correction, row, out):
     """Write a row of pixels of what a head says of cells: three corrections, then the logarithm of
     the weight.
     """
-    i, into = row // DETAIL, row % DETAIL * DETAIL
+    i = row // DETAIL
+    into = row % DETAIL * DETAIL
     for j in range(weight.shape[1]):
         for half in range(DETAIL):
             for c in range(3):
@@ -321,7 +328,8 @@ def smaller(x: Tensor, scale: int) -> Tensor:
     if scale == 1:
         return x
     height, width, channels = x.shape[-3:]
-    below, right = -height % scale, -width % scale
+    below = -height % scale
+    right = -width % scale
     size = (height + below) // scale, (width + right) // scale
     out = torch.empty(*x.shape[:-3], *size, channels, dtype=x.dtype)
     images, resized = (a.reshape(-1, *a.shape[-3:]) for a in (_array(x), out.numpy()))

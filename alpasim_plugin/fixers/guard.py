@@ -148,8 +148,10 @@ def render_share(
         return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED
-    now, past = _cells(out), _cells(before)
-    low, high = -F.max_pool2d(-past, AROUND, 1, REACH), F.max_pool2d(past, AROUND, 1, REACH)
+    now = _cells(out)
+    past = _cells(before)
+    low = -F.max_pool2d(-past, AROUND, 1, REACH)
+    high = F.max_pool2d(past, AROUND, 1, REACH)
     above = torch.relu(now - high).amax(1, keepdim=True)
     below = torch.relu(low - now).amax(1, keepdim=True)
     unseen = _ramp(above + below, LARGE[0] / 2, LARGE[1] / 2)

@@ -126,10 +126,8 @@ class BlockRunner:
             FixerError: The fixer raised, or its frames have another number, time, camera, size or
                 type.
         """
-        frames, maps = (
-            [item.frame for item in block],
-            [item.map for item in block if item.map is not None],
-        )
+        frames = [item.frame for item in block]
+        maps = [item.map for item in block if item.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
         with self._timed("fix"):
             try:
@@ -193,7 +191,8 @@ class FixedRenderer(Renderer):
 
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
-        label, trained = self.fixer.label, self.fixer.trained
+        label = self.fixer.label
+        trained = self.fixer.trained
         return {"label": label, "trained": trained, "mode": self.mode, **self.counts()}
 
     def counts(self) -> dict[str, Any]:

@@ -46,7 +46,8 @@ class NearestFixer(Fixer):
         device: str = "cpu",
         threads: int | None = None,
     ) -> None:
-        self.settings, self.label = settings, f"{settings.name}, no network"
+        self.settings = settings
+        self.label = f"{settings.name}, no network"
 
     def reset(self, seed: int) -> None:
         """Start a new rollout; there is no history."""

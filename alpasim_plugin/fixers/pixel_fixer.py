@@ -80,7 +80,8 @@ def fix_frame(
     generator: LoadedGenerator, settings: PixelFixerSettings, given: GivenFrame
 ) -> FixedFrame:
     """Fix one frame; a large one as a smaller one, whose changes are then enlarged."""
-    net, operations = generator.net, generator.operations
+    net = generator.net
+    operations = generator.operations
     scale = settings.scale_of(*given.rgb.shape[1:3])
     rgb = operations.smaller(given.rgb, scale)
     alpha, maps, references = (
@@ -97,7 +98,8 @@ def fix_frame(
     opacity = torch.ones_like(render[..., :1]) if alpha is None else padded(alpha)
     sdmap = torch.full_like(render, -1.0) if maps is None else in_range(maps)
     if references is not None:
-        right, below = render.shape[2] - width, render.shape[1] - height
+        right = render.shape[2] - width
+        below = render.shape[1] - height
         references = F.pad(references, (0, 0, 0, right, 0, below))
     transparent = torch.zeros_like(opacity) if settings.holes == "everywhere" else opacity
 
@@ -193,7 +195,8 @@ class PixelFixer(Fixer):
             )
         if threads is not None:
             torch.set_num_threads(threads)
-        self.settings, self.scene_id = settings, scene_id
+        self.settings = settings
+        self.scene_id = scene_id
         self.generator = load_generator(settings, device)
         self.trained = self.generator.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
@@ -254,7 +257,8 @@ class PixelFixer(Fixer):
         views = group_views(block, drawn, 1, on_device=True)
         for view in views:
             check_continues(view, pasts)
-        out, after = list(block), dict(pasts)
+        out = list(block)
+        after = dict(pasts)
         for view in views:
             fixed = self._fix(view, block, pasts)
             for camera, (index,), (frame, history) in zip(
@@ -301,7 +305,8 @@ class PixelFixer(Fixer):
             *(planes.pairs for planes in drawn),
             *(planes.alpha.mean() for planes in drawn),
         )
-        pairs, opacity = rest[: len(drawn)], rest[len(drawn) :]
+        pairs = rest[: len(drawn)]
+        opacity = rest[len(drawn) :]
         if not all([planes.had_room(int(n)) for planes, n in zip(drawn, pairs, strict=True)]):
             return self._fix(*_drawn_again(view, block), histories)
         fixed = []
@@ -310,7 +315,8 @@ class PixelFixer(Fixer):
             if event == guard.NAN:  # it would stay in the state for ever
                 state = self._start(rgb[b : b + 1])
             history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], rgb[b])
-            events, facts = frame.events, dict(frame.facts)
+            events = frame.events
+            facts = dict(frame.facts)
             if frame.pending is not None:  # nobody has looked at the render yet
                 events += guard.render_events(measured[b])
             if opacity:
@@ -372,7 +378,8 @@ def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[F
 def padded(plane: Tensor) -> Tensor:
     """Return planes ``(B, H, W, ...)`` with their edges repeated up to multiples of 16."""
     height, width = plane.shape[1:3]
-    below, right = -height % GRID_PX, -width % GRID_PX
+    below = -height % GRID_PX
+    right = -width % GRID_PX
     if not (below or right):
         return plane
     rows = torch.arange(height + below, device=plane.device).clamp_(max=height - 1)

@@ -42,7 +42,8 @@ from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
 from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
 
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
-KEPT_FRAMES, KEPT_INSTANTS = 24, 4
+KEPT_FRAMES = 24
+KEPT_INSTANTS = 4
 SECOND_M, TURN_M = (
     0.5,
     10.0,
@@ -66,7 +67,8 @@ class ReferenceIndex:
     def __init__(self, recorded: Sequence[RecordedFrame]) -> None:
         self.recorded = tuple(recorded)
         T = np.array([frame.T_world_camera for frame in recorded]).reshape(-1, 4, 4)
-        self._centres, self._axes = T[:, :3, 3], T[:, :3, 2]
+        self._centres = T[:, :3, 3]
+        self._axes = T[:, :3, 2]
         self._t_us: I64 = np.array([frame.t_us for frame in recorded], np.int64)
         self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
         self._lenses: dict[tuple[int, str], list[int]] = {}
@@ -164,7 +166,8 @@ class ReferenceSession:
             hysteresis,
         )
         self.threads = threads
-        self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
+        self._boxes = {actor.actor_id: actor.box for actor in actors}
+        self._ego_log = ego_log
         self._last: dict[str, tuple[int, ...]] = {}
         cameras = len({frame.camera for frame in recorded})
         self._kept = max(KEPT_FRAMES, KEPT_INSTANTS * cameras)
@@ -257,7 +260,8 @@ class ReferenceSession:
 
     def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""
-        T_world_camera, camera = request.T_world_camera[1], request.camera.name
+        T_world_camera = request.T_world_camera[1]
+        camera = request.camera.name
         last = self._last.get(camera, ())
         focal_px = float(request.camera.K[0, 0])
         chosen = self.index.choose(

@@ -70,7 +70,8 @@ def refine_frames(
         maps = tuple(image for _, image in pairs if image is not None)
         begin = time.perf_counter()
         fixed = given if is_unlike else tuple(fixer.step(given, maps))
-        took_s, refused_psnr_db = time.perf_counter() - begin, None
+        took_s = time.perf_counter() - begin
+        refused_psnr_db = None
         if limit is not None and not is_unlike:
             worst = min(_psnr_db(*pair) for pair in zip(given, fixed, strict=True))
             is_unlike = worst < limit.least_psnr_db

@@ -194,7 +194,8 @@ def _stack(
     if len(drawn) == len(frames):
         rgb, alpha, references = stacked(drawn)
     else:
-        rgb, alpha = np.stack([frame.rgb for frame in frames]), _opacity(frames)
+        rgb = np.stack([frame.rgb for frame in frames])
+        alpha = _opacity(frames)
     joined: Any = np.stack
     if maps and not isinstance(maps[0], np.ndarray):
         import torch

@@ -155,7 +155,8 @@ class PinholeCamera:
 
     def unprojected(self, rows: I64, columns: I64, depth: F64) -> F64:
         """Return the points ``(N, 3)`` in the camera's axes that pixels show at depths ``(N,)``."""
-        x, y = (columns + 0.5 - self.cx) / self.fx, (rows + 0.5 - self.cy) / self.fy
+        x = (columns + 0.5 - self.cx) / self.fx
+        y = (rows + 0.5 - self.cy) / self.fy
         return np.column_stack([x * depth, y * depth, depth])
 
     def slope_limits(self) -> tuple[float, float, float, float]:

@@ -168,7 +168,8 @@ class GaussianCloud:
         for cause, bad in faults.items():
             dropped[cause] = int(np.count_nonzero(bad & keep))
             keep &= ~bad
-        scales_kept, opacities_kept = raw.scales[keep], raw.opacities[keep]
+        scales_kept = raw.scales[keep]
+        opacities_kept = raw.opacities[keep]
         repaired = {
             "scale raised to exp(-20) m": int(np.count_nonzero(np.any(scales_kept < low, axis=1))),
             "opacity clipped to [0, 1]": int(

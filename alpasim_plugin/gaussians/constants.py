@@ -29,7 +29,8 @@ LOG_SCALE_LIMIT = 20.0
 # A camera's numbers, one float32 array.
 CAM_FX, CAM_FY, CAM_CX, CAM_CY = range(4)
 CAM_SLOPE_LOW_X, CAM_SLOPE_HIGH_X, CAM_SLOPE_LOW_Y, CAM_SLOPE_HIGH_Y = range(4, 8)
-CAM_WIDTH, CAM_HEIGHT = 8, 9
+CAM_WIDTH = 8
+CAM_HEIGHT = 9
 # of a rolling shutter: the time of a pixel, in shutters from its middle, as a U + b V + c; and by how
 # many pixels things move while it is open, 0: it does not roll
 CAM_TIME_U, CAM_TIME_V, CAM_TIME_0 = 10, 11, 12

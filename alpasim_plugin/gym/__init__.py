@@ -21,7 +21,8 @@ from alpasim_plugin.gym.reward import Reward
 
 __all__ = ["DRIVE", "PLAN", "DriveEnv", "Reward"]
 
-DRIVE, PLAN = "simrun/Drive-v0", "simrun/Plan-v0"
+DRIVE = "simrun/Drive-v0"
+PLAN = "simrun/Plan-v0"
 
 for _id, _actions in ((DRIVE, "controls"), (PLAN, "trajectory")):
     if _id not in gymnasium.registry:

@@ -89,7 +89,8 @@ class HeldCommand(Controller):
         """Return the state at ``to_us``; see `Controller.advance`."""
         dt_s = check_interval(state, to_us)
         after = step(planar(state), self.command, dt_s, self._vehicle)
-        z_m, accel = float(state.T_world_rig[2, 3]), (after.speed_mps - state.speed_mps) / dt_s
+        z_m = float(state.T_world_rig[2, 3])
+        accel = (after.speed_mps - state.speed_mps) / dt_s
         return spatial(after, to_us, z_m, accel, self._vehicle)
 
 
@@ -170,8 +171,10 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     ) -> None:
         self._scenarios = [load_scenario(scenario, seed, tuple(overrides)) for seed in scene_seeds]
         _check(self._scenarios, actions, preset, horizon_us, step_us)
-        self._preset, self._reward = preset, reward
-        self._renderer, self.render_mode = renderer, render_mode
+        self._preset = preset
+        self._reward = reward
+        self._renderer = renderer
+        self.render_mode = render_mode
         self._scenario = self._scenarios[0]
         known = [one.name for one in self._scenario.cameras]
         name = camera if camera is not None else known[0] if known else ""
@@ -243,8 +246,10 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         recorder = _Watching(scenario, seed, Path(folder.name))
         session = make_renderer(self._renderer, scenario, seed, threads=1)
         loop = Loop(scenario, session, self._sensors, self._actions.controller, recorder)
-        driving, scorer = loop.drive(), Scorer(scenario, self._preset, self._reward)
-        self._episode, self._over = _Episode(folder, recorder, loop, driving, scorer), False
+        driving = loop.drive()
+        scorer = Scorer(scenario, self._preset, self._reward)
+        self._episode = _Episode(folder, recorder, loop, driving, scorer)
+        self._over = False
         observation = next(driving)
         while observation.t_us < scenario.start_us + scenario.warmup_us:
             # The recording is forced: nothing to decide.
@@ -344,7 +349,8 @@ class _Watching(Recorder):
 
     def taken(self) -> list[Instant]:
         """Return the instants since the last call."""
-        new, self._new = self._new, []
+        new = self._new
+        self._new = []
         return new
 
 

@@ -51,7 +51,8 @@ class Scorer:
 
     def __init__(self, scenario: Scenario, preset: str, reward: Reward) -> None:
         chosen = find_preset(preset)
-        self._scenario, self._reward = scenario, reward
+        self._scenario = scenario
+        self._reward = reward
         specs = [spec for spec in resolve_evaluators() if spec.name in USED]
         self._evaluators = [(spec.name, build(spec, preset=chosen)) for spec in specs]
         self._kinds = {actor.actor_id: actor for actor in scenario.actors}
@@ -79,9 +80,11 @@ class Scorer:
             for name, evaluator in self._evaluators
             for one in run_evaluator(name, evaluator, rollout, scene)
         }
-        is_first, self._before = self._before is None, instants[-1]
+        is_first = self._before is None
+        self._before = instants[-1]
         lateral_m = float(self._value(found["lateral_distance_m"])[-1])
-        share, length_m = self._value(found["progress"]), self._value(found["gt_dist_traveled_m"])
+        share = self._value(found["progress"])
+        length_m = self._value(found["gt_dist_traveled_m"])
         collision, offroad = (
             bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any())
             for name in ("collision_any", "offroad")
@@ -120,7 +123,8 @@ class Scorer:
             )
             kind = self._kinds[actor_id]
             actors[actor_id] = Actor(actor_id, kind.label, kind.box, track, kind.is_static)
-        start_us, log = scenario.start_us, scenario.ego_log
+        start_us = scenario.start_us
+        log = scenario.ego_log
         return RolloutLog(
             scene_id=scenario.scene_id,
             session_uuid="a step",

@@ -44,7 +44,8 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
             ends = [f"{value:.3g}" for value in (np.nanmin(array), np.nanmax(array))]
             # Yellow where values are high, clear where they are low or missing.
             finite = np.where(np.isfinite(array), array, np.nan).astype(np.float64)
-            low, high = np.nanmin(finite), np.nanmax(finite)
+            low = np.nanmin(finite)
+            high = np.nanmax(finite)
             share = np.nan_to_num((finite - low) / ((high - low) or 1.0))
             bgra = np.stack(
                 [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2

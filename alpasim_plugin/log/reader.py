@@ -158,7 +158,8 @@ def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
     path = got.path
     if got.metadata is None:
         raise _bad(path, "no rollout_metadata", "give a whole log")
-    metadata, session = got.metadata, got.metadata.session_metadata
+    metadata = got.metadata
+    session = got.metadata.session_metadata
     definitions = metadata.actor_definitions.actor_aabb
     if not definitions or definitions[0].actor_id != EGO:
         first = definitions[0].actor_id if definitions else "nothing"

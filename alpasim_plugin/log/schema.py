@@ -29,7 +29,8 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
-SEED_BITS, DIGEST_BITS = 64, 58
+SEED_BITS = 64
+DIGEST_BITS = 58
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
 MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
@@ -136,7 +137,8 @@ def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
             f"{what}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
-    vec, rotation = common_pb2.Vec3, common_pb2.Quat
+    vec = common_pb2.Vec3
+    rotation = common_pb2.Quat
     return [
         common_pb2.Pose(vec=vec(x=x, y=y, z=z), quat=rotation(w=w, x=qx, y=qy, z=qz))
         for (x, y, z), (w, qx, qy, qz) in zip(xyz.tolist(), (quat / norm).tolist(), strict=True)
@@ -326,7 +328,8 @@ def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
     # Each attribute access makes a Python object, so vec and quat are fetched once a pose.
     rows = [(v.x, v.y, v.z, q.w, q.x, q.y, q.z) for v, q in ((p.vec, p.quat) for p in poses)]
     table = np.array(rows, np.float64).reshape(-1, 7)
-    xyz, quat = table[:, :3], table[:, 3:]
+    xyz = table[:, :3]
+    quat = table[:, 3:]
     square = np.sum(quat * quat, axis=1)
     bad = ~(np.isfinite(xyz).all(axis=1) & (np.abs(square - 1.0) <= QUAT_NORM_TOLERANCE))
     if bad.any():

@@ -160,7 +160,8 @@ class VideoReader:
             yield TimedFrame(image, time, frame.duration or step)
             last = time
         # A file that was cut short: fewer frames than it claims, and an end well before that.
-        claimed, length = self.format.frames, self._stream.duration
+        claimed = self.format.frames
+        length = self._stream.duration
         if (
             claimed
             and index + 1 < claimed
@@ -273,7 +274,8 @@ class VideoWriter:
         crf: int = 18,
         preset: str = "veryfast",
     ) -> None:
-        self.path, self.count = Path(path), 0
+        self.path = Path(path)
+        self.count = 0
         self._time_base, self._colour, self._pixel_aspect = time_base, colour, pixel_aspect
         self._matrix = WRITABLE.get(colour[0], BT709)
         self._size: tuple[int, ...] | None = None
@@ -336,7 +338,8 @@ class VideoWriter:
             codec.height, codec.width = even.shape[:2]
             matrix, primaries, transfer = self._colour
             codec.colorspace = matrix if matrix in WRITABLE else self._matrix
-            codec.color_primaries, codec.color_trc = primaries, transfer
+            codec.color_primaries = primaries
+            codec.color_trc = transfer
             if self._pixel_aspect != 1:
                 codec.sample_aspect_ratio = self._pixel_aspect
         rgb = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")

@@ -158,7 +158,8 @@ class AslWriter:
         self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0
     ) -> None:
         """Write one frame as the driver received it."""
-        start_us, data = frame.t_us - shutter_us, encode_image(frame.rgb, encoding)
+        start_us = frame.t_us - shutter_us
+        data = encode_image(frame.rgb, encoding)
         image = wire_image(self._uuid, frame.camera, start_us, frame.t_us, data)
         self._write(driver_camera_image=image)
 
@@ -246,7 +247,8 @@ class AslWriter:
         """Write the state the vehicle model reached; estimated equals true, as no pose error is
         modelled.
         """
-        pose, dynamics = wire_pose(state.T_world_rig, "ego state"), wire_dynamics(state)
+        pose = wire_pose(state.T_world_rig, "ego state")
+        dynamics = wire_dynamics(state)
         reached = controller_pb2.RunControllerAndVehicleModelResponse.PropagatedState(
             timestamp_us=state.t_us,
             pose_local_to_rig=pose,
@@ -280,7 +282,8 @@ class AslWriter:
         self._file.write(logging_pb2.LogEntry(**entry))
 
     def _metadata(self) -> logging_pb2.RolloutMetadata:
-        header, message = self.header, logging_pb2.RolloutMetadata
+        header = self.header
+        message = logging_pb2.RolloutMetadata
         box = message.ActorDefinitions.ActorAABB
         actors = [box(actor_id=EGO, aabb=wire_box(header.vehicle.box))]
         actors += [

@@ -98,7 +98,8 @@ def read_background(
         )
     coverage = coverage_of(placed_cloud(cloud, background.T_world_file), path)
     if coverage.covered < LEAST:
-        low, high = path.min(axis=0), path.max(axis=0)
+        low = path.min(axis=0)
+        high = path.max(axis=0)
         drive = ", ".join(
             f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True)
         )

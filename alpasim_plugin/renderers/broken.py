@@ -30,7 +30,8 @@ class BrokenRenderer(Renderer):
     """Render the clean scene and corrupt every frame on its own."""
 
     def __init__(self, clean: CleanRenderer, corrupt: Corruption) -> None:
-        self.clean, self.corrupt = clean, corrupt
+        self.clean = clean
+        self.corrupt = corrupt
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame and corrupt it."""
@@ -44,7 +45,8 @@ class ShiftedRenderer(Renderer):
     """
 
     def __init__(self, clean: CleanRenderer, right_m: float) -> None:
-        self.clean, self.right_m = clean, right_m
+        self.clean = clean
+        self.right_m = right_m
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame with the camera moved along its x axis."""
@@ -59,7 +61,8 @@ class StaleRenderer(Renderer):
     """
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
-        self.clean, self.age_us = clean, age_us
+        self.clean = clean
+        self.age_us = age_us
         self._past: dict[str, deque[tuple[int, U8]]] = {}
 
     def render(self, request: RenderRequest) -> Frame:

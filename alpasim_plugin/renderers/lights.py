@@ -20,7 +20,8 @@ from alpasim_plugin.gaussians.scene.site import make_site, path_of, section_of
 from alpasim_plugin.renderers.view import View
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, height_at
 
-SIGHT_M, NEAREST_M = 150.0, 0.3
+SIGHT_M = 150.0
+NEAREST_M = 0.3
 STREET_CD = 1000.0
 HEAD_CD = 20_000.0  # both low beams of a vehicle
 # Tangents: where a beam has fallen to 1/e sideways and below, its upper edge (ECE R112), and how
@@ -92,7 +93,8 @@ class SceneLights:
         from_lamp = points + beam
         local = from_lamp @ T_world_rig[:3, :3]
         ahead = np.maximum(local[:, 0], NEAREST_M)
-        sideways, upwards = local[:, 1] / ahead, local[:, 2] / ahead
+        sideways = local[:, 1] / ahead
+        upwards = local[:, 2] / ahead
         below = np.exp(-((upwards / BEAM_DEPTH) ** 2))
         above = np.exp(-np.maximum(upwards - CUT_OFF, 0) / EDGE) + ABOVE_CUT_OFF
         shape = np.exp(-((sideways / BEAM_WIDTH) ** 2)) * np.minimum(below, above)
@@ -120,7 +122,8 @@ class SceneLights:
             return spots
         spots += [Spot(tip, np.zeros(3), 0.25, STREET_RGB) for tip in self.tips]
         for name in self.boxes.keys() & actors.keys():
-            box, T = self.boxes[name], actors[name]
+            box = self.boxes[name]
+            T = actors[name]
             for end, rgb in ((1, HEAD_RGB), (-1, TAIL_RGB)):
                 middle = _moved(T, end * box.length_m / 2, LAMP_HEIGHT_M - box.height_m / 2)[:3, 3]
                 for lateral_m in (-0.36 * box.width_m, 0.36 * box.width_m):
@@ -153,7 +156,8 @@ def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
     local = offsets @ view.T_world_camera[:3, :3]
     distance = np.linalg.norm(offsets, axis=1)
     for i in np.argsort(-distance):
-        spot, depth = spots[i], float(local[i, 2])
+        spot = spots[i]
+        depth = float(local[i, 2])
         facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
         if depth < NEAREST_M or distance[i] > SIGHT_M or facing <= 0:
             continue

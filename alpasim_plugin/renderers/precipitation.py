@@ -62,7 +62,8 @@ class Precipitation:
         drawn = np.zeros(shape, np.float32)
         for far_m, near_m in pairwise(SHELLS_M):
             px_per_m = K[1, 1] * 2 / (far_m + near_m)
-            size_px, fallen_px = px_per_m * self.size_m, px_per_m * self.fallen_m
+            size_px = px_per_m * self.size_m
+            fallen_px = px_per_m * self.fallen_m
             share = min(size_px, 1) * min(size_px / max(fallen_px, 1), 1)
             count = rng.poisson(per_m3 * area * (far_m**3 - near_m**3) / 3)
             begin = rng.random((count, 2)) * shape[::-1]

@@ -75,7 +75,8 @@ class ReconstructionRenderer(SplatRenderer):
     """
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
-        self.scenario, self.threads = scenario, threads
+        self.scenario = scenario
+        self.threads = threads
         self.device = require_device(device)
         self.recipe = recipe_of(scenario, device)
         self.model = model_of(scenario, self.recipe, threads, device)
@@ -188,7 +189,8 @@ class ImportedRenderer(SplatRenderer):
     """
 
     def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
-        self.scenario, self.threads = scenario, threads
+        self.scenario = scenario
+        self.threads = threads
         self.device = require_device(device)
         assert scenario.model is not None, "a drive without a model has no such renderer"
         folder = Path(scenario.model)

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 # By second of the log and camera, so that neither a longer drive nor a rig of more cameras is fitted
 # worse; a lens counts as the pinholes that cover it.
-POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
+POINTS_PER_S = 2_400
+FULL_STEPS_PER_S = 50.0
 LONGEST_S = 30.0  # a longer log gets the points and steps of so many seconds
 REFUSED_S = 120.0  # of a longer log next to nothing would be left
 FEWEST_VIEWS, MOST_VIEWS = 12, 180  # the latter by camera
@@ -37,7 +38,8 @@ ACTOR_POINTS = 400  # by camera
 # A camera that looks ahead sees a surface for seconds, one that looks to the side for less than
 # one: with several, start points come from every second instant, and each view is learned from twice
 # as often.
-INSTANTS_ONE_CAMERA, INSTANTS_RIG = 6, 2
+INSTANTS_ONE_CAMERA = 6
+INSTANTS_RIG = 2
 STEPS_RIG = 2.0
 # Steps, points and pixels across of views, where a camera has so many pixels per radian that the
 # street is built finer (`halvings`); one such camera is fitted as one of several. An error of depth
@@ -259,7 +261,8 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
 
 def _read_sky_views(path: Path) -> list[SkyView]:
     sizes, Ks, Ts, bits = read_npz(path, ("size", "K", "T_camera_world", "sky"), DO_THIS)
-    views, first = [], 0
+    views = []
+    first = 0
     for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
         length = -(-width * height // 8)
         sky = np.unpackbits(bits[first : first + length], count=width * height).reshape(

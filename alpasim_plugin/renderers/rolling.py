@@ -103,7 +103,8 @@ def _rolling(request: RenderRequest) -> SceneView:
     share = request.exposure.share
     T_world_camera, actors = at_share(request, 0.5)
     camera = camera_at(request, T_world_camera)
-    first, last = float(share.flat[0]), float(share.flat[-1])
+    first = float(share.flat[0])
+    last = float(share.flat[-1])
     step = (last - first) / max(share.size - 1, 1)
     along = (0.0, step) if share.shape[1] == 1 else (step, 0.0)
     reach_px = motion_px(request)

@@ -27,11 +27,13 @@ class SnowCover:
         lanes = scenario.lane_map.lanes.values()
         centres = [one.centre for one in lanes if one.kind == "vehicle"]
         paths = [polyline_path(one) for one in centres if arc_lengths(one)[-1] > STEP_M]
-        quads, shares = [np.zeros((0, 4, 3))], []
+        quads = [np.zeros((0, 4, 3))]
+        shares = []
         for share, right_m, left_m in STRIPS_M:
             for path in paths:
                 along_m = np.linspace(0, path.length_m, int(path.length_m / STEP_M) + 2)
-                right, left = path.at(along_m, right_m)[0], path.at(along_m, left_m)[0]
+                right = path.at(along_m, right_m)[0]
+                left = path.at(along_m, left_m)[0]
                 quads.append(np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1))
                 shares += [share] * (len(along_m) - 1)
         self.shares = np.array(shares)

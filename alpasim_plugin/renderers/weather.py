@@ -119,7 +119,8 @@ class WeatherRenderer(Renderer):
                 f"weather over {type(self.base).__name__}: its frame has no depth",
                 "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
             )
-        image, camera = (frame.rgb, frame.depth), request.camera
+        image = (frame.rgb, frame.depth)
+        camera = request.camera
         taken = RecordedFrame(
             request.t_us,
             camera.name,

@@ -84,7 +84,8 @@ def make_cadence(
                 np.int64,
             )
         )
-    first, then = block.first, block.then
+    first = block.first
+    then = block.then
     periods = {scenario.period_us(sensor) for sensor in sensors}
     if len(periods) > 1:
         raise InputError(
@@ -137,7 +138,8 @@ class CameraRig:
         self._held: list[RenderRequest] = []
         self._clock = clock
         self._cadence = cadence or make_cadence(clock, scenario, sensors)
-        self._forecaster, self._lookahead = forecaster, lookahead
+        self._forecaster = forecaster
+        self._lookahead = lookahead
         self._before: Mapping[str, F64] = {}  # the road users one control period ago
         for sensor in sensors:
             if sensor.camera not in known:
@@ -191,7 +193,8 @@ class CameraRig:
         self._before = shown
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
-        ready, self._held = self._held, []
+        ready = self._held
+        self._held = []
         return ready
 
     def _is_due(self, t_us: int, period: int) -> bool:

@@ -172,7 +172,8 @@ def copy_cell(
         threads: Of the film.
         original: Manifest of the rollout that was driven; see `is_copied`.
     """
-    folder, source = root / cell.folder, root / original["path"]
+    folder = root / cell.folder
+    source = root / original["path"]
     with _writing_manifest(cell, options, folder) as manifest:
         announce(f"copying {cell.scene}")
         session = session_uuid(cell.seed, cell.rollout_key)
@@ -424,7 +425,8 @@ def make_renderer(
     from alpasim_plugin.fixers.loop import fixed_renderer
     from alpasim_plugin.fixers.settings import FixerSettings
 
-    fixer, settings = spec.fixer, spec.fixer.settings
+    fixer = spec.fixer
+    settings = spec.fixer.settings
     assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
 
     recorded = base.recorded() if settings.references else ()

@@ -174,7 +174,8 @@ def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done
 
 def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Drive or copy rollouts in this process, or in workers that write the run folder themselves."""
-    workers, threads = how.here.workers, how.here.per_worker
+    workers = how.here.workers
+    threads = how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
     work = partial(_work, plan.options, root, how.here)

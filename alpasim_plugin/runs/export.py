@@ -51,7 +51,8 @@ RUN_METADATA = "run_metadata.yaml"
 EVAL_CONFIG = "eval-config.yaml"
 WIZARD_CONFIG = "wizard-config.yaml"
 SCENES = "scenes"
-COMPLETE, FAILED = "_complete", "failed_rollouts.json"
+COMPLETE = "_complete"
+FAILED = "failed_rollouts.json"
 
 
 def eval_config() -> dict[str, Any]:

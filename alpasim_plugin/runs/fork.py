@@ -267,7 +267,8 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
         _check_replay(past, at_us, root / fork.folder)
         manifest["fork"] = asdict(change) | {"of": past.name, "replay": "equal"}
         write_manifest(root / fork.folder, manifest)
-    cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
+    cells = (past.cell, fork)
+    renderers = (past.cell.renderer, fork.renderer)
     plan = RunPlan(
         cells,
         {past.cell.scene: past.scenario},
@@ -318,7 +319,8 @@ def _check_replay(past: LoggedRollout, at_us: int, folder: Path) -> None:
     Raises:
         InfrastructureError: They differ before the instant.
     """
-    one, other = log_trace(past.folder), log_trace(folder)
+    one = log_trace(past.folder)
+    other = log_trace(folder)
     # Another policy may have more cameras; their frames before the instant have no logged
     # counterpart.
     other = {key: value for key, value in other.items() if key in one or key[1] != "frames"}

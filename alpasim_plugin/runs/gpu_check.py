@@ -54,7 +54,8 @@ from policies.base import make_policy
 from scenarios.load import load_scenario
 
 SCENE = "smoke/curve"
-MIDDLE, LARGE = (960, 544), (1920, 1080)
+MIDDLE = (960, 544)
+LARGE = (1920, 1080)
 SIZES = ((256, 144), MIDDLE, (1920, 1088))
 SPLATS = 5_000  # of the image whose gradients are compared
 REPEATS = 5
@@ -258,7 +259,8 @@ def compared(
     """
     facts: Facts = {"ok": True}
     for width, height in sizes or SIZES:
-        ours, theirs = make(width, height, device), make(width, height, "cpu")
+        ours = make(width, height, device)
+        theirs = make(width, height, "cpu")
         differs = np.abs(ours().astype(float) - theirs())
         odd_share = float((differs > LEVELS).mean())
         facts[f"{width}x{height}"] = {

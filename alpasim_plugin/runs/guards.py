@@ -68,9 +68,11 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
     shape: Any
     dtype: Any
     if frame.pending:
-        shape, dtype = (*frame.size, 3), np.dtype(np.uint8)
+        shape = (*frame.size, 3)
+        dtype = np.dtype(np.uint8)
     else:
-        shape, dtype = getattr(frame.rgb, "shape", None), getattr(frame.rgb, "dtype", None)
+        shape = getattr(frame.rgb, "shape", None)
+        dtype = getattr(frame.rgb, "dtype", None)
     if shape != wanted or dtype != np.uint8:
         guess = ""
         if shape == (3, *wanted[:2]):
@@ -86,7 +88,8 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
         plane = None if frame.is_pending(label) else getattr(frame, label)
         if plane is None:
             continue
-        shape, dtype = getattr(plane, "shape", None), getattr(plane, "dtype", None)
+        shape = getattr(plane, "shape", None)
+        dtype = getattr(plane, "dtype", None)
         if shape != wanted[:2] or np.dtype(dtype).kind != "f":
             return (
                 f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {wanted[:2]}"

@@ -17,7 +17,8 @@ SMALLER = 4  # by side, of the cameras whose pinholes are counted
 
 def drawn_pixels(cameras: Sequence[CameraSpec]) -> tuple[int, float]:
     """Return how many pinholes cover cameras, and their pixels together, within one in a hundred."""
-    count, pixels = 0, 0.0
+    count = 0
+    pixels = 0.0
     for camera in cameras:
         small = resized(
             camera, *(max(side // SMALLER, 1) for side in (camera.width, camera.height))
@@ -38,8 +39,10 @@ class LensRenderer(Renderer):
     """
 
     def __init__(self, inner: Renderer, cover: LensCover) -> None:
-        self._inner, self._cover = complete(inner, Renderer), cover
-        self.lookahead, self.block = inner.lookahead, inner.block
+        self._inner = complete(inner, Renderer)
+        self._cover = cover
+        self.lookahead = inner.lookahead
+        self.block = inner.block
         self.has_history = inner.has_history
 
     @property

@@ -215,14 +215,14 @@ class LoopState:
 
         Plans are planar, so only the rig's heading rotates them.
         """
-        yaw0, origin = yaw_of(self.ego.T_world_rig), self.ego.T_world_rig[:3, 3]
-        c, s = np.cos(yaw0), np.sin(yaw0)
+        yaw0 = yaw_of(self.ego.T_world_rig)
+        origin = self.ego.T_world_rig[:3, 3]
+        c = np.cos(yaw0)
+        s = np.sin(yaw0)
         turn = np.array([[c, s], [-s, c]])
 
-        all_xy, all_yaw = (
-            [plan.xy, *(sample[:, :2] for sample in plan.samples)],
-            [plan.yaw, *(sample[:, 2] for sample in plan.samples)],
-        )
+        all_xy = [plan.xy, *(sample[:, :2] for sample in plan.samples)]
+        all_yaw = [plan.yaw, *(sample[:, 2] for sample in plan.samples)]
         xyz = np.full((len(all_xy), len(plan.times_us), 3), origin[2])
         for row, xy in zip(xyz, all_xy, strict=True):
             row[:, :2] = xy @ turn + origin[:2]
@@ -261,7 +261,8 @@ def advance_ego(
     moved = controller.advance(ego, plan, to_us)
     if controller.grounds:
         return moved, False
-    x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
+    x = float(moved.T_world_rig[0, 3])
+    y = float(moved.T_world_rig[1, 3])
     return replace(
         moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))
     ), False
@@ -330,7 +331,8 @@ class Forecast:
             )
             states.append(self.ego)
         if states:
-            past, poses = self.history, np.stack([state.T_world_rig for state in states])
+            past = self.history
+            poses = np.stack([state.T_world_rig for state in states])
             self.history = Trajectory(
                 np.concatenate([past.t_us, np.array([state.t_us for state in states], np.int64)]),
                 np.concatenate([past.xyz, poses[:, :3, 3]]),

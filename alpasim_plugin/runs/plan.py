@@ -291,7 +291,8 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
 
 def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
     """Return the part of a plan that consists of some of its rollouts, with the keys of the whole."""
-    scenes, seeds = {cell.scene for cell in cells}, {cell.seed for cell in cells}
+    scenes = {cell.scene for cell in cells}
+    seeds = {cell.seed for cell in cells}
     scenarios = {name: scenario for name, scenario in plan.scenarios.items() if name in scenes}
     kept = tuple(seed for seed in plan.seeds if seed in seeds)
     return replace(

@@ -35,7 +35,8 @@ def ego_states_from_log(
     before = np.maximum(t - DIFFERENCE_US, ego_log.t_us[0])
     after = np.minimum(t + DIFFERENCE_US, ego_log.t_us[-1])
     poses = interpolate(ego_log, np.stack([before, t, after], axis=-1))  # (N, 3, 4, 4)
-    forward, xyz = poses[:, 1, :3, 0], poses[:, :, :3, 3]
+    forward = poses[:, 1, :3, 0]
+    xyz = poses[:, :, :3, 3]
     # A window of no length, as in a log of one pose, has no motion; one that ends at t has no
     # acceleration.
     span_s, first_s, second_s = (
@@ -44,10 +45,8 @@ def ego_states_from_log(
     speed = _along(xyz[:, 2] - xyz[:, 0], forward) / span_s
     yaw = np.arctan2(poses[:, :, 1, 0], poses[:, :, 0, 0])
     yaw_rate = wrap_angle(yaw[:, 2] - yaw[:, 0]) / span_s
-    v0, v1 = (
-        _along(xyz[:, 1] - xyz[:, 0], forward) / first_s,
-        _along(xyz[:, 2] - xyz[:, 1], forward) / second_s,
-    )
+    v0 = _along(xyz[:, 1] - xyz[:, 0], forward) / first_s
+    v1 = _along(xyz[:, 2] - xyz[:, 1], forward) / second_s
     accel = np.where((before < t) & (t < after), 2.0 * (v1 - v0) / span_s, 0.0)
     turns = np.abs(speed) > 0.5
     steer = np.where(

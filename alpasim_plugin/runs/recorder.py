@@ -209,7 +209,8 @@ class Recorder:
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""
         with self.stage("log"):
-            log, history = self._scenario.ego_log, observation.history.t_us
+            log = self._scenario.ego_log
+            history = observation.history.t_us
             unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
             context = (
                 ego_states_from_log(log, unlogged, self._scenario.vehicle) if len(unlogged) else []

@@ -152,7 +152,8 @@ class Loop:
                 plan_world, *samples = state.to_world(plan)
                 plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
                 recorder.policy_plan(plan_world, samples, plan.debug)
-            before, active = state.ego, plans.active(tick.t_us)
+            before = state.ego
+            active = plans.active(tick.t_us)
             with recorder.stage("control"):
                 forced = state.advance(self._controller, active, tick.t_us + clock.rates.control_us)
             recorder.control_step(before, active, state.ego, forced)

@@ -143,7 +143,8 @@ def default_folder(plan: RunPlan) -> Path:
     the whole key where another command has the short one.
     """
     asked = Path(plan.asked[0] if plan.asked else next(iter(plan.scenarios)))
-    name, key = slug(asked.stem or real(asked).stem), plan.command_key
+    name = slug(asked.stem or real(asked).stem)
+    key = plan.command_key
     short = Path("runs", f"{name}-{key[:SHORT_KEY]}")
     try:
         is_free = not os.path.exists(short / RUN_INFO) or read_run_json(short).get("key") == key

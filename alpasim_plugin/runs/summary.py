@@ -102,7 +102,8 @@ def speed(manifests: Sequence[JsonObject]) -> JsonObject:
     call may compile or fill caches.
     """
     stages: dict[str, list[float]] = {}
-    first, per_frame = [], []
+    first = []
+    per_frame = []
     for manifest in manifests:
         frames = max(int(manifest["frames"]), 1)
         opening = max(int(manifest.get("first_call_frames", 1)), 1)
@@ -134,7 +135,8 @@ def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, 
     """Return percentiles of the passes that took place (a frame from a draft has none through the
     fixer), share and mean per frame.
     """
-    passes, total = [d for d in durations if d > 0.0], sum(durations)
+    passes = [d for d in durations if d > 0.0]
+    total = sum(durations)
     return {
         "p50_ms": round(float(np.percentile(passes, 50)), 3),
         "p95_ms": round(float(np.percentile(passes, 95)), 3),

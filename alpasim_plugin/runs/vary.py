@@ -71,7 +71,8 @@ class Sweep:
         if match is None:
             raise InputError(f"--vary {text}: not KEY=LOW..HIGH", EXAMPLE)
         try:
-            low, high = float(match[2]), float(match[3])
+            low = float(match[2])
+            high = float(match[3])
         except ValueError:
             raise InputError(f"--vary {text}: an end is not a number", EXAMPLE) from None
         if not -1e12 < low < high < 1e12:
@@ -293,7 +294,8 @@ class BoundarySearch:
         base = usual_base(self.variants, self.plan.options.baseline)
         differences = {}
         for variant, other in base.pairs(self.variants):
-            brackets, others = found[variant][1], found[other][1]
+            brackets = found[variant][1]
+            others = found[other][1]
             if brackets and others:
                 estimate = difference_of(brackets, others)
                 differences[variant.name] = {"baseline": other.name} | vars(estimate)

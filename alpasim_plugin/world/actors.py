@@ -55,7 +55,8 @@ MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows i
 LINE_STEP_M = 0.5  # poses nearer to each other than this say nothing about a track's direction
 EXTENSION_M = 300.0
 MAX_TURN_RAD = 0.8
-FADE_M, FADE_STEP_M = 20.0, 2.0
+FADE_M = 20.0
+FADE_STEP_M = 2.0
 SPEED_SPAN_US = 100_000
 DRIVING = ("idm", "adversary")  # behaviours of those who leave their track
 # An adversary: share of its speed between which it chooses, gain and time of its control.
@@ -82,7 +83,8 @@ class Actors:
         lane_map: LaneMap | None = None,
         ground: HeightField | None = None,
     ) -> None:
-        self.vehicle, self.closed_us = vehicle, closed_us
+        self.vehicle = vehicle
+        self.closed_us = closed_us
         reactive = [actor for actor in actors if actor.behaviour.kind in DRIVING]
         index = LaneIndex(lane_map) if lane_map is not None and reactive else None
         self.drivers = [_Driver(actor, index, ground, lane_map) for actor in reactive]
@@ -102,7 +104,8 @@ class Actors:
             if actor.behaviour.kind == "yield"
         }
         for driver in self.drivers:
-            driver.motion, driver.present = None, True
+            driver.motion = None
+            driver.present = True
 
     def step(self, t_us: int, ego: EgoState) -> Mapping[str, F64]:
         """Advance to ``t_us`` and return ``T_world_box`` ``(4, 4)`` of every actor present.
@@ -285,7 +288,8 @@ class _Driver:
         ground: HeightField | None,
         lane_map: LaneMap | None,
     ) -> None:
-        self.actor, self.ground = actor, ground
+        self.actor = actor
+        self.ground = ground
         self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
         self.params = IdmParams(**({} if self.act else actor.behaviour.params))
         line = thinned(actor.track.xyz, LINE_STEP_M)
@@ -308,14 +312,16 @@ class _Driver:
 
     def close(self, from_us: int, to_us: int) -> None:
         """Take the state over from the track, once, when the track has begun."""
-        first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
+        first = int(self.actor.track.t_us[0])
+        last = int(self.actor.track.t_us[-1])
         if self.motion is not None or not self.present or self.path is None or to_us < first:
             return
         if from_us > last:
             self.present = False  # the track ended while the log was forced
             return
         at = max(from_us, first)
-        lo, hi = max(first, at - SPEED_SPAN_US), min(last, at + SPEED_SPAN_US)
+        lo = max(first, at - SPEED_SPAN_US)
+        hi = min(last, at + SPEED_SPAN_US)
         s, d = self.path.project(interpolate(self.actor.track, [at, lo, hi])[:, :2, 3])
         speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
         self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
@@ -333,7 +339,8 @@ class _Driver:
         by which it acts on the ego, the first of the bodies.
         """
         assert self.path is not None
-        speed_mps, front_m = motion.speed_mps, motion.s_m + self.actor.box.length_m / 2
+        speed_mps = motion.speed_mps
+        front_m = motion.s_m + self.actor.box.length_m / 2
         closing_mps = speed_mps - leader.speed_mps
         params = at_place(self.params, self.path, self.wanted_mps, motion.s_m)
         behind = idm_acceleration(speed_mps, leader.gap_m, closing_mps, params)
@@ -358,7 +365,8 @@ class _Driver:
             front_m = ego_s_m + float(bodies.half_length_m[0]) + act["gap_m"]
             ahead_m = front_m + self.actor.box.length_m / 2 - motion.s_m
             ego_mps = float(np.hypot(*bodies.velocity[0]))
-            least_mps, most_mps = SLOWEST * act["speed_mps"], FASTEST * act["speed_mps"]
+            least_mps = SLOWEST * act["speed_mps"]
+            most_mps = FASTEST * act["speed_mps"]
             wanted_mps = min(max(ego_mps + PULL_PER_S * ahead_m, least_mps), most_mps)
         accel = (wanted_mps - motion.speed_mps) / CONTROL_S
         return min(max(accel, -act["decel_mps2"]), MAX_ACCEL_MPS2)
@@ -368,14 +376,16 @@ class _Driver:
         motion.s_m, motion.speed_mps = moved_on(motion.s_m, motion.speed_mps, accel_mps2, dt_s)
         assert self.path is not None
         if motion.s_m > self.path.length_m:
-            self.present, self.motion = False, None
+            self.present = False
+            self.motion = None
 
     def pose(self, t_us: int, closed_us: int, motion: _Motion | None) -> F64 | None:
         """Return the pose of the box centre for a state of motion (None: on the track), or None
         where the actor is not in the scene.
         """
         if motion is None:
-            first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
+            first = int(self.actor.track.t_us[0])
+            last = int(self.actor.track.t_us[-1])
             on_track = (
                 first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
             )

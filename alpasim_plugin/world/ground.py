@@ -58,7 +58,8 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
     sums = np.stack([np.bincount(inverse, rest) for rest in (xyz - xyz[0]).T], axis=1)
     means = sums / count[:, None] + xyz[0]
-    xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
+    xs = low[0] + cell_m * np.arange(nx)
+    ys = low[1] + cell_m * np.arange(ny)
     nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
     z = means[scipy.spatial.KDTree(means[:, :2]).query(nodes)[1], 2]
     local = means[:, :2] - means[0, :2]
@@ -75,8 +76,10 @@ def height_at(field: HeightField, xy: F64) -> F64:
     v = np.clip((xy[:, 1] - field.y0_m) / field.cell_m, 0, ny - 1)
     i = np.minimum(u.astype(np.int64), max(nx - 2, 0))
     j = np.minimum(v.astype(np.int64), max(ny - 2, 0))
-    i1, j1 = np.minimum(i + 1, nx - 1), np.minimum(j + 1, ny - 1)
-    fu, fv = u - i, v - j
+    i1 = np.minimum(i + 1, nx - 1)
+    j1 = np.minimum(j + 1, ny - 1)
+    fu = u - i
+    fv = v - j
     low = field.z[j, i] * (1 - fu) + field.z[j, i1] * fu
     high = field.z[j1, i] * (1 - fu) + field.z[j1, i1] * fu
     return low * (1 - fv) + high * fv
@@ -95,12 +98,15 @@ def ground_poses(field: HeightField, xy: F64, yaw: F64) -> F64:
     Pitch and roll follow the surface: slopes are central differences over `SLOPE_SPAN_M` along and
     across the heading, about what four wheels feel, so a step in the grid does not kick the body.
     """
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     h = SLOPE_SPAN_M
-    ahead, left = np.column_stack([c * h, s * h]), np.column_stack([-s * h, c * h])
+    ahead = np.column_stack([c * h, s * h])
+    left = np.column_stack([-s * h, c * h])
     at = np.concatenate([xy, xy + ahead, xy - ahead, xy + left, xy - left])
     z = height_at(field, at).reshape(5, -1)
-    along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
+    along = (z[1] - z[2]) / (2 * h)
+    across = (z[3] - z[4]) / (2 * h)
     ex = np.column_stack([c, s, along]) / np.sqrt(1 + along * along)[:, None]
     ez = np.cross(ex, np.column_stack([-s, c, across]))
     ez /= np.linalg.norm(ez, axis=1, keepdims=True)

@@ -150,7 +150,8 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
     )
     every = [np.repeat(number, len(_OUTLINE)) for number in (line, low, high)]
     along, across = lines.project(every[0], outline.reshape(-1, 2), *every[1:])
-    along, across = along.reshape(-1, len(_OUTLINE)), across.reshape(-1, len(_OUTLINE))
+    along = along.reshape(-1, len(_OUTLINE))
+    across = across.reshape(-1, len(_OUTLINE))
     rear = along.min(axis=1)
     _, yaw = lines.at(line, rear)
     speed = bodies.velocity[row, 0] * np.cos(yaw) + bodies.velocity[row, 1] * np.sin(yaw)

@@ -52,7 +52,8 @@ class _Edges:
             length = float(arc_lengths(edge.line)[-1])
             n = max(3, int(length / SAMPLE_M))
             s = (np.arange(n) + 0.5) / n * length
-            a, b = resample(edge.line[:, :2], s - 0.1), resample(edge.line[:, :2], s + 0.1)
+            a = resample(edge.line[:, :2], s - 0.1)
+            b = resample(edge.line[:, :2], s + 0.1)
             owner.append(np.full(n, i))
             points.append((a + b) / 2)
             headings.append((b - a) / np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)[:, None])

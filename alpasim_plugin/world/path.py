@@ -63,7 +63,8 @@ def sample_clothoid(
     yaw_at_nodes = heading(0.5 * (s[1:] + s[:-1])[:, None] + half * _NODES)  # (N - 1, 8)
     dx = np.sum(half * _WEIGHTS * np.cos(yaw_at_nodes), axis=1)
     dy = np.sum(half * _WEIGHTS * np.sin(yaw_at_nodes), axis=1)
-    x, y = np.concatenate([[0.0], np.cumsum(dx)]) + x0, np.concatenate([[0.0], np.cumsum(dy)]) + y0
+    x = np.concatenate([[0.0], np.cumsum(dx)]) + x0
+    y = np.concatenate([[0.0], np.cumsum(dy)]) + y0
     return np.column_stack([x, y, heading(s), start_curvature_per_m + rate * s])
 
 
@@ -90,7 +91,8 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
         ends = zip((q0[:2], q1[:2]), directions, strict=True)
         derivatives = [[point, tangent_m * direction, still] for point, direction in ends]
         curve = scipy.interpolate.BPoly.from_derivatives([0.0, 1.0], derivatives)
-        d, dd = curve(t, 1), curve(t, 2)
+        d = curve(t, 1)
+        dd = curve(t, 2)
         speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
         peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
         if peak < least_peak - 1e-9:
@@ -185,8 +187,10 @@ def _from_station(
     """Return arc length and signed distance, both from the nearest station, of points at ``rest``
     from it: on the circle of its curvature, and on its straight tangent beyond the path's ends.
     """
-    c, s = np.cos(yaw), np.sin(yaw)
-    along, across = c * rest[:, 0] + s * rest[:, 1], c * rest[:, 1] - s * rest[:, 0]
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    along = c * rest[:, 0] + s * rest[:, 1]
+    across = c * rest[:, 1] - s * rest[:, 0]
     beyond = (is_first & (along < 0)) | (is_last & (along > 0))
     k = np.where(beyond | (np.abs(curvature) < 1e-9), 1e-9, curvature)
     radial = 1.0 - k * across
@@ -266,7 +270,8 @@ class Lines:
         """
         count = max(-(-int((high - low).max(initial=0)) // every), 1)
         at = np.minimum(low[:, None] + every * np.arange(count), high[:, None] - 1)
-        dx, dy = xy[:, :1] - self._x[at], xy[:, 1:] - self._y[at]
+        dx = xy[:, :1] - self._x[at]
+        dy = xy[:, 1:] - self._y[at]
         return dx * dx + dy * dy
 
 
@@ -311,7 +316,8 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     coarse = polyline_path(xyz)
     spline = scipy.interpolate.CubicSpline(coarse.s, coarse.xyz)
     fine = np.linspace(0.0, coarse.length_m, max(2, int(np.ceil(coarse.length_m / step_m)) + 1))
-    d, dd = spline(fine, 1), spline(fine, 2)
+    d = spline(fine, 1)
+    dd = spline(fine, 2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2
     line = spline(fine)
     return Path(

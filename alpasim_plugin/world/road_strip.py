@@ -212,7 +212,8 @@ def _add_lanes(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profi
 
 def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
     """Return all named lines of a strip."""
-    w, half = profile.lane_width_m, profile.median_m / 2
+    w = profile.lane_width_m
+    half = profile.median_m / 2
     lines = {f"f{j}": offset_line(curve, -half - j * w) for j in range(profile.forward + 1)}
     lines |= {f"fc{k}": offset_line(curve, -half - (k + 0.5) * w) for k in range(profile.forward)}
     # Without a median both directions share one array, so that neighbours cannot drift apart by
@@ -232,7 +233,8 @@ def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
 
 def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profile) -> None:
     """Add the strips outside the outer lanes, the road edges and the drivable area."""
-    outer_right, outer_left = lines[f"f{profile.forward}"], lines[f"b{profile.backward}"]
+    outer_right = lines[f"f{profile.forward}"]
+    outer_left = lines[f"b{profile.backward}"]
     if profile.strip_m > 0:
         # The strip beside oncoming lanes runs in their direction, its left edge next to the lane.
         left_strip = (
@@ -241,8 +243,10 @@ def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profil
             else (lines["left"], outer_left)
         )
         for side, (left, right) in (("r", (outer_right, lines["right"])), ("l", left_strip)):
-            kind, limit = profile.strip_kind, profile.speed_limit_mps
-            lane_id, centre = f"{name}_{kind}_{side}", 0.5 * (left + right)
+            kind = profile.strip_kind
+            limit = profile.speed_limit_mps
+            lane_id = f"{name}_{kind}_{side}"
+            centre = 0.5 * (left + right)
             draft.add(
                 Lane(
                     lane_id,

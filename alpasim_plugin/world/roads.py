@@ -130,7 +130,8 @@ def _movements(a: Arm, b: Arm) -> list[tuple[int, int]]:
     """Return (incoming index at a, outgoing index at b): straight lane by lane, left from and to
     the inner, right the outer lane.
     """
-    n_in, n_out = len(a.into), len(b.out)
+    n_in = len(a.into)
+    n_out = len(b.out)
     if a is b or n_in == 0 or n_out == 0:
         return []
     angle = float(wrap_angle(b.heading_rad - a.heading_rad - np.pi))
@@ -140,8 +141,10 @@ def _movements(a: Arm, b: Arm) -> list[tuple[int, int]]:
 
 
 def _connector(name: str, a: Arm, b: Arm, i: int, j: int) -> Lane:
-    yaw0, yaw1 = a.heading_rad + np.pi, b.heading_rad
-    begin, end = a.joint[f"bc{i}"], b.joint[f"fc{j}"]
+    yaw0 = a.heading_rad + np.pi
+    yaw1 = b.heading_rad
+    begin = a.joint[f"bc{i}"]
+    end = b.joint[f"fc{j}"]
     centre = connect(begin, yaw0, end, yaw1)
     t = np.linspace(0.0, 1.0, len(centre))
     width = (1 - t) * a.profile.lane_width_m + t * b.profile.lane_width_m
@@ -346,7 +349,8 @@ def _append(draft: MapDraft, tip: _Tip, curve: F64, strip: Strip, forward: tuple
         draft.link(after, before)
     x, y, yaw, _ = curve[-1].tolist()
     tip.pose, tip.joint, tip.after_junction = (x, y, yaw), strip.joint(), False
-    tip.forward, tip.backward = forward, strip.backward
+    tip.forward = forward
+    tip.backward = strip.backward
 
 
 def polyline(lane_map: LaneMap, lane_ids: Sequence[str]) -> F64:

@@ -108,7 +108,8 @@ class LaneIndex:
 
         def turn(other: str) -> float:
             line = self.lane_map.lanes[other].centre
-            start, end = _end_heading(line, last=False), _end_heading(line, last=True)
+            start = _end_heading(line, last=False)
+            end = _end_heading(line, last=True)
             return float(abs(wrap_angle(start - here)) + abs(wrap_angle(end - start)))
 
         followers = self.successors(lane_id)
@@ -142,7 +143,8 @@ class LaneIndex:
         xyz = np.concatenate(parts)
         s = arc_lengths(xyz)
         keep = np.concatenate([[True], np.diff(s) > 1e-9])
-        xyz, s = xyz[keep], s[keep]
+        xyz = xyz[keep]
+        s = s[keep]
         if s[-1] > distance_m:
             inside = s < distance_m
             xyz = np.concatenate([xyz[inside], resample(xyz, [distance_m])])
@@ -226,7 +228,8 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     """
     total = float(arc_lengths(path)[-1])
     at = np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
-    points, headings = path[:1], np.array([first_heading_rad])
+    points = path[:1]
+    headings = np.array([first_heading_rad])
     if total > 0:
         points = resample(path, at)
         behind = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
@@ -313,7 +316,8 @@ def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
     """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a
     point, and the offsets there.
     """
-    start, step = line[:-1, :2], line[1:, :2] - line[:-1, :2]
+    start = line[:-1, :2]
+    step = line[1:, :2] - line[:-1, :2]
     length2 = np.maximum(np.sum(step * step, axis=1), 1e-300)
     share = np.minimum(np.maximum(np.sum((xy - start) * step, axis=1) / length2, 0.0), 1.0)
     return step, share, xy - (start + share[:, None] * step)

@@ -339,10 +339,8 @@ def results_summary(
             }
         entries.append(entry)
     name = rollouts[0].of.run_name if rollouts else None
-    saturation, least = (
-        settings.progress_saturation_threshold,
-        settings.min_gt_distance_for_full_score_m,
-    )
+    saturation = settings.progress_saturation_threshold
+    least = settings.min_gt_distance_for_full_score_m
     overall: JsonObject = {key: _number(value) for key, value in sweeps.items()}
     out: JsonObject = {
         "schema_version": SCHEMA_VERSION,

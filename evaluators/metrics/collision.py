@@ -71,7 +71,8 @@ def contact_events(
     """
     chosen = find_preset(preset)
     origin = origin_of(rollout.ego, chosen)
-    ego, actors = ego_footprints(rollout, chosen, origin), ActorTable(rollout, chosen, origin)
+    ego = ego_footprints(rollout, chosen, origin)
+    actors = ActorTable(rollout, chosen, origin)
     at_steps, _ = find_contacts(ego, actors, rollout.ego.t_us)
     begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).onsets
     places = in_rig(begun.xy, rollout)
@@ -96,7 +97,8 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     """
     origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
-    ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
+    ego = ego_footprints(rollout, preset, origin)
+    actors = ActorTable(rollout, preset, origin)
     contacts, gap_m = find_contacts(ego, actors, t_us)
     if preset.hits == "last":
         contacts = last_per_step(contacts, ego, actors, t_us)

@@ -191,10 +191,8 @@ def find_swept(
     times = at_steps.actor * span + (t_us[at_steps.step] - t_us[0]) * 1e-6
     latest = np.searchsorted(keys, times + _SLACK_S, side="right") - 1
     alone = np.flatnonzero(~touch[between.actor, row])
-    step, actor = (
-        np.concatenate([at_steps.step, row[alone]]),
-        np.concatenate([at_steps.actor, between.actor[alone]]),
-    )
+    step = np.concatenate([at_steps.step, row[alone]])
+    actor = np.concatenate([at_steps.actor, between.actor[alone]])
     begin = np.concatenate([latest, place_of[alone]])
     rank = np.lexsort((actor, step))
     return SweptContacts(step[rank], actor[rank], begin[rank], onsets)
@@ -206,7 +204,8 @@ def _onsets(
     """Join contacts found between steps with those that are there at once; also return how they
     were sorted (found ones first).
     """
-    step, actor = at_steps.step[fresh], at_steps.actor[fresh]
+    step = at_steps.step[fresh]
+    actor = at_steps.actor[fresh]
     boxes = actors.boxes(actor, t_us[step])
     still = np.zeros((len(fresh), 2))
     bodies = ego.take(step)
@@ -231,9 +230,11 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     for a in range(len(actors)):
         logged = actors.times_of(a)
         knots = np.union1d(t_us, logged)
-        first_us, last_us = max(logged[0], t_us[0]), min(logged[-1], t_us[-1])
+        first_us = max(logged[0], t_us[0])
+        last_us = min(logged[-1], t_us[-1])
         knots = knots[(knots >= first_us) & (knots <= last_us)]
-        starts, ends = knots[:-1], knots[1:]
+        starts = knots[:-1]
+        ends = knots[1:]
         if len(knots) == 1 and knots[0] not in t_us:
             starts = ends = knots
         pieces.append(np.stack([np.full(len(starts), a), starts, ends]))
@@ -245,7 +246,8 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     near = np.flatnonzero(pairs.distance_m() <= pairs.radius_m().sum(axis=1) + _SLACK_M)
     tau = first_contact(pairs.take(near))
     hit = np.flatnonzero(np.isfinite(tau))
-    rows, tau = near[hit], tau[hit]
+    rows = near[hit]
+    tau = tau[hit]
     side, xy = _place(pairs.take(rows), tau)
     t_s = (t0[rows] - t_us[0]) * 1e-6 + tau * (t1[rows] - t0[rows]) * 1e-6
     # Pieces of a pair run forward in time: the first hit is the earliest.
@@ -270,7 +272,8 @@ def _motions(
                 ego.yaw[interval] + f * turn,
             )
         )
-    first, last = actors.boxes(actor, t0), actors.boxes(actor, t1)
+    first = actors.boxes(actor, t0)
+    last = actors.boxes(actor, t1)
     start = first.xy - ego_at[0][0]
     return Motions(
         start,
@@ -287,7 +290,8 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     """
     center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
-    c, s = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])
+    c = np.cos(yaw[:, 0])
+    s = np.sin(yaw[:, 0])
     seen = np.stack(
         [c * center[:, 0] + s * center[:, 1], c * center[:, 1] - s * center[:, 0]], axis=1
     )
@@ -301,7 +305,8 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])
     cosine = np.cos(turned)
     sine = np.sin(turned)
-    ones, zero = np.ones(len(tau)), np.zeros(len(tau))
+    ones = np.ones(len(tau))
+    zero = np.zeros(len(tau))
     # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look
     # the other way.
     forward = np.repeat(np.stack([ones, zero, cosine, -sine], axis=1), 2, axis=1)

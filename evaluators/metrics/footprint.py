@@ -64,10 +64,8 @@ class Footprints:
         if self.float32:
             # Rounded after each step, the centre first, as AlpaSim does.
             x, y = (self.xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
-            c, s = (
-                np.cos(self.yaw.astype(np.float32))[:, None],
-                np.sin(self.yaw.astype(np.float32))[:, None],
-            )
+            c = np.cos(self.yaw.astype(np.float32))[:, None]
+            s = np.sin(self.yaw.astype(np.float32))[:, None]
             along, across = (
                 (UNIT_CORNERS[:, d] * self.size[:, [d]]).astype(np.float32) for d in (0, 1)
             )  # (N, 4)
@@ -97,7 +95,8 @@ class Footprints:
         part within a corner radius of them.
         """
         corners = self.corners()
-        front, rear = shapely.linestrings(corners[:, 0:2]), shapely.linestrings(corners[:, 2:4])
+        front = shapely.linestrings(corners[:, 0:2])
+        rear = shapely.linestrings(corners[:, 2:4])
         r = self._corner_radius_m()
         if r is None:
             return front, rear
@@ -165,7 +164,8 @@ class ActorTable:
 
     def boxes(self, actor: I64, t_us: I64) -> Footprints:
         """Return the boxes ``(M,)`` of actors at times ``(M,)`` at which they are present."""
-        row, fraction = np.zeros(len(actor), np.int64), np.zeros(len(actor))
+        row = np.zeros(len(actor), np.int64)
+        fraction = np.zeros(len(actor))
         for a in np.unique(actor):
             rows = np.flatnonzero(actor == a)
             row[rows], fraction[rows], _ = self._locate(int(a), t_us[rows])

@@ -67,7 +67,8 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     to = tracks.xy - ego.centre
     along = to[..., 0] * ego.heading[:, 0] + to[..., 1] * ego.heading[:, 1]
     lateral = np.abs(to[..., 1] * ego.heading[:, 0] - to[..., 0] * ego.heading[:, 1])
-    c, s = np.abs(np.cos(tracks.yaw - ego.yaw)), np.abs(np.sin(tracks.yaw - ego.yaw))
+    c = np.abs(np.cos(tracks.yaw - ego.yaw))
+    s = np.abs(np.sin(tracks.yaw - ego.yaw))
     length, width = (tracks.size[:, [d]] / 2 for d in (0, 1))
     gap_m = along - ego.size[0] / 2 - (length * c + width * s)
     ahead_mps = (
@@ -93,7 +94,8 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     against = (
         drive.against_m >= nuplan.AGAINST_M if drive.has_map else np.zeros(len(t_us), np.bool_)
     )
-    margin_m, impact_mps = rss_margin_m(drive.ego, drive.tracks), np.full(len(t_us), np.nan)
+    margin_m = rss_margin_m(drive.ego, drive.tracks)
+    impact_mps = np.full(len(t_us), np.nan)
     for hit in drive.hits:
         if t_us[hit.step] >= handover_us(rollout) and np.isnan(impact_mps[hit.step]):
             impact_mps[hit.step] = hit.delta_v_mps / nuplan.MASS_SHARE

@@ -81,10 +81,12 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
     """
     step, lane = np.nonzero(near)
     inside = shapely.contains(road.areas(lane), shapely.points(xy[step]))
-    step, lane = step[inside], lane[inside]
+    step = step[inside]
+    lane = lane[inside]
     delta = road.heading_at(lane, xy[step]) - yaw[step]
     opposes = np.abs(wrap_angle(delta) if preset.wrap_heading else delta) > WRONG_HEADING_RAD
-    out, agreed = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
+    out = np.zeros(len(xy), np.bool_)
+    agreed = np.zeros(len(xy), np.bool_)
     out[step[opposes]] = True
     agreed[step[~opposes]] = True
     return out if preset.wrong_lane_rule == "any_opposes" else out & ~agreed

@@ -172,7 +172,8 @@ def ending_of(rollout: Rollout) -> str:
     return REACHED_END if reached_end(rollout) else SHORT_OF_END
 
 
-STAND_MPS, STAND_S = 0.3, 3.0
+STAND_MPS = 0.3
+STAND_S = 3.0
 SLOW_SHARE = 0.5
 LEAST_MPS = 2.0
 SLOW_S = 1.0
@@ -192,7 +193,8 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     """
     if preset.aliases:
         return []
-    t_us, origin = rollout.ego.t_us, origin_of(rollout.ego_log, preset)
+    t_us = rollout.ego.t_us
+    origin = origin_of(rollout.ego_log, preset)
     path = recorded_path(rollout, preset)
     ego = ego_footprints(rollout, preset, origin)
     line = path.xyz[:, :2] - origin[:2]
@@ -222,7 +224,8 @@ def _slow(
     v = speeds(rollout.ego)
     engaged = t_us >= handover_us(rollout)
     fastest = np.maximum.accumulate(np.where(engaged, v, 0.0))
-    along, then = arc_lengths(line), (path.t_us - path.t_us[0]) * 1e-6
+    along = arc_lengths(line)
+    then = (path.t_us - path.t_us[0]) * 1e-6
     usual, pause_s = recorded_speed(along, then, speeds(path), s)
     expected = np.minimum(fastest, usual)
     stands = engaged & (v < STAND_MPS)
@@ -233,7 +236,8 @@ def _slow(
     )  # what comes before a slow step may excuse it
     ahead[asked] = actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, asked)
     excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
-    stood_s, slow_s = _lasting(stands & ~excused, seconds), _lasting(slow & ~excused, seconds)
+    stood_s = _lasting(stands & ~excused, seconds)
+    slow_s = _lasting(slow & ~excused, seconds)
     return stood_s >= STAND_S + pause_s, slow_s >= SLOW_S
 
 
@@ -278,8 +282,10 @@ def actor_ahead(
     out = np.zeros(len(steps), np.bool_)
     if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
         return out
-    way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[steps, :2] - origin[:2]
-    s, reach_m = s[steps], reach_m[steps]
+    way = shapely.linestrings(line)
+    ego_xy = rollout.ego.xyz[steps, :2] - origin[:2]
+    s = s[steps]
+    reach_m = reach_m[steps]
     for soon_s in SOON_S:
         actors_at = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
         actor, step = np.nonzero(

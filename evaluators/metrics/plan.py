@@ -49,8 +49,10 @@ class TrajectoryTable:
         """Return the centre ``(M, 3)`` of trajectory ``i`` at times inside it, linear between its
         poses.
         """
-        t, xyz = self.t_us[self.rows(i)], self.xyz[self.rows(i)]
-        grid, query = (t - t[0]).astype(np.float64), (t_us - t[0]).astype(np.float64)
+        t = self.t_us[self.rows(i)]
+        xyz = self.xyz[self.rows(i)]
+        grid = (t - t[0]).astype(np.float64)
+        query = (t_us - t[0]).astype(np.float64)
         return np.stack([np.interp(query, grid, xyz[:, d]) for d in range(3)], axis=1)
 
     @property
@@ -120,8 +122,10 @@ def plan_deviation(table: TrajectoryTable, preset: Preset) -> F64:
     n = max(len(table.start) - 2, 0)
     out = np.full(n, np.nan)
     for i in range(n):
-        old, new = table.rows(i), table.rows(i + 1)
-        t_old, t_new = table.t_us[old], table.t_us[new][1:]
+        old = table.rows(i)
+        new = table.rows(i + 1)
+        t_old = table.t_us[old]
+        t_new = table.t_us[new][1:]
         common = (t_new >= t_old[0]) & (t_new <= t_old[-1])
         if not common.any():
             continue

@@ -33,7 +33,8 @@ class Polylines:
         self.vertices = np.concatenate([np.zeros((0, 3)), *lines]) - origin
         self.vertex_owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
         follows = np.flatnonzero(self.vertex_owner[1:] == self.vertex_owner[:-1])
-        self.start, self.end = self.vertices[follows], self.vertices[follows + 1]
+        self.start = self.vertices[follows]
+        self.end = self.vertices[follows + 1]
         self.owner = self.vertex_owner[follows]
 
     @cached_property
@@ -101,7 +102,8 @@ class Polylines:
         body, segment = self._tree.query(footprints, predicate="dwithin", distance=limit_m)
         middle = (self.start[segment, 2] + self.end[segment, 2]) / 2
         level = np.abs(middle - z[body]) <= height_m
-        body, segment = body[level], segment[level]
+        body = body[level]
+        segment = segment[level]
         out[body[shapely.distance(self._segments[segment], footprints[body]) < limit_m]] = True
         return out
 
@@ -184,7 +186,8 @@ class Road:
         """Return a lane with those that lead into it and that it leads to; a seam between them is
         no border.
         """
-        own, chosen = self._lanes[lane], np.zeros(self.surface.n_areas, np.bool_)
+        own = self._lanes[lane]
+        chosen = np.zeros(self.surface.n_areas, np.bool_)
         for k, other in enumerate(self._lanes):
             chosen[k] = own.lane_id in other.successors or other.lane_id in own.successors
         chosen[lane] = True

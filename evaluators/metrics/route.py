@@ -61,7 +61,8 @@ def moving(path: F64) -> I64:
     away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
     if not (away[0].any() and away[1].any()):
         return np.zeros(1, np.int64)
-    first, last = int(np.argmax(away[0])), len(path) - 1 - int(np.argmax(away[1][::-1]))
+    first = int(np.argmax(away[0]))
+    last = len(path) - 1 - int(np.argmax(away[1][::-1]))
     return np.concatenate([[0], np.arange(first, last + 1), [len(path) - 1]])
 
 
@@ -82,13 +83,15 @@ def followed(path: F64, distance_m: F64, s: F64, points: F64, first_m: float) ->
     """
     lengths = arc_lengths(path)
     moved = np.diff(points, axis=0, prepend=points[:1])
-    out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*moved.T)
+    out = np.array(s)
+    reach_m = 2.0 + 2.0 * np.hypot(*moved.T)
     reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, lengths, first_m))))
     step_m = np.diff(s, prepend=first_m)
     leaps = np.flatnonzero((step_m > reach_m) | (step_m < -SAME_M))
     for k in range(int(leaps[0]), len(s)) if len(leaps) else ():
         before = float(out[k - 1]) if k else first_m
-        low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(lengths[-1]))
+        low = max(before - reach_m[k], 0.0)
+        high = min(before + reach_m[k], float(lengths[-1]))
         found = []
         for start in (low, min(before, high)):
             inner = path[np.searchsorted(lengths, start, "right") : np.searchsorted(lengths, high)]
@@ -148,7 +151,8 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
     if length_m < DIRECTION_M:
         return np.full(len(points), np.nan)
     out = np.array(distance_m)
-    inner, outer = _at(path, lengths, DIRECTION_M), _at(path, lengths, length_m - DIRECTION_M)
+    inner = _at(path, lengths, DIRECTION_M)
+    outer = _at(path, lengths, length_m - DIRECTION_M)
     for end, inside, is_there in (
         (path[0], inner, s <= 0.0),
         (path[-1], outer, s >= length_m * (1 - 1e-12)),

@@ -94,8 +94,10 @@ class Surface:
         rise_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
         out = rise_m <= self._level_m + SLOPE * at_least_m
         for b in np.flatnonzero(~out.all(axis=0)):
-            rows, line = np.flatnonzero(~out[:, b]), self._outlines[b]
-            flat, points = shapely.linestrings(line[:, :2]), shapely.points(xyz[rows, :2])
+            rows = np.flatnonzero(~out[:, b])
+            line = self._outlines[b]
+            flat = shapely.linestrings(line[:, :2])
+            points = shapely.points(xyz[rows, :2])
             z = np.interp(shapely.line_locate_point(flat, points), arc_lengths(line), line[:, 2])
             out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(
                 flat, points
@@ -251,7 +253,8 @@ def closed_union(areas: Geometries, seam_m: float) -> Any:
 def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
     """Cut pieces at the middle of their bounds; empty quarters are left out."""
     low_x, low_y, high_x, high_y = shapely.bounds(pieces).reshape(-1, 4).T
-    x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
+    x = (low_x + high_x) / 2
+    y = (low_y + high_y) / 2
     quarters = [
         (low_x, low_y, x, y),
         (x, low_y, high_x, y),

@@ -56,11 +56,14 @@ def gaps(pairs: Motions, tau: F64) -> F64:
     """
     center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
-    c, s = np.abs(np.cos(yaw[:, 1] - yaw[:, 0])), np.abs(np.sin(yaw[:, 1] - yaw[:, 0]))
+    c = np.abs(np.cos(yaw[:, 1] - yaw[:, 0]))
+    s = np.abs(np.sin(yaw[:, 1] - yaw[:, 0]))
     out = np.empty((len(tau), _N_GAPS))
     for body in (0, 1):
-        cos, sin = np.cos(yaw[:, body]), np.sin(yaw[:, body])
-        own, other = pairs.half[:, body], pairs.half[:, 1 - body]
+        cos = np.cos(yaw[:, body])
+        sin = np.sin(yaw[:, body])
+        own = pairs.half[:, body]
+        other = pairs.half[:, 1 - body]
         offsets = (cos * center[:, 0] + sin * center[:, 1], cos * center[:, 1] - sin * center[:, 0])
         reach = (
             own[:, 0] + other[:, 0] * c + other[:, 1] * s,
@@ -84,7 +87,8 @@ def curvature(pairs: Motions) -> F64:
     )
     speed = np.linalg.norm(pairs.shift, axis=1)
     relative = (pairs.turn[:, 1] - pairs.turn[:, 0]) ** 2
-    turn, radius = np.abs(pairs.turn), pairs.radius_m()
+    turn = np.abs(pairs.turn)
+    radius = pairs.radius_m()
     per_body = [
         turn[:, b] ** 2 * far + 2 * turn[:, b] * speed + relative * radius[:, 1 - b] for b in (0, 1)
     ]
@@ -114,10 +118,13 @@ def first_contact(pairs: Motions) -> F64:
     """
     n = len(pairs.start)
     first = np.full(n, np.inf)
-    bend, steep = curvature(pairs), slope(pairs)
+    bend = curvature(pairs)
+    steep = slope(pairs)
     owner = np.arange(n)
-    low, width = np.zeros(n), np.ones(n)
-    at_low, at_high = gaps(pairs, low), gaps(pairs, width)
+    low = np.zeros(n)
+    width = np.ones(n)
+    at_low = gaps(pairs, low)
+    at_high = gaps(pairs, width)
     while len(owner):
         for tau, gap in ((low, at_low), (low + width, at_high)):
             touching = gap.max(axis=1) <= TOUCH_M
@@ -131,10 +138,12 @@ def first_contact(pairs: Motions) -> F64:
         owner = owner[rows]
         low = low[rows]
         width = width[rows] / 2
-        at_low, at_high = at_low[rows], at_high[rows]
+        at_low = at_low[rows]
+        at_high = at_high[rows]
         at_middle = gaps(pairs.take(owner), low + width)
         owner = np.tile(owner, 2)
         low = np.concatenate([low, low + width])
         width = np.tile(width, 2)
-        at_low, at_high = np.concatenate([at_low, at_middle]), np.concatenate([at_middle, at_high])
+        at_low = np.concatenate([at_low, at_middle])
+        at_high = np.concatenate([at_middle, at_high])
     return first

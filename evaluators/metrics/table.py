@@ -238,7 +238,8 @@ def _min_ade(horizon: float | str, target: str) -> MetricInfo:
 
 
 LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
-FOOTPRINT, CENTRE = "footprint, plan view", "box centre, plan view"
+FOOTPRINT = "footprint, plan view"
+CENTRE = "box centre, plan view"
 UNKNOWN = MetricInfo("", "none", "last", "")
 _SIGNED = (None, None)
 _FEW = "three steps or fewer"

@@ -30,9 +30,11 @@ def drawn_map(content: JsonView) -> dict[str, list[F64]]:
     Returns:
         Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
     """
-    rings, marked = [], []
+    rings = []
+    marked = []
     for lane in content.get("lanes") or []:
-        left, right = lane.get("left"), lane.get("right")
+        left = lane.get("left")
+        right = lane.get("right")
         if left and right:
             rings.append([*left, *reversed(right)])
         edges = zip((left, right), lane["markings"], strict=True)

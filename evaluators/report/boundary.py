@@ -117,7 +117,8 @@ def area_charts(record: JsonView) -> list[Chart]:
         for area in facts.get("areas", {}).values():
             low, high = record["reachable"][0]
             edges = np.linspace(low, high, len(area["lower"]) + 1)
-            lower, upper = area["lower"], area["upper"]
+            lower = area["lower"]
+            upper = area["upper"]
             axes.stairs(upper, edges, baseline=lower, fill=True, color=colour, alpha=0.16)
             for one in (lower, upper):
                 axes.stairs(one, edges, baseline=None, color=colour)

@@ -231,7 +231,8 @@ def check_suite(verdict: GateVerdict, gate: str) -> Suite:
     cases = []
     for check in verdict.checks:
         facts = {key: check.entry[key] for key in CHECK_FACTS if check.entry.get(key) is not None}
-        result, kind = "pass", ""
+        result = "pass"
+        kind = ""
         if check.cause != "pass":
             result, kind = ("failure", check.cause) if check.binding else ("skipped", "")
         cases.append(

@@ -20,7 +20,8 @@ WORST_CASE = "any bound"
 
 def verdict_text(decision: Decision) -> str:
     """Say in one line what was decided, after how much."""
-    most, cause = decision["ceiling"], decision["outcome"]["cause"]
+    most = decision["ceiling"]
+    cause = decision["outcome"]["cause"]
     is_answer = cause in ("pass", "regression", "undecided")
     verdict = decision["verdict"] if is_answer else WORDS[cause].lower()
     text = (

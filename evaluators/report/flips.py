@@ -62,7 +62,8 @@ class Flip:
     @property
     def sides(self) -> tuple[str, str]:
         """Give what the two sides are called: by their renderers, their policies, or both."""
-        one, two = self.base, self.other
+        one = self.base
+        two = self.other
         if one.policy == two.policy:
             return one.renderer, two.renderer
         return (
@@ -93,7 +94,8 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
             if other == variant or partner is None or not (rollout.ok or partner.ok):
                 continue
             compared += 1
-            was, now = outcomes_of(partner), outcomes_of(rollout)
+            was = outcomes_of(partner)
+            now = outcomes_of(rollout)
             if was != now:
                 tone = "worse" if was < now else "better" if now < was else "mixed"
                 flips.append(Flip(partner, rollout, in_words(was), in_words(now), tone))
@@ -164,7 +166,8 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     for flip in flips[:MAX_FLIP_ROWS]:
         entry: JsonView = known.get(flip.key) or {"t_us": None, "reason": unknown}
         why_not = entry.get("reason") or entry.get("frames_reason") or TOO_MANY
-        images, links = [], []
+        images = []
+        links = []
         for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True):
             colour, _ = colours[rollout.renderer, rollout.policy]
             links.append((name, colour, run.href(rollout, VIDEO_NAME), run.href(rollout)))

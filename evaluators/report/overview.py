@@ -157,9 +157,11 @@ class Overview:
             return "no rollouts", "unclear"
         n_short = sum(row.endings.get(SHORT_OF_END, 0) for row in self.rows)
         n_rollouts = sum(row.n_rollouts for row in self.rows)
-        n, total = len(self.failing), plural(len(self.rows), "variant")
+        n = len(self.failing)
+        total = plural(len(self.rows), "variant")
         if len(self.rows) == 1:
-            n, total = self.rows[0].n_failed, plural(n_rollouts, "rollout")
+            n = self.rows[0].n_failed
+            total = plural(n_rollouts, "rollout")
         tone: Tone = "worse" if n else "unclear" if n_short else "better"
         text = f"{n} of {total} fail{'s' if n == 1 else ''}" if n else f"no failure in {total}"
         if n_short:
@@ -309,7 +311,8 @@ def tone_of(entry: JsonView) -> Tone:
 
     Neutral means non-inferior: no worse than its margin, and not shown to be better.
     """
-    stated, shown = entry.get("verdict"), entry.get("difference")
+    stated = entry.get("verdict")
+    shown = entry.get("difference")
     if shown == "better" or (shown == "worse" and stated != "non-inferior"):
         return "better" if shown == "better" else "worse"
     known: dict[str, Tone] = {"worse": "worse", "undecided": "unclear"}
@@ -398,7 +401,8 @@ def _row(
     renderer = variant.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else variant
     key = variant if variant in metrics else renderer
     primary = metrics.get(key, {}).get(run.table.primary) or {}
-    mean, n = finite(primary.get("mean")), int(primary.get("n_rollouts") or 0)
+    mean = finite(primary.get("mean"))
+    n = int(primary.get("n_rollouts") or 0)
     rate = DASH
     if mean is not None:
         in_percent = run.table.shown(run.table.primary).in_percent

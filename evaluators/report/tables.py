@@ -153,14 +153,16 @@ def pair_rows(summary: JsonView, known: MetricTable = METRICS) -> list[PairRow]:
 
 
 def _pair_row(variant: str, metric: MetricInfo, entry: JsonView) -> PairRow:
-    difference, p = finite(entry.get("diff")), finite(entry.get("p_value"))
+    difference = finite(entry.get("diff"))
+    p = finite(entry.get("p_value"))
     bounds = interval(entry.get("ci95")) or ()
     scale, unit = scale_and_unit(metric, str(entry.get("unit", "")))
     counts = [(entry.get("n_cells"), "pair"), (entry.get("n_scenes"), "scene")]
     numbers = [plural(int(count), noun) for count, noun in counts if count is not None]
     if entry.get("n_missing"):
         numbers.append(f"{entry['n_missing']} rollouts lack a partner")
-    reason, note = str(entry.get("reason") or ""), ", ".join(numbers)
+    reason = str(entry.get("reason") or "")
+    note = ", ".join(numbers)
     diff_cell = missing(reason or "no pair has this metric valid on both sides")
     bounds_cell = missing(reason or "it needs at least two scenes")
     if difference is not None:

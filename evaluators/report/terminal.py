@@ -126,7 +126,8 @@ def overview_lines(shown: Overview, width: int) -> list[Text]:
     for caution in shown.cautions:
         lines += [Text(line, "yellow") for line in _wrapped(f"caution: {caution}", width)]
     for line in lines:
-        line.no_wrap, line.overflow = True, "ignore"
+        line.no_wrap = True
+        line.overflow = "ignore"
     return lines
 
 

@@ -20,7 +20,8 @@ from evaluators.scores.states import EgoStates, Kind, Tracks, derivative, smooth
 
 STOPPED_MPS = 5e-2  # for a contact; for the time to collision the ego stands below STANDS_MPS
 STANDS_MPS = 5e-3
-AHEAD_RAD, BEHIND_RAD = np.deg2rad(30.0), np.deg2rad(150.0)
+AHEAD_RAD = np.deg2rad(30.0)
+BEHIND_RAD = np.deg2rad(150.0)
 TTC_STEP_S = 0.1
 TTC_HORIZON_S = 3.0
 LEAST_TTC_S = 0.95
@@ -35,7 +36,8 @@ COMFORT = {  # least and greatest: m/s2, m/s3, rad/s, rad/s2
     "yaw_rate": (-0.95, 0.95),
     "yaw_accel": (-1.93, 1.93),
 }
-PROGRESS_M, PROGRESS_SHARE = 2.0, 0.2
+PROGRESS_M = 2.0
+PROGRESS_SHARE = 0.2
 OFF_AREA_M = 0.3
 OVERSPEED_MPS = 2.23
 AGAINST_S = 1.0
@@ -89,7 +91,8 @@ def collisions(ego: EgoStates, tracks: Tracks, astray: Bool | None = None) -> li
         tracks.there & (apart <= radius + np.hypot(*tracks.size.T)[:, None] / 2)
     )
     touches = shapely.intersects(boxes.take(step).shapes(), tracks.boxes(actor, step).shapes())
-    actor, step = actor[touches], step[touches]
+    actor = actor[touches]
+    step = step[touches]
     out = []
     for a in np.unique(actor).tolist():
         k = int(step[actor == a].min())
@@ -155,7 +158,8 @@ def time_to_collision(
     near = angle < AHEAD_RAD
     if beside is not None:
         near |= beside[step] & (angle <= BEHIND_RAD)
-    actor, step = actor[near], step[near]
+    actor = actor[near]
+    step = step[near]
     first_s, last_s = touching_s(ego, tracks, actor, step)
     after_s = step_s * np.maximum(np.ceil(first_s / step_s - 1e-9), 1.0)
     hit = (after_s <= last_s) & (after_s < horizon_s - 1e-9)
@@ -176,13 +180,12 @@ def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F
     The ego moves at its speed along its heading. Two boxes touch while they overlap on each of
     their four axes.
     """
-    apart, yaws = (
-        tracks.xy[actor, step] - ego.centre[step],
-        (ego.yaw[step], tracks.yaw[actor, step]),
-    )
+    apart = tracks.xy[actor, step] - ego.centre[step]
+    yaws = (ego.yaw[step], tracks.yaw[actor, step])
     gone = tracks.velocity[actor, step] - ego.speed[step][:, None] * ego.heading[step]
     sizes = np.broadcast_to(np.array(ego.size), (len(step), 2)), tracks.size[actor]
-    first_s, last_s = np.full(len(step), -np.inf), np.full(len(step), np.inf)
+    first_s = np.full(len(step), -np.inf)
+    last_s = np.full(len(step), np.inf)
     for yaw in (yaws[0], yaws[0] + np.pi / 2, yaws[1], yaws[1] + np.pi / 2):
         axis = np.cos(yaw), np.sin(yaw)
         reach = sum(
@@ -197,7 +200,8 @@ def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F
         ends[:, still] = np.where(
             np.abs(distance) <= reach, [[-np.inf], [np.inf]], [[np.inf], [-np.inf]]
         )[:, still]
-        first_s, last_s = np.maximum(first_s, ends[0]), np.minimum(last_s, ends[1])
+        first_s = np.maximum(first_s, ends[0])
+        last_s = np.minimum(last_s, ends[1])
     return first_s, last_s
 
 

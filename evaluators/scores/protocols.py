@@ -190,7 +190,8 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     benchmark = preset.protocol
     if benchmark is None:
         return []
-    ego, rows = rollout.ego, relevant(rollout)
+    ego = rollout.ego
+    rows = relevant(rollout)
     parts: dict[str, Part] = dict.fromkeys(PARTS[benchmark], NOT_DRIVEN)
     if rows.any():
         scored = replace(ego, t_us=ego.t_us[rows], xyz=ego.xyz[rows], quat=ego.quat[rows])
@@ -201,7 +202,8 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         known = {part: value for part, value in parts.items() if not isinstance(value, str)}
         missing = {part: reason for part, reason in parts.items() if isinstance(reason, str)}
         full_marks = known | dict.fromkeys(missing, 1.0)
-        least, most = rule(known | dict.fromkeys(missing, 0.0)), rule(full_marks)
+        least = rule(known | dict.fromkeys(missing, 0.0))
+        most = rule(full_marks)
         reasons = [
             reason for part, reason in missing.items() if rule(full_marks | {part: 0.0}) < most
         ]

@@ -23,7 +23,8 @@ NO_LIMITS = "the speed limits of the lanes"
 SHORT = "more than three instants"
 NO_SIGNALS = "the states of the traffic lights"
 RED = ("red", "red_yellow")
-LANE_M, LANE_S = 0.5, 2.0
+LANE_M = 0.5
+LANE_S = 2.0
 
 
 class ScoredRollout:
@@ -37,7 +38,8 @@ class ScoredRollout:
         self._lanes = list(scene.lane_map.lanes.values())
         self._xyz = centre.xyz - origin
         self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
-        self._signals, self._origin = scene.lane_map.signals, origin
+        self._signals = scene.lane_map.signals
+        self._origin = origin
 
     @property
     def road(self) -> Road:
@@ -77,7 +79,8 @@ class ScoredRollout:
         across = np.flatnonzero(out)
         row, lane = np.nonzero(self.road.lanes_near(self._xyz[across]))
         touches = shapely.intersects(self.road.areas(lane), boxes[across[row]])
-        row, lane = row[touches], lane[touches]
+        row = row[touches]
+        lane = lane[touches]
         for k in np.unique(lane).tolist():
             steps = across[row[lane == k]]
             inner = shapely.buffer(boxes[steps], -MARGIN_M, join_style="mitre")
@@ -140,7 +143,8 @@ class ScoredRollout:
         """
         if self._signals is None:
             return None
-        front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
+        front = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading
+        t_us = self.ego.t_us
         out = np.zeros(len(t_us), np.bool_)
         line = np.column_stack([front, self._xyz[:, 2]])
         for signal in (one for one in self._signals if not one.pedestrians):

@@ -106,9 +106,11 @@ def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F6
     origin ``(3,)``.
     """
     t_us = rear.t_us
-    yaw, rear_xy = np.unwrap(yaw_from_quat(rear.quat)), rear.xyz[:, :2] - origin[:2]
+    yaw = np.unwrap(yaw_from_quat(rear.quat))
+    rear_xy = rear.xyz[:, :2] - origin[:2]
     vectors = _rate(rear_xy, t_us)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     velocity = np.stack(
         [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1
     )

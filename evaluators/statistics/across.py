@@ -107,7 +107,8 @@ def compare_runs(
     check_scenes(
         scene_hashes(first), scene_hashes(second), both, "run both on the same scene files"
     )
-    table, base = table_of_run(second), table_of_run(first)
+    table = table_of_run(second)
+    base = table_of_run(first)
     base_variants = variants_in(base)
     named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
     before, after = (dict(run.info.get("weights") or {}) for run in (first, second))

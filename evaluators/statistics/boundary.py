@@ -85,7 +85,8 @@ def next_points(failed: Mapping[int, bool], skipped: set[int]) -> list[int]:
         middles += sorted(inside, key=lambda point: (abs(2 * point - low - high), point))[:1]
     if middles:
         return sorted(middles)
-    low, high = changes[0][0], changes[-1][1]
+    low = changes[0][0]
+    high = changes[-1][1]
     beside = [point for step in BESIDE for point in (low - step, high + step)]
     return [p for p in beside if 0 < p < STEPS and p not in {*failed, *skipped}]
 
@@ -108,7 +109,8 @@ def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Brack
     changes = changes_of(failed)
     if not changes:
         return "fails everywhere" if any(failed.values()) else "no failure"
-    low, high = changes[0][0], changes[-1][1]
+    low = changes[0][0]
+    high = changes[-1][1]
     return Bracket(values[low], values[high], failed[low], len(changes))
 
 

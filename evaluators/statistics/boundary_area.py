@@ -80,7 +80,8 @@ class Claims:
 
     def beyond(self, steps: int) -> tuple[Grid, Grid]:
         """Return the points that fail and that hold where claims begin some steps beyond a point."""
-        up, down = ((0, steps), (0, steps)), ((steps, 0), (steps, 0))
+        up = ((0, steps), (0, steps))
+        down = ((steps, 0), (steps, 0))
         fails = np.pad(self.fails, up, mode="edge")[steps:, steps:]
         end = AREA_STEPS + 1
         return fails, np.pad(self.holds, down, mode="edge")[:end, :end]
@@ -194,7 +195,8 @@ def _testing_point(claims: Claims, asked: Sequence[Point], skipped: set[Point]) 
     driven = claims.driven | _marked(claims, asked)
     distance = distance_transform_cdt(~driven, metric="chessboard")
     for steps in BESIDE:
-        nearer, here = claims.beyond(steps - 1), claims.beyond(steps)
+        nearer = claims.beyond(steps - 1)
+        here = claims.beyond(steps)
         layer = (nearer[0] & ~here[0]) | (nearer[1] & ~here[1])
         score = np.where(layer & ~_marked(claims, skipped), distance, 0)
         if score.max() > APART:
@@ -237,7 +239,8 @@ def area_of(failed: Mapping[Point, bool], values: Sequence[float]) -> Area | str
     claims = claims_of(failed)[0]
     steps = next(number for number in range(AREA_STEPS) if _agree(failed, claims, number))
     fails, holds = claims.squares(steps)
-    below, above = claims.turned(fails), claims.turned(holds)
+    below = claims.turned(fails)
+    above = claims.turned(holds)
     if claims.order[1] < 0:
         below, above = above, below
     return Area(

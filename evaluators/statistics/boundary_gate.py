@@ -84,7 +84,8 @@ def _checked(
     record: JsonView, earlier: JsonView, name: str, other: str, spec: GateSpec
 ) -> tuple[Cause, str, tuple[float, float] | None]:
     """Return a cause, a sentence, and by how much more of the range fails, at least and at most."""
-    now, was = record["variants"][name], earlier["variants"][other]
+    now = record["variants"][name]
+    was = earlier["variants"][other]
     if record["stopped"] or earlier["stopped"]:
         return "incomplete", "a search was stopped", None
     bounds = more_that_fails(now, was, record["reachable"])

@@ -124,7 +124,8 @@ def rate_interval(means: F64) -> Interval:
     Raises:
         EvaluatorError: A value outside [0, 1].
     """
-    n, p = len(means), float(np.mean(means))
+    n = len(means)
+    p = float(np.mean(means))
     if means.min() < 0.0 or means.max() > 1.0:
         raise EvaluatorError(
             f"{n} scene means: values from {means.min():g} to {means.max():g}",
@@ -144,7 +145,8 @@ def mean_interval(means: F64, metric: MetricInfo) -> Interval:
     and `mean_bounds` of the values cut to the cap. All others take t, which knows only the spread
     that it saw.
     """
-    n, centre = len(means), mean_of(means)
+    n = len(means)
+    centre = mean_of(means)
     least, most = metric.value_range
     if metric.is_flag:
         return rate_interval(means)
@@ -155,5 +157,6 @@ def mean_interval(means: F64, metric: MetricInfo) -> Interval:
     low, high = mean_bounds(means, least if math.isfinite(least) else -reach, reach)
     method = f"mean of scenes up to {reach:g} {metric.unit}".rstrip()
     if metric.cap is not None:
-        low, high = min(low, *(seen.bounds or [centre])), max(high, *(seen.bounds or [centre]))
+        low = min(low, *(seen.bounds or [centre]))
+        high = max(high, *(seen.bounds or [centre]))
     return within(Interval(centre, low, high, method=method), least, most)

@@ -391,7 +391,8 @@ class _Pair:
         self, metric: MetricInfo, cause: Cause, text: str, entry: JsonView, binding: bool
     ) -> Check:
         """Make the check of a metric."""
-        renderer, policy = self.variant.renderer, self.variant.policy
+        renderer = self.variant.renderer
+        policy = self.variant.policy
         sentence = f"{renderer}: {metric.name} against {self.against}: {text}"
         return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
 
@@ -479,7 +480,8 @@ def _of_suite(
             )
             for check in checks
         ]
-    named, others = checks[: len(rules)], checks[len(rules) :]
+    named = checks[: len(rules)]
+    others = checks[len(rules) :]
     if any(check.cause == "regression" for check in named):
         return named
     happened = [change.n_new > 0 for change in changes[len(rules) :]]
@@ -492,7 +494,8 @@ def _suite_check(
     metric = change.metric
     max_new = spec.max_new if rule.max_new is None else rule.max_new
     verdict = verdict_of(change, p, max_new)
-    n_cells, n_missing = int(np.sum(change.is_pair)), len(change.missing)
+    n_cells = int(np.sum(change.is_pair))
+    n_missing = len(change.missing)
     if metric.is_flag:
         counts = {"new": change.n_new, "gone": change.n_gone}
     else:
@@ -523,7 +526,8 @@ def _suite_check(
         "missing": change.missing[:LISTED],
         "seeds": seeds_that_decide(change) if verdict == "undecided" else None,
     }
-    text, cause = change_text(entry, metric), CAUSES[verdict]
+    text = change_text(entry, metric)
+    cause = CAUSES[verdict]
     is_missing = n_missing > spec.max_missing * (n_cells + n_missing)
     n_scenes = len({pair.side.scene[i] for i in np.flatnonzero(change.is_pair | change.is_cut)})
     if is_missing or not n_cells:

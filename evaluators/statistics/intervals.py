@@ -115,7 +115,8 @@ def t_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
     if are_alike(x):
         return Interval(centre, reason=NO_SPREAD.format(len(x), unit))
     half = float(scipy.special.stdtrit(len(x) - 1, 1 - TAIL) * np.std(x, ddof=1)) / len(x) ** 0.5
-    low, high = centre - half * scale, centre + half * scale
+    low = centre - half * scale
+    high = centre + half * scale
     if not np.isfinite([low, high]).all():
         return Interval(centre, reason=TOO_LARGE)
     return Interval(centre, low, high, method=f"t on {unit}")
@@ -180,7 +181,8 @@ def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
         return (gained - lost - n * difference) / math.sqrt(max(variance, 1e-12))
 
     seen = (gained - lost) / n
-    low, high = -1.0, 1.0
+    low = -1.0
+    high = 1.0
     if score(-1 + 1e-9) > Z95:
         low = scipy.optimize.brentq(lambda d: score(d) - Z95, -1 + 1e-9, seen)
     if score(1 - 1e-9) < -Z95:

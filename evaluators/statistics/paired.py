@@ -241,7 +241,8 @@ def compare(
     sizes, _ = cluster_means(np.abs(pairs.mine) + np.abs(pairs.base), pairs.scenes)
     means[np.abs(means) <= ROUNDING * sizes] = 0.0
     n = len(means)
-    up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
+    up = int(np.sum(means > 0))
+    down = int(np.sum(means < 0))
     entry["scenes"] = {
         "up": up,
         "down": down,
@@ -315,7 +316,8 @@ def _beyond(pairs: Pairs, left: Pairs, metric: MetricInfo, reach: float) -> Json
     """
     what, scenes, change = metric.event, left.scenes, left.mine - left.base
     if not len(change):
-        what, scenes = f"more than {reach:g} {metric.unit}".rstrip(), pairs.scenes
+        what = f"more than {reach:g} {metric.unit}".rstrip()
+        scenes = pairs.scenes
         far = pairs.mine - pairs.base
         worse = {"none": np.abs(far), "lower": far, "higher": -far}[metric.direction]
         change = np.where(worse > reach, 1.0, 0.0) - np.where(worse < -reach, 1.0, 0.0)
@@ -340,7 +342,8 @@ def difference_bounds(
         metric: What it is.
         margin: How much worse is accepted.
     """
-    n, reach = len(means), reach_of(metric, margin)
+    n = len(means)
+    reach = reach_of(metric, margin)
     guarded = list(mean_bounds(means, -reach, reach)) if reach else None
     if metric.is_flag:
         return flag_interval(delta, scenes), guarded
@@ -415,13 +418,15 @@ class Pairs:
     """Cells with a value on both sides, and those without."""
 
     def __init__(self, side: Side, base: Side, metric: str) -> None:
-        here, there = side.values(metric), base.values(metric)
+        here = side.values(metric)
+        there = base.values(metric)
         self.index = side.place_in(base)
         self.here = here
         # The last value stands for cells that the base does not have: index -1.
         self.there = np.append(there, np.nan)[self.index]
         self.both: Bool = np.isfinite(self.here) & np.isfinite(self.there)
-        self.mine, self.base = self.here[self.both], self.there[self.both]
+        self.mine = self.here[self.both]
+        self.base = self.there[self.both]
         self.scenes = side.scene[self.both]
         self._sides = {"here": (side, here), "baseline": (base, there)}
         self.only_base = np.flatnonzero(base.place_in(side) < 0)

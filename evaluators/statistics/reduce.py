@@ -215,7 +215,8 @@ def _reduce(
     if dropped:
         return _value(metric_series.metric, None, dropped)
     rows = (metric_series.t_us >= first_us) & (metric_series.t_us <= last_us)
-    value, valid = metric_series.value[rows], metric_series.valid[rows]
+    value = metric_series.value[rows]
+    valid = metric_series.valid[rows]
     if not len(value):
         return _value(metric_series.metric, None, "no value among the scored steps")
     # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables

@@ -37,13 +37,15 @@ def difference_text(entry: JsonView, metric: MetricInfo) -> str:
     bounds = interval(entry.get("ci95")) or ()
     numbers = printed(metric, difference, *bounds, sign=True)
     text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
-    n, p = int(entry.get("n_scenes") or 0), finite(entry.get("p_value"))
+    n = int(entry.get("n_scenes") or 0)
+    p = finite(entry.get("p_value"))
     if p is not None and 1 < n < FEW_SCENES:
         can = "" if n >= LEAST_SCENES else f", {plural(n, 'scene')} cannot decide"
         text = f"exact test p = {short(p)}{can}; {text}"
     if bounds:
         text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
-    needed, margin = more_scenes_text(entry.get("more_scenes")), finite(entry.get("margin"))
+    needed = more_scenes_text(entry.get("more_scenes"))
+    margin = finite(entry.get("margin"))
     if needed and margin is not None:
         text += f"; {needed} on the margin of {short(margin * scale, unit)}"
     return text
@@ -71,7 +73,8 @@ def change_text(entry: JsonView, metric: MetricInfo) -> str:
     if not entry["n_cells"]:
         parts = ["no pair is compared"]
     elif not metric.is_flag:
-        mean, margin = entry["diff"] * scale, entry["margin"] * scale
+        mean = entry["diff"] * scale
+        margin = entry["margin"] * scale
         parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":
         parts.append(f"worst in {_some([_place(pair) for pair in entry['worst']])}")

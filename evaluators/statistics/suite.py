@@ -256,7 +256,8 @@ def seeds_that_decide(change: Change) -> int | None:
     """Return about how many seeds a scene would show that a metric is within its margin, if more of
     them show the same; None where that is more than `MOST_SEEDS`.
     """
-    n, n_scenes = int(np.sum(change.is_pair)), len(change.by_scene(change.now))
+    n = int(np.sum(change.is_pair))
+    n_scenes = len(change.by_scene(change.now))
     if n < 2:
         return None
     for seeds in range(1, MOST_SEEDS + 1):

@@ -72,8 +72,10 @@ def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: Me
 def _entry(side: Side, metric: MetricInfo) -> JsonObject:
     by_cell = side.values(metric.name)
     known = np.isfinite(by_cell)
-    values, scenes = by_cell[known], side.scene[known]
-    n, n_ran = len(values), int(side.ok.sum())
+    values = by_cell[known]
+    scenes = side.scene[known]
+    n = len(values)
+    n_ran = int(side.ok.sum())
     entry: JsonObject = {
         "mean": None,
         "ci95": None,
@@ -219,14 +221,14 @@ def rate_bounds(
     seen = values[known]
     n = len(values)
     missing = int(np.sum(~known))
-    cut, scored = cut[known], scored[known]
-    least, greatest = seen, np.where(cut > 0, 1.0, seen)
+    cut = cut[known]
+    scored = scored[known]
+    least = seen
+    greatest = np.where(cut > 0, 1.0, seen)
     if is_share:
         steps = np.maximum(scored + cut, 1.0)
-        least, greatest = (
-            np.where(cut > 0, seen * scored / steps, seen),
-            np.where(cut > 0, (seen * scored + cut) / steps, seen),
-        )
+        least = np.where(cut > 0, seen * scored / steps, seen)
+        greatest = np.where(cut > 0, (seen * scored + cut) / steps, seen)
     over_rollouts = [float(seen.sum()) / n, (float(seen.sum()) + missing) / n]
     return (
         over_rollouts,

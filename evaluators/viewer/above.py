@@ -38,7 +38,8 @@ def still_map(
         series: Pose and event series, by cell.
         variant_of: (renderer, policy) -> (colour index, dash index).
     """
-    log, vehicle = content["ego_log"], content["vehicle"]
+    log = content["ego_log"]
+    vehicle = content["vehicle"]
     recorded = np.column_stack([log["x_m"], log["y_m"]]).astype(np.float64)
     names_policy = len({rollout.policy for rollout in rollouts}) > 1
     driven = [one for one in rollouts if "ego_x_m" in series.get(one.cell, {})]
@@ -55,7 +56,8 @@ def still_map(
         )
     marks = []
     # road users are drawn at the scene's first event, else half way through
-    at_us, moment = (first_us + last_us) // 2, "half way"
+    at_us = (first_us + last_us) // 2
+    moment = "half way"
     happened = []
     for rollout in rollouts:
         names = [rollout.renderer, rollout.policy] if names_policy else [rollout.renderer]

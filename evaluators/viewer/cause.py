@@ -340,7 +340,8 @@ def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:
 
 def _parting_of(run: Run, rollout: Rollout, entry: JsonView, start_us: int) -> Parting:
     """Return where plans part by an entry of ``flips.json``; a policy sees the same images."""
-    at_s, gap_m = (int(entry["t_us"]) - start_us) * 1e-6, float(entry["gap_m"])
+    at_s = (int(entry["t_us"]) - start_us) * 1e-6
+    gap_m = float(entry["gap_m"])
     if entry["baseline"] == rollout.renderer:
         name = str(entry["against"]).removeprefix(rollout.renderer + "/")
         return Parting(name, "policy", at_s, gap_m)

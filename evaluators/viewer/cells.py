@@ -195,7 +195,8 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
             grouped.setdefault(key, []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        other, held = flip.other, getattr(flip.other, fixed)
+        other = flip.other
+        held = getattr(flip.other, fixed)
         # a cell shows one policy behind all renderers, or the other way round
         if getattr(flip.base, fixed) == held and wanted.takes(other):
             flips.setdefault((other.scene, held, other.seed), []).append(flip)

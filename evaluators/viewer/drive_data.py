@@ -178,7 +178,8 @@ def drive_data(
 
 def user_data(actor: Actor, place: Place) -> JsonObject:
     """Return a road user: its label, its size in centimetres, its way."""
-    way, box = place.track(actor.track), actor.box
+    way = place.track(actor.track)
+    box = actor.box
     poses = set(zip(way["x"], way["y"], way["a"], strict=True))
     if len(poses) == 1:  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
@@ -232,7 +233,8 @@ def moments(
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
     found = []
     for event in events_of(rollout, series_by_cell(known)):
-        text, t_ms = event.what, None
+        text = event.what
+        t_ms = None
         if event.t_us is not None and event.t_s is not None:
             t_ms = place.ms([event.t_us])[0]
             if event.kind == "collision":
@@ -265,7 +267,8 @@ def plans_part(flips: Sequence[JsonView], place: Place, by_policy: bool) -> list
     for entry in flips:
         if entry.get("t_us") is None:
             continue
-        side, other = entry["renderer"], entry["baseline"]
+        side = entry["renderer"]
+        other = entry["baseline"]
         if by_policy:
             side, other = entry["policy"], str(entry["against"]).removeprefix(f"{side}/")
         text = f"plans part by {float(entry['gap_m']):.2f} m from {other}"

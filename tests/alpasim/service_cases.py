@@ -18,8 +18,10 @@ from alpasim_plugin.log.wire import api_version, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
 CAMERA = "camera_front_wide_120fov"
-WIDTH, HEIGHT = 48, 32
-STEP_US, SHUTTER_US = 100_000, 30_000
+WIDTH = 48
+HEIGHT = 32
+STEP_US = 100_000
+SHUTTER_US = 30_000
 START_US = 1_689_697_803_493_732
 # Optical axes in the rig: x right, y down, z forward.
 T_RIG_CAMERA = np.array(
@@ -39,7 +41,8 @@ def wire_pose(T):
 def pinhole(width=WIDTH, height=HEIGHT, name=CAMERA):
     """Return the intrinsics of a pinhole without distortion."""
     lens = sensorsim_pb2.OpenCVPinholeCameraParam(focal_length_x=40, focal_length_y=40)
-    lens.principal_point_x, lens.principal_point_y = width / 2, height / 2
+    lens.principal_point_x = width / 2
+    lens.principal_point_y = height / 2
     return sensorsim_pb2.CameraSpec(
         opencv_pinhole_param=lens, logical_id=name, resolution_w=width, resolution_h=height
     )
@@ -156,7 +159,8 @@ class StandInRenderer:
     def batch_render_rgb(self, asked, context):
         """Draw one frame a camera."""
         self.calls.append("batch_render_rgb")
-        item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
+        item = sensorsim_pb2.BatchRGBRenderReturnItem
+        result = sensorsim_pb2.RGBRenderReturn
         images = [self._image(i.request, context) for i in asked.items]
         made = [
             item(camera_name=i.camera_name, success=True, result=result(image_bytes=data))

@@ -42,10 +42,8 @@ sys.exit(code)
 """
 
 REPO = Path(__file__).resolve().parents[2]
-PAGE, SCENES = (
-    REPO / "docs" / "alpasim.md",
-    REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes",
-)
+PAGE = REPO / "docs" / "alpasim.md"
+SCENES = REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes"
 WIZARD = "SIMRUN_ALPASIM_PYTHON"
 
 
@@ -127,7 +125,8 @@ def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
 
 def test_the_client_asks_again_only_after_what_may_pass(upstream, renderer, monkeypatch):
     monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
-    frame, seen = drive(1)[0], []
+    frame = drive(1)[0]
+    seen = []
 
     def fault(code, text, times):
         def answer(asked, context, data):

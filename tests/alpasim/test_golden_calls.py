@@ -91,7 +91,8 @@ def replay(log, scenes, **settings):
 
 def test_the_calls_of_one_recorded_drive(shared_data, overrides, monkeypatch):
     trust_every_frame(monkeypatch)
-    log, scenes = complete_logs(shared_data)[0], shared_data / "alpasim-golden" / "scenes"
+    log = complete_logs(shared_data)[0]
+    scenes = shared_data / "alpasim-golden" / "scenes"
     scene = scenes / f"{log.parents[1].name}.usdz"
     images = replay(log, scene, overrides=overrides)
     assert len(images) > 20

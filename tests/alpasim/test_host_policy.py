@@ -47,7 +47,8 @@ class Cruise(Policy):
     sensors = (SensorSpec("front"),)
 
     def __init__(self):
-        self.poses, self.is_closed = 0, False
+        self.poses = 0
+        self.is_closed = False
 
     def reset(self, seed, route):
         pass
@@ -149,7 +150,8 @@ def test_streams_that_stay_open_hold_nobody_up(name):
     ids=lambda of: of and of[1],
 )
 def test_calls_whose_message_never_comes_hold_nobody_up(name, of):
-    silence, open_call = Silence(), say_nothing(*(of or (name, "get_version")))
+    silence = Silence()
+    open_call = say_nothing(*(of or (name, "get_version")))
     with served(name) as host, channel_to(host) as channel:
         calls = [open_call(channel, silence) for _ in range(100)]
         time.sleep(0.5)  # all are there before the next caller
@@ -165,7 +167,8 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
     monkeypatch.setattr(hosting, "RECEIVING", 4)
     monkeypatch.setattr(hosting, "SENDING_S", 0.5)
     monkeypatch.setattr(hosting, "UPKEEP_S", 0.1)
-    name, silence = "EgodriverService", Silence()
+    name = "EgodriverService"
+    silence = Silence()
     with served(name) as host, channel_to(host) as channel:
         calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(8)]
         assert is_served(host, name)

@@ -16,15 +16,18 @@ def plain_lengths(rays):
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(rays[:, 2] < 0, GROUND_M / rays[:, 2], np.inf)
-        first, second = BOX[0] / rays, BOX[1] / rays
-    enter, leave = np.fmin(first, second).max(axis=1), np.fmax(first, second).min(axis=1)
+        first = BOX[0] / rays
+        second = BOX[1] / rays
+    enter = np.fmin(first, second).max(axis=1)
+    leave = np.fmax(first, second).min(axis=1)
     return np.minimum(plane, np.where((enter <= leave) & (enter > 0), enter, np.inf))
 
 
 @pytest.mark.parametrize("device", [sensorsim_pb2.PANDAR128, sensorsim_pb2.AT128])
 def test_points_of_a_plane_and_a_box_are_exact_but_at_edges(device):
     lidar = LIDARS[device]
-    depths, cameras = [], lidar.cameras()
+    depths = []
+    cameras = lidar.cameras()
     for camera in cameras:
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         p = np.stack(

@@ -78,7 +78,8 @@ def driver(address, *more):
 def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_driven_again(
     tmp_path, capsys
 ):
-    address, out = f"127.0.0.1:{free_port()}", tmp_path / "out"
+    address = f"127.0.0.1:{free_port()}"
+    out = tmp_path / "out"
     command = [
         "--renderer",
         "clean",
@@ -105,7 +106,8 @@ class Answering:
     """A driver that fails with a given status."""
 
     def __init__(self, code, text="as told"):
-        self.code, self.text = code, text
+        self.code = code
+        self.text = text
 
     def drive(self, request, context):
         if self.code is grpc.StatusCode.DEADLINE_EXCEEDED:

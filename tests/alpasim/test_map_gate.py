@@ -105,10 +105,8 @@ def test_a_map_without_lines_or_with_few_in_view_is_not_judged():
 
 
 def test_a_road_user_hides_lines_from_the_comparison():
-    bus, striped = (
-        ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus"),
-        photograph(contrast=0),
-    )
+    bus = ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus")
+    striped = photograph(contrast=0)
     lines = line_pixels(draw_map(prepared(1.75), SPEC, AHEAD)) & (np.arange(270)[:, None] > 150)
     striped[np.roll(lines, 30, axis=1)] = (
         200  # the lines of the map, beside where it has them, painted on the bus
@@ -138,7 +136,8 @@ def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence():
 
 def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side():
     paint = top_hat(np.random.default_rng(2).integers(0, 255, (200, 300, 3), dtype=np.uint8))
-    rows, ones = np.arange(200), np.ones(200, np.int64)
+    rows = np.arange(200)
+    ones = np.ones(200, np.int64)
     found = agreement(Pieces(rows, 100 * ones, 104 * ones), paint)
     assert found == pytest.approx(0.5, abs=0.05)
     assert agreement(Pieces(rows, 296 * ones, 300 * ones), paint) is not None
@@ -175,7 +174,8 @@ def test_a_server_drops_a_wrong_map_and_says_so(aside_m, is_off, overrides, capl
                 overrides=[*overrides, *more],
             )
         )
-        entry, asked = made.scenes.get(ask().scene_id), ask()
+        entry = made.scenes.get(ask().scene_id)
+        asked = ask()
         if entry.scene_map is not None:
             lines = replace(
                 entry.scene_map, origin=entry.scene_map.origin + np.array([0.0, moved_m, 0.0])

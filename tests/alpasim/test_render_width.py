@@ -23,7 +23,8 @@ def test_a_smaller_picture_is_enlarged_to_the_size_asked_for(renderer, overrides
     asked = [ask(1.0 + 0.1 * i) for i in range(2)]
     small = [ask(1.0 + 0.1 * i) for i in range(2)]
     for one in small:
-        one.resolution_w, one.resolution_h = one.resolution_w // 2, one.resolution_h // 2
+        one.resolution_w = one.resolution_w // 2
+        one.resolution_h = one.resolution_h // 2
     size = asked[0].resolution_w, asked[0].resolution_h
     got = [
         decode_image(data)

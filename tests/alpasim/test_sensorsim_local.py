@@ -23,7 +23,8 @@ from tests.alpasim.service_cases import answers, channel_to, hosted, pinhole
 pytestmark = pytest.mark.slow
 
 SCENE = "smoke/lead_car"
-W, H = 64, 36
+W = 64
+H = 36
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,8 @@ def ask(t_s=1.0, spec=None):
 def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(
     served,
 ):
-    asked, scenario = ask(), load_scenario(SCENE)
+    asked = ask()
+    scenario = load_scenario(SCENE)
     view = read_view(asked)
     camera = replace(
         scenario.cameras[0],

@@ -29,7 +29,8 @@ from tests.alpasim.service_cases import (
 from tests.alpasim.test_server_history import SLOWLY_APART
 
 EMPTY = common_pb2.Empty()
-JPEG, PNG = sensorsim_pb2.JPEG, sensorsim_pb2.PNG
+JPEG = sensorsim_pb2.JPEG
+PNG = sensorsim_pb2.PNG
 
 
 def batch(requests):

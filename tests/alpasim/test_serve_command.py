@@ -63,7 +63,8 @@ def test_the_commands_of_the_page_are_valid(repo):
     for verb, *rest in commands:
         one = load_verb(verb)
         while hasattr(one, "commands"):
-            one, rest = one.commands[rest[0]], rest[1:]
+            one = one.commands[rest[0]]
+            rest = rest[1:]
         one.make_context(verb, list(rest))
     modules = re.findall(r"python -m (alpasim_plugin[\w.]+)", page)
     assert modules

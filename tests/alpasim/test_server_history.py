@@ -33,7 +33,8 @@ def views(*args, **options):
 
 def interleaved(drives, seed):
     """Return the frames of all drives mixed at random, each drive's in its own order."""
-    rng, left = np.random.default_rng(seed), [list(d) for d in drives]
+    rng = np.random.default_rng(seed)
+    left = [list(d) for d in drives]
     out = []
     while any(left):
         out.append(left[rng.choice([i for i, rest in enumerate(left) if rest])].pop(0))
@@ -85,10 +86,12 @@ def test_a_step_back_forks_and_leaves_the_first_branch_alone():
 
 
 def test_another_place_camera_lens_or_scene_starts_a_history():
-    kept, known = tree(), drive(5)
+    kept = tree()
+    known = drive(5)
     for r in known:
         serve(kept, read_view(r))
-    far, t_us = se2(500.0, 0.0, 0.0), START_US + 5 * STEP_US
+    far = se2(500.0, 0.0, 0.0)
+    t_us = START_US + 5 * STEP_US
     assert kept.parent_of(read_view(drive(6)[5])) is not None
     assert kept.parent_of(read_view(request(far, far, t_us))) is None
     for change in ({"camera": "camera_rear"}, {"scene_id": "other"}):
@@ -120,7 +123,8 @@ def test_drives_that_differ_in_traffic_alone_stay_apart():
 
 
 def test_memory_is_bounded_and_the_drives_ends_go_last():
-    kept, slow = tree(max_bytes=1000), views(3, parts_at=1, aside_mps=2.0)
+    kept = tree(max_bytes=1000)
+    slow = views(3, parts_at=1, aside_mps=2.0)
     for view in slow:
         serve(kept, view)
     for view in views(60):
@@ -133,7 +137,8 @@ def test_memory_is_bounded_and_the_drives_ends_go_last():
 
 
 def test_motion_is_continued_in_place_and_turn():
-    a, b = se2(0, 0, 0.1), se2(1, 0.5, 0.2)
+    a = se2(0, 0, 0.1)
+    b = se2(1, 0.5, 0.2)
     assert apart(on_line(a, b, 3.0), se2(3, 1.5, 0.4)) < 1e-6
     assert apart(on_line(a, b, -1.0), se2(-1, -0.5, 0.0)) < 1e-6
 

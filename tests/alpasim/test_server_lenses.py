@@ -70,7 +70,8 @@ def ftheta(backward):
 
 
 def by_opencv(spec):
-    p, rays = spec.opencv_pinhole_param, np.column_stack([RAYS, np.ones(len(RAYS))])
+    p = spec.opencv_pinhole_param
+    rays = np.column_stack([RAYS, np.ones(len(RAYS))])
     K = np.array(
         [
             [p.focal_length_x, 0, p.principal_point_x],
@@ -78,14 +79,16 @@ def by_opencv(spec):
             [0, 0, 1],
         ]
     )
-    k, t = list(p.radial_coeffs), list(p.tangential_coeffs)
+    k = list(p.radial_coeffs)
+    t = list(p.tangential_coeffs)
     return cv2.projectPoints(
         rays, np.zeros(3), np.zeros(3), K, np.array([*k[:2], *t, *k[2:], *p.thin_prism_coeffs])
     )[0][:, 0]
 
 
 def by_opencv_fisheye(spec):
-    p, rays = spec.opencv_fisheye_param, np.column_stack([RAYS, np.ones(len(RAYS))])
+    p = spec.opencv_fisheye_param
+    rays = np.column_stack([RAYS, np.ones(len(RAYS))])
     K = np.array(
         [
             [p.focal_length_x, 0, p.principal_point_x],
@@ -102,7 +105,8 @@ def by_ftheta(spec):
     """The overlay's formula: theta = atan2(|xy|, z); pixel = [[c, d], [e, 1]] (r(theta) xy / |xy|)
     + principal point.
     """
-    p, rho = spec.ftheta_param, np.linalg.norm(RAYS, axis=1)
+    p = spec.ftheta_param
+    rho = np.linalg.norm(RAYS, axis=1)
     theta = np.arctan2(rho, 1.0)
     if p.reference_poly == sensorsim_pb2.FthetaCameraParam.ANGLE_TO_PIXELDIST:
         r = np.polynomial.polynomial.polyval(theta, np.array(p.angle_to_pixeldist_poly))
@@ -150,7 +154,8 @@ def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
     assert straight.place is not None
     assert straight.size[0] == size[0]
     for (x, y), pixel in zip(RAYS, project(spec) * size[0] / 320, strict=True):
-        column, row = straight.K[0] @ [x, y, 1] - 0.5, straight.K[1] @ [x, y, 1] - 0.5
+        column = straight.K[0] @ [x, y, 1] - 0.5
+        row = straight.K[1] @ [x, y, 1] - 0.5
         found = cv2.remap(
             straight.place, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR
         )[0, 0]
@@ -225,7 +230,8 @@ def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean
     (only,) = read_sides(pinhole(64, 32), 32, 32)
     assert_allclose(only.K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
     spec = ftheta(False)
-    whole, half = read_sides(spec, 320, 180), read_sides(spec, 160, 90)
+    whole = read_sides(spec, 320, 180)
+    half = read_sides(spec, 160, 90)
     assert_allclose(
         shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
     )

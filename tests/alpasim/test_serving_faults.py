@@ -171,7 +171,8 @@ def test_a_caller_that_leaves_or_is_late_costs_nobody_else(upstream, renderer, o
 
 @pytest.mark.parametrize("count", [44, pytest.param(200, marks=pytest.mark.slow)])
 def test_malformed_messages_change_nothing(upstream, overrides, count):
-    frames, rng = drive(3), np.random.default_rng(7)
+    frames = drive(3)
+    rng = np.random.default_rng(7)
     whole = frames[0].SerializeToString()
     with in_front_of(upstream, overrides=overrides) as (stub, made):
         before = answers(stub, frames)
@@ -204,11 +205,13 @@ def test_malformed_messages_change_nothing(upstream, overrides, count):
 def test_health_and_reflection_answer_under_public_names(upstream):
     service = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address))).service
     with hosted({"SensorsimService": service}) as host, channel_to(host) as to:
-        health, name = Stub(to, "Health"), "nre.grpc.protos.sensorsim.SensorsimService"
+        health = Stub(to, "Health")
+        name = "nre.grpc.protos.sensorsim.SensorsimService"
         ask = health_pb2.HealthCheckRequest
         assert [health.Check(ask(service=s)).status for s in ("", name)] == [1, 1]
         assert failure(lambda: health.Check(ask(service="other")))[0] == Code.NOT_FOUND
-        reflect, question = Stub(to, "ServerReflection"), reflection_pb2.ServerReflectionRequest
+        reflect = Stub(to, "ServerReflection")
+        question = reflection_pb2.ServerReflectionRequest
         listed, file, missing = reflect.ServerReflectionInfo(
             iter(
                 [
@@ -323,7 +326,8 @@ def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
             address, grpc.ssl_channel_credentials(cert.read_bytes())
         ),
     )
-    right, wrong = ways[with_tls], ways[not with_tls]
+    right = ways[with_tls]
+    wrong = ways[not with_tls]
     with contextlib.ExitStack() as stack:
         policy = HostPolicy(cert, key) if with_tls else HostPolicy()
         host = stack.enter_context(hosted({"SensorsimService": renderer}, policy=policy))

@@ -28,9 +28,12 @@ from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta
 from tests.examples import first_of
 
 SCENE = "smoke/lead_car"
-W, H = 96, 54
-DOWN, UP = sensorsim_pb2.ROLLING_TOP_TO_BOTTOM, sensorsim_pb2.ROLLING_BOTTOM_TO_TOP
-RIGHT, LEFT = sensorsim_pb2.ROLLING_LEFT_TO_RIGHT, sensorsim_pb2.ROLLING_RIGHT_TO_LEFT
+W = 96
+H = 54
+DOWN = sensorsim_pb2.ROLLING_TOP_TO_BOTTOM
+UP = sensorsim_pb2.ROLLING_BOTTOM_TO_TOP
+RIGHT = sensorsim_pb2.ROLLING_LEFT_TO_RIGHT
+LEFT = sensorsim_pb2.ROLLING_RIGHT_TO_LEFT
 
 
 def ask(
@@ -86,7 +89,8 @@ def sides_of_request(asked):
 @pytest.mark.parametrize("shutter_type", first_of([UP, RIGHT, DOWN, LEFT], 2))
 def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec, shutter_type):
     asked = ask(shutter_type, spec=spec)
-    asked.resolution_w, asked.resolution_h = 160, 90
+    asked.resolution_w = 160
+    asked.resolution_h = 90
     found, (lens, *_) = exposure(asked), sides_of_request(asked)
     assert lens.resample is not None
     assert found.share.shape == lens.cover[::-1]
@@ -127,7 +131,8 @@ def served(asked):
 
 
 def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row():
-    rolled, still = served(ask()), served(ask(sensorsim_pb2.GLOBAL))
+    rolled = served(ask())
+    still = served(ask(sensorsim_pb2.GLOBAL))
     assert (
         np.abs(rolled[: H // 2].astype(int) - still[: H // 2]).mean()
         > 3 * np.abs(rolled[-2:].astype(int) - still[-2:]).mean()
@@ -137,15 +142,14 @@ def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_r
 def test_the_map_has_the_shutter_of_the_frame():
     made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE]))
     asked = ask()
-    view, entry = read_view(asked), made.scenes.get(asked.scene_id)
+    view = read_view(asked)
+    entry = made.scenes.get(asked.scene_id)
     (lens,) = sides = sides_of_request(asked)
     camera = lens.spec("front", np.eye(4))
     boxes = {name: pair[1] for name, pair in view.objects.items()}
     request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
-    drawn, still = (
-        drawn_map(entry, [request], sides),
-        drawn_map(entry, [replace(request, exposure=None)], sides),
-    )
+    drawn = drawn_map(entry, [request], sides)
+    still = drawn_map(entry, [replace(request, exposure=None)], sides)
     assert still is not None
     assert (drawn != still).any()
     assert entry.scene_map is not None

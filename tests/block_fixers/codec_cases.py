@@ -37,7 +37,8 @@ class Stream:
     """Feed a codec's pure step block by block."""
 
     def __init__(self, step, state=None):
-        self.step, self.state = step, state
+        self.step = step
+        self.state = state
 
     def push(self, x, *args, **options):
         """Return the outputs that the next frames or latents complete."""

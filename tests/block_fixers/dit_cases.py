@@ -43,7 +43,8 @@ def clip(
 
 def stream(net, cache, x, t, text, hdmap, blocks, mask=None):
     """Run a clip block by block, each forward kept; ``blocks`` lists their lengths."""
-    out, start = [], 0
+    out = []
+    start = 0
     for latents in blocks:
         cut = slice(start, start + latents)
         m = None if mask is None else mask[:, :, cut]

@@ -98,7 +98,8 @@ def velocity(
     sd = {key: value.double() for key, value in sd.items() if value.is_floating_point()}
     x, t, text, hdmap = (a.double() for a in (x, t, text, hdmap))
     b, _, frames, height, width = x.shape
-    rows, columns = height // 2, width // 2
+    rows = height // 2
+    columns = width // 2
     nothing = torch.zeros_like(x[:, :1])
     masks = [nothing if mask is None else mask.double() for mask in (condition_mask, padding_mask)]
 
@@ -150,7 +151,8 @@ def velocity(
                 source = y if is_self else context.expand(b, *context.shape[1:])
                 q, k, v = heads(y, name, "q"), heads(source, name, "k"), heads(source, name, "v")
                 if is_self:
-                    q, k = rotate(q, angles), rotate(k, angles)
+                    q = rotate(q, angles)
+                    k = rotate(k, angles)
                 y = apply(f"{name}.output_proj", attend(q, k, v, causal if is_self else None))
             stream = stream + gate * y
         i += 1

@@ -22,7 +22,8 @@ def test_two_rollouts_interleaved_are_each_bit_equal_to_alone():
     net = network()
     clips = [clip(10, seed=seed) for seed in (1, 2)]
     alone = [stream(net, net.new_cache(1, 4, 6, 4, 1), *c, (2,) * 5) for c in clips]
-    caches, out = [net.new_cache(1, 4, 6, 4, 1) for _ in clips], [[], []]
+    caches = [net.new_cache(1, 4, 6, 4, 1) for _ in clips]
+    out = [[], []]
     for start in range(0, 10, 2):
         cut = slice(start, start + 2)
         for i, (x, t, text, hdmap) in enumerate(clips):
@@ -32,7 +33,8 @@ def test_two_rollouts_interleaved_are_each_bit_equal_to_alone():
 
 
 def test_reset_reproduces_the_same_bits_even_after_nan():
-    net, c = network(), clip(10)
+    net = network()
+    c = clip(10)
     cache = net.new_cache(1, 4, 6, 4)
     first = stream(net, cache, *c, (2,) * 5)
     net.step(torch.full_like(c[0][:, :, :2], torch.nan), 500.0, c[2], c[3][:, :, :2], cache)

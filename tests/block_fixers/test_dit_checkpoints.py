@@ -114,7 +114,8 @@ def of_the_page(repo, word, folder):
 
 
 def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
-    sd, folder = random_weights(SMALL), tmp_path / "shards"
+    sd = random_weights(SMALL)
+    folder = tmp_path / "shards"
     folder.mkdir()
     halves = sorted(sd)[::2], sorted(sd)[1::2]
     for number, keys in enumerate(halves):
@@ -133,7 +134,8 @@ def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
 
 @pytest.mark.slow
 def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
-    sd, folder = random_weights(SMALL), tmp_path / "shards"
+    sd = random_weights(SMALL)
+    folder = tmp_path / "shards"
     distributed.save({f"net.{key}": value for key, value in sd.items()}, checkpoint_id=folder)
     with pytest.raises(InputError):
         load_weights(folder)
@@ -163,7 +165,8 @@ def test_state_dict_of_the_network_has_the_original_keys():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_tensors_are_widened(dtype):
-    sd, c = random_weights(SMALL), clip(3)
+    sd = random_weights(SMALL)
+    c = clip(3)
     mixed = sd | {"blocks.0.mlp.layer1.weight": sd["blocks.0.mlp.layer1.weight"].to(dtype)}
     for weights in (mixed, {key: value.to(dtype) for key, value in sd.items()}):
         net = load(weights)
@@ -256,7 +259,8 @@ class Trap:
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("plain", [False, True])
 def test_pickle_with_code_is_refused_and_not_run(tmp_path, plain):
-    path, sprung = tmp_path / "net.safetensors", tmp_path / "sprung"
+    path = tmp_path / "net.safetensors"
+    sprung = tmp_path / "sprung"
     content = {"a": torch.zeros(1), "trap": Trap(sprung)}
     if plain:
         path.write_bytes(pickle.dumps({"trap": Trap(sprung)}))

@@ -71,7 +71,8 @@ def test_past_beyond_the_window_is_forgotten_and_the_sink_is_not():
         DiTSizes(**{**SMALL.__dict__, "blocks": 1})
     )  # several layers would pass it on from block to block
     x, t, text, hdmap = clip(8)
-    far, sunk = x.clone(), x.clone()
+    far = x.clone()
+    sunk = x.clone()
     far[:, :, 2:4] += 5
     sunk[:, :, 0:2] += 5
     with torch.no_grad():

@@ -67,7 +67,8 @@ def test_first_latent_given(net, io):
 
 
 def test_bidirectional_teacher(net, io):
-    t, mask = io["in.clip.t"], first_given(6)
+    t = io["in.clip.t"]
+    mask = first_given(6)
     assert (
         furthest(
             net(**inputs(io), condition_mask=mask, block_latents=None),
@@ -80,7 +81,8 @@ def test_bidirectional_teacher(net, io):
 
 
 def test_blocks_through_a_cache_that_covers_the_clip(net, io):
-    clip, mask = inputs(io, t=io["in.cached_full.t"]), first_given(6)
+    clip = inputs(io, t=io["in.cached_full.t"])
+    mask = first_given(6)
     assert (
         furthest(net(**clip, condition_mask=mask), io["out.cached_full.wholeclip.out"]) < TOLERANCE
     )

@@ -46,7 +46,8 @@ def spoil(bundle, **changes):
     """Write the bundle again with tensors replaced, or left out; a double underscore stands for a
     dot.
     """
-    header, tensors = read_metadata(bundle), load_file(bundle)
+    header = read_metadata(bundle)
+    tensors = load_file(bundle)
     for name, value in changes.items():
         key = name.replace("__", ".")
         tensors.pop(key, None)
@@ -98,7 +99,8 @@ def test_a_bundle_without_an_autoencoder_is_refused(bundle):
 
 
 def test_a_pickle_a_foreign_file_and_no_file_are_refused(bundle, tmp_path):
-    pickled, foreign = tmp_path / "net.safetensors", tmp_path / "plain.safetensors"
+    pickled = tmp_path / "net.safetensors"
+    foreign = tmp_path / "plain.safetensors"
     torch.save(load_file(bundle), pickled)
     save_file(load_file(bundle), foreign)
     assert "not safetensors" in refusal(at(pickled))

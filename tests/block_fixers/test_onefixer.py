@@ -69,7 +69,8 @@ def test_two_rollouts_interleaved_never_mix(busy, alone):
     frames = moving_picture(29, key="other")
     maps = maps_of(frames)
     other = pixels(run_blocks(fixer(busy, seed=1), frames, maps))
-    first, second = fixer(busy), fixer(busy, seed=1)
+    first = fixer(busy)
+    second = fixer(busy, seed=1)
     a = []
     b = []
     for start, end in ((0, 5), (5, 13), (13, 21), (21, 29)):

@@ -13,7 +13,8 @@ CAMERA = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
 
 
 def facing_z(x=0.0, actors=None, start_x=None):
-    end, start = np.eye(4), np.eye(4)
+    end = np.eye(4)
+    start = np.eye(4)
     end[0, 3], start[0, 3] = x, x if start_x is None else start_x
     return RenderRequest(0, CAMERA, np.stack([start, end]), actors or {})
 

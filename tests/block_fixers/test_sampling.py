@@ -61,7 +61,8 @@ def test_opacity_values_are_means_of_four_by_four_pixels_of_every_frame(first):
 
 
 def test_opaque_render_is_kept_and_empty_one_is_noise_bit_for_bit():
-    z, eps = noise(1, 4, 2, 2, 3), noise(1, 4, 2, 2, 3, seed=1)
+    z = noise(1, 4, 2, 2, 3)
+    eps = noise(1, 4, 2, 2, 3, seed=1)
     ones = opacity_mask(torch.ones(1, 1, 5, 16, 24))
     assert torch.equal(mixed_source(z, ones, eps), z)
     assert torch.equal(mixed_source(z, 0 * ones, eps), eps)
@@ -76,7 +77,8 @@ def test_opacity_of_a_wrong_shape_is_refused(shape):
 
 
 def test_one_step_inverts_the_interpolant_at_every_time():
-    z_0, z_1 = noise(1, 4, 2, 2, 2), noise(1, 4, 2, 2, 2, seed=1)
+    z_0 = noise(1, 4, 2, 2, 2)
+    z_1 = noise(1, 4, 2, 2, 2, seed=1)
     for t in (0.0, 0.13, 0.8, 1.0):
         assert furthest(flow_step(interpolant(z_0, z_1, t), z_1 - z_0, t), z_0) < 1e-6
     assert torch.equal(interpolant(z_0, z_1, 1.0), z_1)
@@ -111,7 +113,8 @@ def test_senseless_schedules_are_refused(call):
 
 def test_steps_leave_the_block_open_and_the_cache_keeps_the_last_forward():
     net, (_, _, text, hdmap) = network(), clip(2)
-    cache, calls = net.new_cache(1, 4, 6), []
+    cache = net.new_cache(1, 4, 6)
+    calls = []
 
     class Counter:
         def step(self, x, t, text, hdmap, cache, write=True):
@@ -131,7 +134,8 @@ def test_steps_leave_the_block_open_and_the_cache_keeps_the_last_forward():
 @pytest.mark.parametrize("finalises", [True, False])
 def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(finalises):
     net, (z_1, _, text, hdmap) = network(), clip(2)
-    kept, guessed = net.new_cache(1, 4, 6, window=4), net.new_cache(1, 4, 6, window=4)
+    kept = net.new_cache(1, 4, 6, window=4)
+    guessed = net.new_cache(1, 4, 6, window=4)
 
     def keep(cache, z_0):
         if finalises:

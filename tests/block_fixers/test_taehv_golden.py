@@ -39,10 +39,8 @@ def test_frames_that_are_dropped_are_the_original_ones_too(numbers, name):
 
 
 def test_lighttae_convention_takes_the_denormalised_latent(numbers):
-    z, expected = (
-        numbers[1]["in.latent_n1_t3_4x6"].transpose(1, 2),
-        numbers[1]["out.latent_n1_t3_4x6.lighttae_decode_BCTHW_minus1_1"],
-    )
+    z = numbers[1]["in.latent_n1_t3_4x6"].transpose(1, 2)
+    expected = numbers[1]["out.latent_n1_t3_4x6.lighttae_decode_BCTHW_minus1_1"]
     assert_close(
         TinyDecoder.from_state_dict(numbers[0], scaled=True)(z), expected, atol=TOLERANCE, rtol=0
     )

@@ -54,7 +54,8 @@ def test_components_are_orthonormal():
 
 
 def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest():
-    transform, z = CosineTransform(), noise(2, 3, 2, 3, 16)
+    transform = CosineTransform()
+    z = noise(2, 3, 2, 3, 16)
     assert_close(transform.analyse(transform.synthesise(z)), z, atol=1e-5, rtol=0)
     grid = to_grid(clip(8, 16, 24))
     assert_close(
@@ -76,13 +77,15 @@ def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest():
 
 
 def test_untrained_decoding_with_its_own_render_returns_the_render():
-    untrained, video = TinyVAE.random(SIZES), clip(9, 16, 24)
+    untrained = TinyVAE.random(SIZES)
+    video = clip(9, 16, 24)
     assert_close(untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0)
 
 
 def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred():
     untrained = TinyVAE.random()
-    rows, columns = torch.linspace(-0.5, 0.5, 32).view(-1, 1), torch.linspace(-0.4, 0.4, 48)
+    rows = torch.linspace(-0.5, 0.5, 32).view(-1, 1)
+    columns = torch.linspace(-0.4, 0.4, 48)
     smooth = (rows + columns).expand(1, 3, 5, 32, 48).clone()
     assert (untrained.decode(untrained.encode(smooth)) - smooth).abs().max() < 0.02
     rough = clip(5, 32, 48)
@@ -90,8 +93,10 @@ def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred(
 
 
 def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail():
-    untrained, video = TinyVAE.random(SIZES), clip(5, 16, 16)
-    z, cover = untrained.encode(video), torch.ones(1, 1, 5, 16, 16)
+    untrained = TinyVAE.random(SIZES)
+    video = clip(5, 16, 16)
+    z = untrained.encode(video)
+    cover = torch.ones(1, 1, 5, 16, 16)
     assert_close(
         untrained.decode(z, render=video, opacity=cover),
         untrained.decode(z, render=video),
@@ -104,7 +109,8 @@ def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail():
 
 
 def test_a_hole_in_the_render_is_filled_by_the_latent_alone():
-    untrained, truth = TinyVAE.random(SIZES), clip(5, 16, 32)
+    untrained = TinyVAE.random(SIZES)
+    truth = clip(5, 16, 32)
     cover = torch.ones(1, 1, 5, 16, 32)
     cover[..., 16:] = 0
     z = untrained.encode(truth)
@@ -118,7 +124,8 @@ def test_a_hole_in_the_render_is_filled_by_the_latent_alone():
 
 @pytest.mark.parametrize("counts", [[1, 4, 4, 4], [5, 8], [13], [9, 4]])
 def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
-    video, stream = clip(13, 16, 24, batch=2), encoder_stream(vae)
+    video = clip(13, 16, 24, batch=2)
+    stream = encoder_stream(vae)
     assert torch.equal(
         torch.cat([stream.push(part) for part in video.split(counts, dim=2)], dim=2),
         vae.encode(video),
@@ -227,7 +234,8 @@ def test_random_weights_depend_on_the_seed_alone():
 def test_saving_and_loading_gives_bit_equal_results(vae, tmp_path):
     path = tmp_path / "tiny.safetensors"
     vae.save(path, {"trained": "no"})
-    loaded, video = TinyVAE.from_state_dict(load_weights(path)), clip(5, 16, 16)
+    loaded = TinyVAE.from_state_dict(load_weights(path))
+    video = clip(5, 16, 16)
     assert loaded.sizes == SIZES
     assert torch.equal(
         loaded.decode(loaded.encode(video), render=video),
@@ -277,7 +285,8 @@ def test_components_follow_their_names():
 
 def test_full_opacity_is_as_none_for_a_trained_network(vae):
     video = clip(5, 16, 16)
-    z, cover = vae.encode(video), torch.ones(1, 1, 5, 16, 16)
+    z = vae.encode(video)
+    cover = torch.ones(1, 1, 5, 16, 16)
     assert_close(
         vae.decode(z, render=video, opacity=cover), vae.decode(z, render=video), atol=1e-5, rtol=0
     )

@@ -59,9 +59,11 @@ def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae, counts):
 
 
 def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass():
-    whole, steps = WanVAE.random(SMALL), WanVAE.random(SMALL)
+    whole = WanVAE.random(SMALL)
+    steps = WanVAE.random(SMALL)
     whole.latents_per_pass = None
-    video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
+    video = clip(13, 24, 16)
+    z = noise(1, 16, 4, 3, 2)
     assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
     assert_close(whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0)
 
@@ -80,7 +82,8 @@ def test_a_state_holds_no_more_than_its_own_frames(vae):
 
 
 def test_one_and_five_frames_give_one_and_two_latents(vae):
-    one, five = vae.encode(clip(1, 16, 24)), vae.encode(clip(5, 16, 24))
+    one = vae.encode(clip(1, 16, 24))
+    five = vae.encode(clip(5, 16, 24))
     assert one.shape == (1, 16, 1, 2, 3)
     assert five.shape == (1, 16, 2, 2, 3)
     assert vae.decode(one).shape == (1, 3, 1, 16, 24)
@@ -162,7 +165,8 @@ def test_one_bad_pixel_does_not_reach_earlier_frames(vae):
 )
 def test_summed_2d_convolutions_equal_the_3d_one(past, frames, inputs, outputs, side):
     joined = noise(2, past + frames, 4, 5, inputs, seed=past)
-    weight, bias = noise(outputs, inputs, 3, side, side), noise(outputs)
+    weight = noise(outputs, inputs, 3, side, side)
+    bias = noise(outputs)
     past_and_padding = F.pad(joined, (0, 0, 0, 0, 0, 0, 2 - past, 0)).permute(0, 4, 1, 2, 3)
     pad = side // 2
     expected = F.conv3d(past_and_padding, weight, bias, padding=(0, pad, pad)).permute(
@@ -227,7 +231,8 @@ def test_half_and_double_precision_tensors_load_into_single(vae, stored):
 
 
 def test_running_in_half_precision_stays_close(vae):
-    half, dtype = at_precision(copy.deepcopy(vae), "bf16"), torch.bfloat16
+    half = at_precision(copy.deepcopy(vae), "bf16")
+    dtype = torch.bfloat16
     video = clip(9, 16, 16)
     z = half.encode(video)
     assert z.dtype == dtype

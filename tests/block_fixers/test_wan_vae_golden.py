@@ -67,7 +67,8 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(vae, numbers):
             if slot is not None
         ]
         assert [tuple(channels_first(kept).shape) for kept in streaming.state] == slots
-        state, start = streaming.state, start + count
+        state = streaming.state
+        start = start + count
 
 
 def test_statistics_are_the_published_ones(numbers):

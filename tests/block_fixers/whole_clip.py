@@ -83,7 +83,8 @@ class Clip:
         while start + rule(index) <= len(frames):
             end = start + rule(index)
             yield frames[start:end], list(self.maps[start:end])
-            start, index = end, index + 1
+            start = end
+            index = index + 1
 
 
 def refine_latents(
@@ -107,7 +108,8 @@ def refine_latents(
     Returns:
         ``(B, 16, T, h, w)`` clean latents.
     """
-    schedule, n = from_names(settings.steps), settings.block_latents
+    schedule = from_names(settings.steps)
+    n = settings.block_latents
     clean = z_render[:, :, :0]
     past = z_render[:, :, :0]
     past_t = torch.zeros(1, 0)
@@ -135,7 +137,8 @@ def refine_latents(
         if settings.history == "finalise":
             level = context_level()
             x = interpolant(z_0, noise[-1][:, :, own], level.sigma)
-        clean, past = torch.cat([clean, z_0], dim=2), torch.cat([past, x], dim=2)
+        clean = torch.cat([clean, z_0], dim=2)
+        past = torch.cat([past, x], dim=2)
         past_t = torch.cat([past_t, torch.full((1, x.shape[2]), level.t)], dim=1)
     return clean
 
@@ -182,7 +185,8 @@ def whole_clip(settings, clip, scene_id, seed):
         update={"precision": "fp32", "codec_precision": "fp32", "fold": False}
     )
     networks = load_networks(exact)
-    rule, frames = BlockRule.of_latents(settings.block_latents), clip.frames()
+    rule = BlockRule.of_latents(settings.block_latents)
+    frames = clip.frames()
     due = rule.first + -(-max(0, len(frames) - rule.first) // rule.then) * rule.then
     (views,) = group_views(frames, list(clip.maps) if settings.uses_map else (), due)
     video = to_clip(views, due)

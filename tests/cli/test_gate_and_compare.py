@@ -334,10 +334,8 @@ def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_p
 
 
 def test_another_policy_of_a_stored_baseline_is_named_or_the_only_one(tmp_path, capsys):
-    stored, run = (
-        arms_run(tmp_path / "stored", ("clean",), ("a",)),
-        arms_run(tmp_path / "run", ("clean",), ("b",)),
-    )
+    stored = arms_run(tmp_path / "stored", ("clean",), ("a",))
+    run = arms_run(tmp_path / "run", ("clean",), ("b",))
     gate = tmp_path / "gate.yaml"
     gate.write_text("version: 1\nmetrics:\n  progress: {margin: 0.9}\n")
     run_command(["gate", str(run), "--gate", str(gate), "--baseline-file", str(stored), "--json"])

@@ -28,7 +28,8 @@ def called(monkeypatch):
     """Give a function that puts something in a job's place and returns what it was called with."""
 
     def watch(module: Any, name: str, *words: str) -> dict[str, Any]:
-        job, found = getattr(module, name), {}
+        job = getattr(module, name)
+        found = {}
 
         def instead(*args: Any, **kwargs: Any) -> None:
             found.update(inspect.signature(job).bind(*args, **kwargs).arguments)

@@ -17,7 +17,8 @@ actors:
   - {kind: parked, id: van, s_m: 40, side: right, clearance_m: 0.5}
 timing: {duration_us: 3000000}
 """
-EGO, LEAD = (0x0B, 0x6B, 0xB3), (0xC2, 0x54, 0x0A)
+EGO = (0x0B, 0x6B, 0xB3)
+LEAD = (0xC2, 0x54, 0x0A)
 
 
 def near(picture, rgb):

@@ -22,7 +22,8 @@ def source(tmp_path):
 
 
 def test_a_video_is_refined_and_the_summary_says_what_was_done(source, capsys):
-    out, side = source.with_name("out.mp4"), source.with_name("side.mp4")
+    out = source.with_name("out.mp4")
+    side = source.with_name("side.mp4")
     assert (
         run_command(
             ["refine", str(source), "-o", str(out), "--fixer", "identity", "--compare", str(side)]
@@ -93,8 +94,10 @@ def pictures(folder, count=3, height=36, channels=3):
 
 
 def test_folders_of_pictures_pass_without_a_codec(tmp_path, capsys):
-    source, alpha = pictures(tmp_path / "in"), pictures(tmp_path / "alpha", channels=1)
-    out, side = tmp_path / "out", tmp_path / "side"
+    source = pictures(tmp_path / "in")
+    alpha = pictures(tmp_path / "alpha", channels=1)
+    out = tmp_path / "out"
+    side = tmp_path / "side"
     command = [
         "refine",
         str(source),
@@ -166,7 +169,8 @@ class Inverts:
 
 def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_path, capsys):
     (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
-    source, out = pictures(tmp_path / "in", count=5), tmp_path / "out"
+    source = pictures(tmp_path / "in", count=5)
+    out = tmp_path / "out"
     command = [
         "refine",
         str(source),

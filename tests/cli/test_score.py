@@ -70,7 +70,8 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
         0,
         "strict",
     )
-    before, after = rows(our_run), rows(out)
+    before = rows(our_run)
+    after = rows(out)
     names = [row["rollout"] for row in after]
     assert names == sorted(names)  # session ids, which sort as the seeds
     assert names == [

@@ -14,7 +14,8 @@ from alpasim_plugin.cli.output import Progress, show
 
 REPO = Path(__file__).resolve().parents[2]
 OWN = [verb for panel in PANELS.values() for verb in panel]
-MOST_VERBS, MOST_OPTIONS = 17, 140
+MOST_VERBS = 17
+MOST_OPTIONS = 140
 
 
 def verbs_below(command, path=()):

@@ -39,7 +39,8 @@ def test_an_unfinished_run_is_shown_as_far_as_it_has_got(run, capsys):
 
 
 def test_a_rollout_is_shown_beside_the_others_of_its_cell(run, tmp_path, capsys):
-    folder, out = run / "rollouts/3dgs/lane-camera/smoke-straight/0", tmp_path / "one.html"
+    folder = run / "rollouts/3dgs/lane-camera/smoke-straight/0"
+    out = tmp_path / "one.html"
     assert run_command(["view", str(folder), "--out", str(out)]) == 0
     assert "1 of 1 rollouts" in capsys.readouterr().out
     text = out.read_text()

@@ -11,7 +11,8 @@ import threading
 from alpasim_plugin.control.can_bus import Address, open_bus
 from alpasim_plugin.control.can_codec import load_map, open_codec
 
-LOOKAHEAD_S, LEAST_LOOKAHEAD_M = 0.7, 5.0
+LOOKAHEAD_S = 0.7
+LEAST_LOOKAHEAD_M = 5.0
 WHEELBASE_M = 2.85
 SPEED_GAIN = 0.5  # 1/s
 

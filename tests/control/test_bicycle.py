@@ -74,7 +74,8 @@ def test_turning_wheel_follows_the_integral_of_the_heading():
     """With a steer that grows linearly, yaw is the integral of v tan(steer) / L = -v ln(cos(steer))
     / (L rate).
     """
-    speed, target = 4.0, 0.5
+    speed = 4.0
+    target = 0.5
     seconds = target / VEHICLE.max_steer_rate_radps
     end = step(BicycleState(0.0, 0.0, 0.0, speed, 0.0), Command(10.0), seconds, VEHICLE)
     assert end.steer_rad == pytest.approx(target, abs=1e-12)
@@ -109,7 +110,8 @@ def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_w
 
 
 def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can():
-    state, last = BicycleState(0.0, 0.0, 0.0, 8.0, -0.2), -0.2
+    state = BicycleState(0.0, 0.0, 0.0, 8.0, -0.2)
+    last = -0.2
     for _ in range(150):
         state = step(state, Command(5.0), 0.01, VEHICLE)
         assert state.steer_rad - last <= VEHICLE.max_steer_rate_radps * 0.01 + 1e-12

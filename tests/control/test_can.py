@@ -137,14 +137,16 @@ def test_without_any_command_the_vehicle_brakes(codec, wires):
 
 def test_every_fault_is_counted_by_cause(codec, wires):
     bus, unit = wires
-    one, other = exchange(codec, bus), open_codec(*load_map("example"))
+    one = exchange(codec, bus)
+    other = open_codec(*load_map("example"))
     frames = [commands(other, 1.0, 0.5) for _ in range(6)]
     for frame in frames[0]:
         unit.send(frame)
         unit.send(frame)  # the same counter again
     for frame in frames[3]:  # two of each lost
         unit.send(frame)
-    steer_id, data = frames[4][0].arbitration_id, bytes(frames[4][0].data)
+    steer_id = frames[4][0].arbitration_id
+    data = bytes(frames[4][0].data)
     send(unit, steer_id, data[:5])  # cut short
     unit.send(other.pack("ACCEL_CMD", {"ACCEL": 1.0, "ENABLE": 0}, "COUNTER"))
     raw = other.message("ACCEL_CMD").encode(
@@ -184,7 +186,8 @@ def curve():
 
 def drive(scenario, name):
     """Drive over a bus of two threads; return the driven path and the policy's facts."""
-    stop, address = threading.Event(), Address.parse(name)
+    stop = threading.Event()
+    address = Address.parse(name)
     with open_bus(address) as bus:
         unit = threading.Thread(
             target=serve, args=(bus, LaneKeeper(open_codec(*load_map("example"))), stop)

@@ -105,9 +105,11 @@ def test_drive_does_not_depend_on_where_in_the_world_it_happens():
         0, 10, 0.0937
     )  # the preview's nodes, 0.8 m apart, do not lie on the path's knots: there its direction has two values
     a = 8 * t / 25
-    x, y = 25 * np.sin(a), 25 * (1 - np.cos(a))
+    x = 25 * np.sin(a)
+    y = 25 * (1 - np.cos(a))
     here = drive(plan_of(t, x, y, a), at(speed=8.0), 6.0)
-    c, s = np.cos(2.5), np.sin(2.5)
+    c = np.cos(2.5)
+    s = np.sin(2.5)
     far = plan_of(t, c * x - s * y + 4e5, s * x + c * y - 5e6, a + 2.5)
     there = drive(far, EgoState(0, se2(4e5, -5e6, 2.5), 8.0), 6.0)
     back = (xy(there) - [4e5, -5e6]) @ np.array([[c, -s], [s, c]])
@@ -196,7 +198,8 @@ def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data):
 
 def test_advancing_twice_from_the_same_state_gives_the_same_and_leaves_the_input_alone():
     t = np.arange(0, 5, 0.1)
-    plan, state = plan_of(t, 9 * t, 0.1 * t, 0.01), at(y=0.2, speed=9.0)
+    plan = plan_of(t, 9 * t, 0.1 * t, 0.01)
+    state = at(y=0.2, speed=9.0)
     before = state.T_world_rig.copy()
     first = TRACKER.advance(state, plan, 100_000)
     TRACKER.advance(at(speed=3.0), plan_of(t, 3 * t, 0, 0), 100_000)
@@ -245,7 +248,8 @@ def test_standing_start_reaches_the_planned_acceleration_and_place():
 
 
 def test_on_a_slippery_road_braking_is_longer_and_curves_are_wider():
-    speed, limit = 15.0, 0.2 * 9.81
+    speed = 15.0
+    limit = 0.2 * 9.81
     tracker = make_controller("bicycle", replace(VEHICLE, friction=0.2))
     t = np.arange(0, 40, 0.1)
     stopped = drive(plan_of(t, 0, 0, 0), at(speed=speed), 12, tracker=tracker)

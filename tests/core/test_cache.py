@@ -93,7 +93,8 @@ def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache):
         print(cached("texts", "k", make, lambda folder: (folder / "text").read_text(), "a text"))
         """
     )
-    command, pipe = [sys.executable, "-c", script], subprocess.PIPE
+    command = [sys.executable, "-c", script]
+    pipe = subprocess.PIPE
     asking = [
         subprocess.Popen([*command, name], stdout=pipe, stderr=pipe, text=True) for name in "ab"
     ]

@@ -11,7 +11,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, joined, pixels_of, rays_of, resized, sides_of
 from alpasim_plugin.core.types import CameraSpec, Frame, LensModel
 
-W, H = 320, 240
+W = 320
+H = 240
 K = np.array([[100.0, 0.0, 158.0], [0.0, 102.0, 121.0], [0.0, 0.0, 1.0]])
 OPENCV = LensModel("opencv", (-0.25, 0.08, 0.002, -0.003, 0.01, 0.02, 0.0, 0.0, 0.001, 0.0, -0.001))
 FISHEYE = LensModel("fisheye", (0.02, -0.01, 0.001), max_angle_rad=np.deg2rad(100))
@@ -32,14 +33,16 @@ def colours(ray):
 
 def by_equations(spec, ray):
     """Where a lens shows rays ``(N, 3)``, by OpenCV and by the equation of f-theta lenses."""
-    lens, none = spec.lens, np.zeros(3)
+    lens = spec.lens
+    none = np.zeros(3)
     from_corner = spec.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     given = np.array(lens.coefficients)
     if lens.kind == "opencv":
         return (
             cv2.projectPoints(ray, none, none, from_corner, np.array([*given, 0.0]))[0][:, 0] + 0.5
         )
-    angle, across = np.arctan2(np.linalg.norm(ray[:, :2], axis=1), ray[:, 2]), ray[:, :2]
+    angle = np.arctan2(np.linalg.norm(ray[:, :2], axis=1), ray[:, 2])
+    across = ray[:, :2]
     if lens.kind == "fisheye":
         k = np.array([*given, 0.0])
         radius = angle * (1 + (angle[:, None] ** [2, 4, 6, 8]) @ k)
@@ -84,7 +87,8 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
         if not frames:  # holds nowhere: its neighbours' references count
             held[:] = 7, 7, 7, 0
         frames.append(Frame(0, "x", rgb, np.zeros((h, w), np.float32), references=(held,)))
-    out, rays = joined("lens", sides, frames), rays_of(spec)
+    out = joined("lens", sides, frames)
+    rays = rays_of(spec)
     off = np.abs(out.rgb.reshape(-1, 3) - colours(rays.ray)).max(axis=1)
     assert (off[rays.seen] <= 2).mean() > 0.995
     assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()

@@ -112,7 +112,8 @@ except SimrunError as error:
 
 @pytest.mark.slow
 def test_compiled_kernels_that_are_damaged_are_no_fault_of_a_part(tmp_path):
-    script, kept = tmp_path / "uses.py", tmp_path / "kept"
+    script = tmp_path / "uses.py"
+    kept = tmp_path / "kept"
     script.write_text(USES_A_KERNEL.format(repo=str(REPO)))
     kept.mkdir()
 

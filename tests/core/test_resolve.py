@@ -139,10 +139,8 @@ def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
 
 
 def test_settings_in_brackets_make_another_arm_of_one_fixer():
-    plain, without = (
-        resolve_renderer("identity"),
-        resolve_renderer("identity[references=0,tolerance_m=0.5]+clean"),
-    )
+    plain = resolve_renderer("identity")
+    without = resolve_renderer("identity[references=0,tolerance_m=0.5]+clean")
     assert (without.name, str(without)) == (
         "identity[references=0,tolerance_m=0.5]+clean",
         "identity[references=0,tolerance_m=0.5]+clean",

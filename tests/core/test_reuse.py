@@ -59,7 +59,8 @@ def made(folder, renderer, *more):
 
 
 def test_a_remote_part_is_never_reused_unasked(folder, capsys):
-    first, second = made(folder, "Remote"), made(folder, "Remote")
+    first = made(folder, "Remote")
+    second = made(folder, "Remote")
     assert second != first
     assert made(folder, "Remote", "--resume") == second
     run_command(

@@ -20,7 +20,8 @@ from alpasim_plugin.core.shutter import (
 )
 from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
 
-WIDTH, HEIGHT = 64, 32
+WIDTH = 64
+HEIGHT = 32
 FORWARD = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
 )  # a camera that looks along x of its rig
@@ -56,7 +57,8 @@ FAST = asked(se2(0, 0, 0), se2(0.6, 0, 0.05))
 @pytest.mark.parametrize("count", [1, 5, HEIGHT, 3 * WIDTH])
 def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(along, back, count):
     request = asked(se2(0, 0, 0), se2(0.6, 0, 0.05), along=along, back=back)
-    times, seen = np.full((HEIGHT, WIDTH), np.nan), np.zeros((HEIGHT, WIDTH), int)
+    times = np.full((HEIGHT, WIDTH), np.nan)
+    seen = np.zeros((HEIGHT, WIDTH), int)
     for band in bands_of(request, count):
         assert band.exposed is None
         seen[band.rows, band.columns] += 1
@@ -72,7 +74,8 @@ def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask(
     request = replace(FAST, exposure=Exposure(share, {}))
     whole = np.full((HEIGHT, WIDTH), -1.0)
     for i, band in enumerate(bands_of(request, 4)):
-        height, width = band.rows.stop - band.rows.start, band.columns.stop - band.columns.start
+        height = band.rows.stop - band.rows.start
+        width = band.columns.stop - band.columns.start
         band.put(whole, np.full((height, width), float(i)))
     expected = np.where(np.isnan(share), -1, np.minimum(share * 4, 3).astype(float) // 1)
     assert_array_equal(whole, expected)
@@ -101,7 +104,8 @@ def test_motion_is_what_a_near_point_moves_by():
 
 
 def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn():
-    start, end = se2(2, 0, 0.2), se2(4, 8, 0.2 + 0.9 * np.pi)
+    start = se2(2, 0, 0.2)
+    end = se2(4, 8, 0.2 + 0.9 * np.pi)
     middle = between(np.stack([start]), np.stack([end]), 0.25)[0]
     assert_allclose(middle, se2(2.5, 2, 0.2 + 0.225 * np.pi), atol=1e-12)
     assert_array_equal(between(np.stack([start]), np.stack([end]), 1.0)[0], end)

@@ -22,7 +22,8 @@ class Bait:
     """What leaves its name in a file when it is run, in the languages that the ways need."""
 
     def __init__(self, folder, name):
-        self.mark, self.name = folder.parent / "ran", name
+        self.mark = folder.parent / "ran"
+        self.name = name
 
     @property
     def python(self):

@@ -103,7 +103,8 @@ def test_studies_that_are_done_are_in_the_commit_that_their_page_names(repo, pag
 
 def reachable(docs):
     """Return the pages that the index leads to."""
-    seen, queue = {docs / "index.md"}, [docs / "index.md"]
+    seen = {docs / "index.md"}
+    queue = [docs / "index.md"]
     while queue:
         for file, _ in local_links(queue.pop()):
             if (

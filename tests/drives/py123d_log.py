@@ -55,7 +55,8 @@ def write_py123d(
         first_frame: Of the film, by the log's numbers.
     """
     (folder / "samples").mkdir(parents=True)
-    street, times = Street(), [START_US + 100_000 * i for i in range(COUNT)]
+    street = Street()
+    times = [START_US + 100_000 * i for i in range(COUNT)]
     cameras = [street.pose(x) for x in stations()]
     images = [street.photograph(T) for T in cameras]
     endings = {"png_binary": ".png", "path": ".png"}

@@ -48,7 +48,8 @@ class Street:
         """Return ``T_world_camera`` at a station; the world is x along, y left, z up."""
         T = np.eye(4)
         slope = float(self.ground(np.array(x + 0.5)) - self.ground(np.array(x - 0.5)))
-        c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
+        c = np.cos(np.arctan(slope))
+        s = np.sin(np.arctan(slope))
         T[:3, :3] = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ RIG_FROM_CAMERA
         T[:3, 3] = x, -lateral_m, float(self.ground(np.array(x))) + CAMERA_M
         return T
@@ -86,7 +87,8 @@ class Street:
             t = np.where(
                 ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far
             )
-        best, kind = np.where(t > 0, t, far), np.zeros(len(ray), int)
+        best = np.where(t > 0, t, far)
+        kind = np.zeros(len(ray), int)
         for side in (1.0, -1.0):
             t = np.where(
                 ray[:, 1] * side > 1e-6,
@@ -95,14 +97,19 @@ class Street:
             )
             z = at[2] + t * ray[:, 2]
             hit = (t > 0) & (t < best) & (z < 6.0)
-            best, kind = np.where(hit, t, best), np.where(hit, 1, kind)
+            best = np.where(hit, t, best)
+            kind = np.where(hit, 1, kind)
         lift = np.array([0, 0, float(self.ground(np.array(16.0)))])
-        low, high = BOX_LOW + lift, BOX_HIGH + lift
+        low = BOX_LOW + lift
+        high = BOX_HIGH + lift
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (low - at) / ray, (high - at) / ray
-        t0, t1 = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            a = (low - at) / ray
+            b = (high - at) / ray
+        t0 = np.minimum(a, b).max(axis=1)
+        t1 = np.maximum(a, b).min(axis=1)
         hit = (t0 < t1) & (t0 > 0) & (t0 < best)
-        best, kind = np.where(hit, t0, best), np.where(hit, 2, kind)
+        best = np.where(hit, t0, best)
+        kind = np.where(hit, 2, kind)
         place = at + np.minimum(best, 1e3)[:, None] * ray
         grey = 0.55 * noise(place, 0.25) + 0.45 * noise(place + 7.0, 0.06)
         grey = np.where(best > 60, 0.8, grey)
@@ -202,7 +209,8 @@ def write_colmap(folder, binary, model="SIMPLE_PINHOLE", bend=()):
     """Write the street as a COLMAP model in ``sparse/0`` with pictures in ``images``; the unit is
     arbitrary.
     """
-    street, sparse = Street(), folder / "sparse/0"
+    street = Street()
+    sparse = folder / "sparse/0"
     sparse.mkdir(parents=True)
     (folder / "images").mkdir()
     number = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}[model]

@@ -43,7 +43,8 @@ def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
 
 def test_the_wheels_stand_on_the_road_that_bows(imported):
     scenario = load_scenario(imported / "scenario.yaml")
-    street, x = Street(), np.arange(4.0, 16.0)
+    street = Street()
+    x = np.arange(4.0, 16.0)
     found = height_at(scenario.ground, np.column_stack([x, np.zeros(len(x))]))
     true = street.ground(x)
     slope = np.polyfit(
@@ -67,7 +68,8 @@ def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imp
 
 @pytest.mark.slow
 def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path, monkeypatch, quick_fit):
-    source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
+    source = write_kitti(tmp_path / "street", stereo=False)
+    real = build.measure
 
     def stop(*given):
         raise KeyboardInterrupt

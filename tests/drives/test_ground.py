@@ -52,10 +52,8 @@ def test_what_stands_on_it_does_not_lift_it():
 
 def test_few_points_under_the_path_are_helped_by_those_beside_it():
     rng = stream("ground", 0, "few")
-    under, beside = (
-        rng.uniform([0, -1.4], [60, 1.4], (20, 2)),
-        rng.uniform([0, 1.7], [60, 1.95], (60, 2)),
-    )
+    under = rng.uniform([0, -1.4], [60, 1.4], (20, 2))
+    beside = rng.uniform([0, 1.7], [60, 1.95], (60, 2))
     strip = fit_ground(points_on(np.concatenate([under, beside])), path())
     assert strip.height == pytest.approx(HEIGHT_M, abs=0.1)
 

@@ -26,7 +26,8 @@ def surface(low, high, count):
 
 def cloud_at(points, size_m=0.06, opacity=0.9):
     n = len(points)
-    quats, scales = np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), size_m)
+    quats = np.tile([1.0, 0, 0, 0], (n, 1))
+    scales = np.full((n, 3), size_m)
     return GaussianCloud(points, quats, scales, np.full(n, opacity), np.zeros((n, 1, 3)))
 
 

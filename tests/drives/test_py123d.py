@@ -45,7 +45,8 @@ def test_images_are_read_however_they_are_kept(tmp_path, log, codec):
     drive = read_source(write_py123d(tmp_path / codec, codec, implicit_poses=True))
     truth = read_source(log)
     assert len(drive.photographs) == COUNT
-    one, other = drive.photographs[5], truth.photographs[5]
+    one = drive.photographs[5]
+    other = truth.photographs[5]
     assert np.abs(one.rgb().astype(float) - other.rgb()).mean() < 12
     assert one.T_world_camera == pytest.approx(other.T_world_camera)
     assert one.T_world_camera[:2, 3] == pytest.approx(ORIGIN[:2] + np.array([3.0, 0.0]), abs=0.1)

@@ -65,7 +65,8 @@ def test_a_colmap_model(tmp_path, binary):
 def test_photographs_are_freed_of_every_lens(tmp_path, model, bend):
     drive = read_source(write_colmap(tmp_path / "a", True, model, bend))
     plain = read_source(write_colmap(tmp_path / "b", True))
-    bent, straight = drive.photographs[5], plain.photographs[5]
+    bent = drive.photographs[5]
+    straight = plain.photographs[5]
     K = bent.lens.straight_K()
     H = straight.lens.K @ np.linalg.inv(K)
     back = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])

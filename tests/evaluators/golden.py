@@ -145,7 +145,8 @@ class Tally:
         self.logs, self.values, self.equal, self.largest = 0, 0, 0, 0.0
 
     def add(self, got, want):
-        got, want = np.asarray(got, float), np.asarray(want, float)
+        got = np.asarray(got, float)
+        want = np.asarray(want, float)
         same = (got == want) | (np.isnan(got) & np.isnan(want))
         off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
         self.logs, self.values, self.equal = (

@@ -51,11 +51,10 @@ def route_by_step(rollout):
     recorded = recorded_path(rollout, PRESETS["paper"])
     path = recorded.xyz[:, :2]
     there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
-    line, out = path[moving(path)], []
-    s, before = (
-        float(np.interp(rollout.ego.t_us[0], recorded.t_us[moving(path)], arc_lengths(line))),
-        there[0],
-    )
+    line = path[moving(path)]
+    out = []
+    s = float(np.interp(rollout.ego.t_us[0], recorded.t_us[moving(path)], arc_lengths(line)))
+    before = there[0]
     for i in range(len(rollout.ego)):
         point = rollout.ego.xyz[i, :2]
         distance_m, _, _ = _along(path, point)
@@ -85,7 +84,8 @@ def _along(path, point, about_m=0.0, reach_m=math.inf):
         ends = [[p + f * (q - p) for p, q in zip(a, b, strict=True)] for f in (low, high)]
         distance, f = point_to_segment(point.tolist(), *ends)
         if distance < best and s <= about_m + reach_m and s + length >= about_m - reach_m:
-            best, best_s = distance, s + (low + f * (high - low)) * length
+            best = distance
+            best_s = s + (low + f * (high - low)) * length
         s += length
     return best, best_s, s
 

@@ -59,7 +59,8 @@ def _separation(a, b, tau):
     best = Decimal("-Infinity")
     for (p, q), (_, r) in ((shape[:2], shape[1:3]) for shape in shapes):
         for end, start in ((p, q), (q, r)):
-            dx, dy = end[0] - start[0], end[1] - start[1]
+            dx = end[0] - start[0]
+            dy = end[1] - start[1]
             length = (dx * dx + dy * dy).sqrt(_C)
             spans = [[(dx * x + dy * y) / length for x, y in shape] for shape in shapes]
             best = max(best, min(spans[0]) - max(spans[1]), min(spans[1]) - max(spans[0]))
@@ -88,7 +89,8 @@ def _first_touch(a, b, samples):
         return 0.0
     for k in range(1, samples + 1):
         if gaps[k] > 0:
-            low, high = times[k - 1], times[min(k + 1, samples)]
+            low = times[k - 1]
+            high = times[min(k + 1, samples)]
             if (
                 gaps[k] >= gaps[k - 1]
                 or (k < samples and gaps[k] > gaps[k + 1])
@@ -115,8 +117,10 @@ def _bottom(gap, low, high):
     """
     for _ in range(60):
         third = (high - low) / 3
-        a, b = low + third, high - third
-        at_a, at_b = gap(a), gap(b)
+        a = low + third
+        b = high - third
+        at_a = gap(a)
+        at_b = gap(b)
         if at_a <= 0:
             return a
         if at_b <= 0:
@@ -136,7 +140,8 @@ def _sin_cos(angle):
     """Return sine and cosine by their power series."""
     x = _C.remainder(angle, _TWO_PI)
     sums = [Decimal(0), Decimal(0)]
-    term, n = Decimal(1), 0
+    term = Decimal(1)
+    n = 0
     while n < 8 or abs(term) > Decimal("1e-45"):
         sums[n % 2] += term if n % 4 < 2 else -term
         n += 1
@@ -149,7 +154,8 @@ def side_at(a, b, tau, tie_m):
     along which they overlap least.
     """
     with localcontext(_C):
-        box, other = a.corners(Decimal(tau)), b.corners(Decimal(tau))
+        box = a.corners(Decimal(tau))
+        other = b.corners(Decimal(tau))
         ahead = (box[0][0] - box[3][0], box[0][1] - box[3][1])
         found = []
         for shape in (box, other):

@@ -85,7 +85,8 @@ def assert_reduced(
         if one.valid
     }
     for name in (set(values) | set(want)) - IDS - skip:
-        got, value = values.get(name), want.get(name)
+        got = values.get(name)
+        value = want.get(name)
         if value is None:  # AlpaSim writes null for inf and NaN
             assert got is None or not np.isfinite(got), name
         else:
@@ -125,10 +126,8 @@ def test_other_settings_of_the_scorers_are_followed(shared_data):
     preset = load_settings(folder / "eval-config.yaml").preset()
     assert len(rows) >= 11
     for (scene, rollout), row in rows.items():
-        log, archive = (
-            golden / "rollouts" / scene / rollout / "rollout.asl",
-            golden / "scenes" / f"{scene}.usdz",
-        )
+        log = golden / "rollouts" / scene / rollout / "rollout.asl"
+        archive = golden / "scenes" / f"{scene}.usdz"
         assert_steps(log, archive, preset, table=folder / "rollouts" / scene / rollout)
         assert_reduced(log, archive, preset, row["metrics"])
 

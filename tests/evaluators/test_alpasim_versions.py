@@ -32,7 +32,8 @@ from tests.evaluators.eval_build import (
 )
 from tests.evaluators.golden import scored
 
-NOW, LATER = PRESETS["alpasim"], PRESETS["alpasim@6f1029c"]
+NOW = PRESETS["alpasim"]
+LATER = PRESETS["alpasim@6f1029c"]
 RECORDED = track(np.linspace(0.0, 50.0, 51), 0.0)
 
 
@@ -49,7 +50,8 @@ RECORDED = track(np.linspace(0.0, 50.0, 51), 0.0)
     ],
 )
 def test_distance_to_the_side_ignores_what_was_driven_past_the_end(path, at, away_m):
-    line, point = np.array(path, float), np.array([at])
+    line = np.array(path, float)
+    point = np.array([at])
     distance_m, s = to_path(line, point)
     assert from_corridor(line, s, point, distance_m) == pytest.approx([away_m])
 
@@ -64,7 +66,8 @@ def values(log, chosen, road=TWO_LANES):
 
 
 def test_leaving_the_path_to_the_side_is_a_fault_and_passing_its_end_is_none():
-    aside, ahead = values(drift(4.6), LATER), values(drift(0.0, 61.0), LATER)
+    aside = values(drift(4.6), LATER)
+    ahead = values(drift(0.0, 61.0), LATER)
     assert aside["left_corridor_laterally"] == 1.0
     assert aside["lateral_dist_to_gt_trajectory"] == pytest.approx(
         4.048, abs=1e-3
@@ -186,7 +189,8 @@ def test_settings_and_result_files_name_the_version():
 def test_golden_logs_have_the_values_of_the_later_code(
     shared_data, name, rollout_id, score_there, reason, lateral_m, progress, clipped
 ):
-    folder, scene_id = shared_data / "alpasim-golden", f"synthetic-{name}"
+    folder = shared_data / "alpasim-golden"
+    scene_id = f"synthetic-{name}"
     log = folder / "rollouts" / scene_id / rollout_id / "rollout.asl"
     settings = load_settings(folder / "eval-config.yaml")
     chosen = settings.preset(LATER)

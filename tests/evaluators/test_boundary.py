@@ -125,7 +125,8 @@ def test_no_claim_contradicts_an_outcome():
     for seed in range(12):
         noise = 3 * stream("area", seed, "noise").standard_normal((AREA_STEPS + 1, AREA_STEPS + 1))
         found, failed = searched_area(lambda x, y, noise=noise: x + y + noise[x, y] < 24)
-        lower, upper = np.array(found.lower), np.array(found.upper)
+        lower = np.array(found.lower)
+        upper = np.array(found.upper)
         inside = {(x, y): one for (x, y), one in failed.items() if 0 < x < AREA_STEPS}
         for (x, y), has_failed in inside.items():
             assert has_failed or y >= lower[x - 1 : x + 1].min()

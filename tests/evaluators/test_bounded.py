@@ -59,7 +59,8 @@ def test_bounds_hold_the_mean_and_turn_with_the_sign_and_grow_with_the_worst_val
 def test_the_chance_agrees_with_the_bound():
     rows = np.random.Generator(np.random.Philox(6)).uniform(-1.0, 0.5, (5, 40))
     for row in rows:
-        values, counts = np.sort(np.append(row, 1.0)), np.ones(41)
+        values = np.sort(np.append(row, 1.0))
+        counts = np.ones(41)
         chance = chance_above(values, counts, upper_bound(row, 1.0))
         assert chance == pytest.approx(0.025, abs=1e-6)
         assert chance_above(values, counts, -1.0) == 1.0

@@ -18,7 +18,8 @@ from tests.evaluators.reference_rules import contacts_by_step
 from tests.examples import examples
 
 PAPER = PRESETS["paper"]
-HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
+HALF_L = 4.855 / 2
+HALF_W = 1.88 / 2
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 
 
@@ -220,7 +221,8 @@ def test_flips_stay_within_a_nanometre_of_touching(nudge, yaw, offset):
     """Whole scene turned and moved: rounding of the corners may flip a contact only next to the
     touching position.
     """
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     distance = HALF_L + 2.25 + nudge
     log = rollout(
         track(offset, -offset, yaw=yaw),

@@ -115,7 +115,8 @@ def test_columns_give_what_rows_give(
     seeds,
 ):
     rows = rows_like_a_run(renderers, policies, scenes, seeds, scenes)
-    baseline, bases = renderers[-1], {"onefixer": "3dgs"}
+    baseline = renderers[-1]
+    bases = {"onefixer": "3dgs"}
     wanted = by_rows(rows, baseline, bases)
 
     def numbers_by_renderer(table):

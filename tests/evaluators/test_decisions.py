@@ -88,10 +88,8 @@ def test_scenes_without_a_pair_leave_the_evidence_as_it_was():
     holed = x.copy()
     holed[[3, 17, 39]] = np.nan
     question = asked(("offroad", 0.1))
-    with_holes, without = (
-        state_after(question, {"offroad": holed}, 60),
-        state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60),
-    )
+    with_holes = state_after(question, {"offroad": holed}, 60)
+    without = state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60)
     assert with_holes.metrics["offroad"]["n_scenes"] == 37
     assert with_holes.metrics == without.metrics
 

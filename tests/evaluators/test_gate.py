@@ -92,7 +92,8 @@ def same(candidate):
     return candidate
 
 
-ONE, THREE = slice(4, 5), slice(5, 8)
+ONE = slice(4, 5)
+THREE = slice(5, 8)
 NEW = add(1.0, "collision_at_fault", ONE)
 
 
@@ -215,7 +216,8 @@ def test_a_verdict_counts_and_names_what_changed():
     stored = add(1.0, "collision_at_fault", THREE)(rows("clean"))
     verdict = judged([*stored, *both(NEW, add(0.4, where=ONE))(rows())], gate())
     checks = {check.metric: check for check in verdict.checks}
-    event, distance = checks["collision_at_fault"], checks["lateral_distance_m"]
+    event = checks["collision_at_fault"]
+    distance = checks["lateral_distance_m"]
     assert event.entry["counts"] == {"equal": 10, "new": 1, "gone": 3}
     assert event.entry["worst"] == [{"scene": "s004", "seed": 0, "was": 0.0, "now": 1.0}]
     assert distance.entry["counts"] == {"equal": 13, "worse": 1, "better": 0}

@@ -15,7 +15,8 @@ from tests.evaluators.reference_rules import road_by_step
 from tests.examples import examples
 
 PAPER = PRESETS["paper"]
-LENGTH_M, HALF_W = 4.855, 0.94
+LENGTH_M = 4.855
+HALF_W = 0.94
 
 
 def checked(lane_map, log):
@@ -40,7 +41,8 @@ def strip(name, y0, y1, x0=-30.0, x1=30.0, vertices=2, turn=0.0, about=(0.0, 0.0
     c, s = np.cos(turn), np.sin(turn)
 
     def line(y):
-        dx, dy = x - about[0], np.full(vertices, y) - about[1]
+        dx = x - about[0]
+        dy = np.full(vertices, y) - about[1]
         return np.stack(
             [about[0] + c * dx - s * dy, about[1] + s * dx + c * dy, np.zeros(vertices)], axis=1
         )
@@ -74,7 +76,8 @@ def test_a_seam_of_any_width_between_two_lanes(gap_m, turn):
         strip("left", gap_m, gap_m + 2.0, vertices=7, turn=turn),
     ]
     y = np.array([0.0, 0.3, -0.8, 1.0 + gap_m, 1.06, 1.2, -1.06, -1.07])
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     checked(road_map(*lanes), rollout(track(-s * y, c * y, yaw=turn)))
 
 

@@ -41,7 +41,8 @@ def test_who_crosses_at_speed_is_seen_from_the_side_however_far_off_the_nose():
     crossing = car("crosses", track(40.0, 23.0 * (5.0 - t), yaw=-np.pi / 2))
     found = scored(rollout(track(CRUISE, 0.0), [crossing]))["time_to_collision_s"].value
     for k in (22, 30, 40, 45):
-        x, y = CRUISE[k] + CRUISE[1] * 10 * (s := np.arange(0, 3, 0.001)), 23.0 * (5.0 - t[k] - s)
+        x = CRUISE[k] + CRUISE[1] * 10 * (s := np.arange(0, 3, 0.001))
+        y = 23.0 * (5.0 - t[k] - s)
         box = rollout(track(CRUISE, 0.0)).ego_box
         touch = (np.abs(x - 40.0) <= box.length_m / 2 + 0.9) & (np.abs(y) <= 2.25 + box.width_m / 2)
         assert found[k] == pytest.approx(s[np.argmax(touch)] if touch.any() else 3.0, abs=0.002)
@@ -52,7 +53,8 @@ def test_the_safe_distance_is_that_of_the_definition_and_nobody_beside_counts():
     assert safe_distance_m(np.array([8.0]), np.array([0.0]))[0] == pytest.approx(
         8 + 1.75 + 11.5**2 / 8
     )
-    standing, beside = track(np.full(N, 40.0), 0.0), track(CRUISE + 8.0, 3.0)
+    standing = track(np.full(N, 40.0), 0.0)
+    beside = track(CRUISE + 8.0, 3.0)
     log = rollout(track(CRUISE, 0.0), [car("stands", standing), car("beside", beside)])
     gap_m = 40.0 - 2.25 - CRUISE[20] - log.ego_box.length_m / 2
     assert scored(log)["rss_margin_m"].value[20] == pytest.approx(gap_m - 26.28125, abs=1e-6)

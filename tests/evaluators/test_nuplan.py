@@ -54,7 +54,8 @@ def tracks(worlds):
     for t, world in enumerate(worlds):
         for kind in kinds:
             for one in world.get(kind, []):
-                a, box = ids.index((kind, one["id"])), one["box"]
+                a = ids.index((kind, one["id"]))
+                box = one["box"]
                 there[a, t], xy[a, t], yaw[a, t], size[a] = (
                     True,
                     box["pose"][:2],
@@ -123,7 +124,8 @@ def test_the_devkits_test_vectors_give_its_series_to_all_printed_digits_and_its_
     path,
 ):
     scene = json.loads(path.read_text())
-    name, expected = path.parent.name, scene["expected"]
+    name = path.parent.name
+    expected = scene["expected"]
     got = found_statistics(name, scene)
     wanted = [
         value for kind, value in expected["statistics"] if name not in SERIES or kind != "BOOLEAN"
@@ -159,7 +161,8 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
         np.array([[4.0, 1.8]]),
         velocity,
     )
-    everyone, steps = np.zeros(n, np.int64), np.arange(n)
+    everyone = np.zeros(n, np.int64)
+    steps = np.arange(n)
     first_s, last_s = nuplan.touching_s(ego, others, everyone, steps)
     for after_s in np.arange(0.0, 4.0, 0.05):
         own = ego.boxes(ego.centre + after_s * ego.speed[:, None] * ego.heading, ego.yaw).shapes()

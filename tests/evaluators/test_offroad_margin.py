@@ -30,7 +30,8 @@ from tests.evaluators.reference_strict import depth_by_points
 from tests.examples import examples
 
 STRICT = PRESETS["strict"]
-HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
+HALF_L = 4.855 / 2
+HALF_W = 1.88 / 2
 
 
 def margins(log, lane_map=TWO_LANES):
@@ -104,7 +105,8 @@ def test_closing_leaves_the_outer_border_where_the_map_has_it():
         ],
         object,
     )
-    joined, plain = closed_union(areas, 0.1), shapely.union_all(areas)
+    joined = closed_union(areas, 0.1)
+    plain = shapely.union_all(areas)
     added = shapely.difference(joined, plain)
     assert shapely.area(added) == pytest.approx(0.04 * 20 * 2, rel=0.02)
     # Everything thicker than the grid's rounding that was added lies between the lanes.
@@ -126,7 +128,8 @@ def test_a_nose_across_a_wide_gap_is_settled_in_a_few_pieces(monkeypatch, x):
     region = Region(
         shapely.MultiPolygon([shapely.box(0, -1.75, 24, 1.75), shapely.box(26, -1.75, 60, 1.75)])
     )
-    quartered, cut = [], surface._quartered
+    quartered = []
+    cut = surface._quartered
     monkeypatch.setattr(
         surface,
         "_quartered",

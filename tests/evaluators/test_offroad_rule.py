@@ -230,7 +230,8 @@ half_metre = st.integers(-8, 8).map(lambda k: k / 2)
 
 @st.composite
 def roads(draw):
-    lanes, edges = [], []
+    lanes = []
+    edges = []
     y = -4.0
     for k in range(draw(st.integers(1, 4))):
         width = draw(st.sampled_from([1.88, 2.0, 3.5]))
@@ -241,7 +242,8 @@ def roads(draw):
         def line(at, bend=bend, xs=xs):
             return np.stack([xs, at + bend * np.sin(xs / 9), np.zeros(5)], axis=1)
 
-        left, right = line(y + width), line(y)
+        left = line(y + width)
+        right = line(y)
         kind = draw(st.sampled_from(["both", "both", "none", "reversed"]))
         left, right = {
             "both": (left, right),
@@ -295,7 +297,8 @@ def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
 @given(st.floats(-1e-12, 1e-12), st.floats(0.0, 2 * np.pi))
 def test_a_footprint_on_the_lane_border_flips_only_next_to_it(nudge, turn):
     """The road turned as a whole; the exact twin decides on the same rounded corners."""
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     spin = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     one = lane("a", 0.0)
     turned = replace(

@@ -22,7 +22,8 @@ from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
 from evaluators.statistics.outcomes import outcome_table, times_of
 
-DT_S, V = 0.1, 8.0
+DT_S = 0.1
+V = 8.0
 T = np.arange(0.0, 12.0, DT_S)
 
 
@@ -141,10 +142,8 @@ def test_a_drive_far_from_the_origin_is_judged_alike():
     far = np.array([4.5e5, 5.4e6, 0.0])
     log, scene = drive(track(travelled(slowing(0.0))))
     moved = lambda one: Trajectory(one.t_us, one.xyz + far, one.quat)  # noqa: E731
-    log, scene = (
-        replace(log, ego=moved(log.ego), ego_log=moved(log.ego_log)),
-        replace(scene, ego_log=moved(scene.ego_log)),
-    )
+    log = replace(log, ego=moved(log.ego), ego_log=moved(log.ego_log))
+    scene = replace(scene, ego_log=moved(scene.ego_log))
     assert {
         one.name for one in evaluate_outcomes(log, scene, PRESETS["paper"]) if np.any(one.value > 0)
     } == {

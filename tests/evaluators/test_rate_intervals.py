@@ -28,7 +28,8 @@ def test_bounds_of_a_rate_hold_its_centre_and_never_leave_zero_to_one(means):
 @given(shares)
 @settings(max_examples=examples(100), deadline=None)
 def test_counting_non_events_instead_of_events_mirrors_the_bounds(means):
-    one, other = rate_interval(np.array(means)), rate_interval(1.0 - np.array(means))
+    one = rate_interval(np.array(means))
+    other = rate_interval(1.0 - np.array(means))
     assert (one.low, one.high) == pytest.approx((1 - other.high, 1 - other.low), abs=1e-7)
 
 
@@ -50,13 +51,15 @@ def test_a_rate_and_its_difference_are_covered_where_a_tenth_of_scenes_always_ha
 
 @pytest.mark.parametrize("n", [2, 5, 60])
 def test_nobody_and_everybody_take_the_exact_bounds_over_scenes(n):
-    nobody, everybody = rate_interval(np.zeros(n)), rate_interval(np.ones(n))
+    nobody = rate_interval(np.zeros(n))
+    everybody = rate_interval(np.ones(n))
     assert (nobody.low, nobody.high) == pytest.approx((0.0, 1 - 0.025 ** (1 / n)))
     assert (everybody.low, everybody.high) == pytest.approx((0.025 ** (1 / n), 1.0))
 
 
 def test_scenes_that_all_have_the_same_share_allow_for_others_that_were_not_drawn():
-    one, unseen = rate_interval(np.full(10, 0.2)), 1 - 0.025 ** (1 / 10)
+    one = rate_interval(np.full(10, 0.2))
+    unseen = 1 - 0.025 ** (1 / 10)
     assert (one.low, one.high) == pytest.approx((0.2 - 0.2 * unseen, 0.2 + 0.8 * unseen))
 
 
@@ -92,7 +95,8 @@ def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
 
 
 def test_unequal_seeds_do_not_let_one_scene_outweigh_the_others():
-    values, scenes = [1.0] * 50 + [0.0] * 4, ["busy"] * 50 + ["a", "b", "c", "d"]
+    values = [1.0] * 50 + [0.0] * 4
+    scenes = ["busy"] * 50 + ["a", "b", "c", "d"]
     one = rate_interval(cluster_means(values, scenes)[0])
     assert one.centre == pytest.approx(0.2)
     assert one.high > 0.5

@@ -136,8 +136,10 @@ def is_ambiguous(path, point):
 
 def test_lateral_bias_is_the_signed_mean_left_positive_and_follows_the_paths_direction():
     for heading in (0.0, 0.9, np.pi, -2.0):
-        c, s = np.cos(heading), np.sin(heading)
-        x, y = np.arange(5.0), np.array([0.0, 9.0, 0.5, 0.5, -1.6])
+        c = np.cos(heading)
+        s = np.sin(heading)
+        x = np.arange(5.0)
+        y = np.array([0.0, 9.0, 0.5, 0.5, -1.6])
         log = rollout(
             track(c * x - s * y, s * x + c * y, yaw=heading), log=track(c * x, s * x, yaw=heading)
         )
@@ -249,7 +251,8 @@ def test_a_recording_that_stands_all_the_time_has_no_length_whatever_its_noise()
 
 def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_it():
     turn = np.linspace(-np.pi / 2, np.pi / 2, 21)
-    out, back = np.arange(0.0, 100.0), np.arange(100.0, -1.0, -1.0)
+    out = np.arange(0.0, 100.0)
+    back = np.arange(100.0, -1.0, -1.0)
     path = np.concatenate(
         [
             np.stack([out, 0 * out]),

@@ -56,10 +56,8 @@ def test_a_log_with_a_broken_track_is_refused(who, poses, text):
 
 
 def test_a_broken_plan_is_refused_and_named():
-    good, late = (
-        track(np.arange(3.0), 0.0, t_us=[0, 100, 200]),
-        track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100]),
-    )
+    good = track(np.arange(3.0), 0.0, t_us=[0, 100, 200])
+    late = track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100])
     plans = (
         LoggedPlan(0, 100, good, (good, good)),
         LoggedPlan(300_000, 300_100, good, (good, late)),

@@ -77,7 +77,8 @@ LAWS = {
 def test_the_capital_is_a_martingale_where_the_mean_is_the_hypothesis_by_enumeration(law):
     """Every course of seven scenes, with its probability: no sampling."""
     values, chances = (np.array(column) for column in LAWS[law])
-    n, mean = 7, float(values @ chances)
+    n = 7
+    mean = float(values @ chances)
     courses = np.array(list(itertools.product(range(len(values)), repeat=n)))
     chance = np.prod(chances[courses], axis=1)
     found = capital(Draws(values[courses], 1.0), mean)
@@ -94,7 +95,8 @@ def test_the_capital_is_a_martingale_where_the_mean_is_the_hypothesis_by_enumera
 
 
 def test_below_the_hypothesis_the_capital_only_shrinks_on_average():
-    values, chances = np.array([-1.0, 0.0, 1.0]), np.array([0.15, 0.8, 0.05])
+    values = np.array([-1.0, 0.0, 1.0])
+    chances = np.array([0.15, 0.8, 0.05])
     courses = np.array(list(itertools.product(range(3), repeat=6)))
     found = capital(Draws(values[courses], 1.0), 0.1)
     means = np.sum(np.prod(chances[courses], axis=1)[:, None] * found, axis=0)

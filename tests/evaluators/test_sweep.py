@@ -34,7 +34,8 @@ def contact(a, b):
 
 
 def assert_twins_agree(a, b):
-    fast, slow = contact(a, b), first_touch(a, b)
+    fast = contact(a, b)
+    slow = first_touch(a, b)
     if fast is None:
         assert slow is None  # no contact is ever passed over
         return
@@ -92,7 +93,8 @@ def test_bodies_within_a_nanometre_touch(off):
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (0.0, 5.0), (30.0, 0.0)])
 def test_bodies_more_than_a_nanometre_apart_that_keep_their_distance_do_not_touch(motion):
-    a, b = moving(0, 0, *motion, size=EGO), moving((4.855 + 4.5) / 2 + 3e-9, 0.0, *motion)
+    a = moving(0, 0, *motion, size=EGO)
+    b = moving((4.855 + 4.5) / 2 + 3e-9, 0.0, *motion)
     assert contact(a, b) is None
 
 
@@ -103,9 +105,11 @@ def test_sliding_along_a_wall_a_nanometre_away_ends_quickly():
 
 def test_corner_that_grazes_corner_touches_within_the_band():
     # Relative motion along the diagonal that just brings corner on corner half way.
-    x, y = (4.855 + 4.5) / 2, (1.88 + 1.8) / 2
+    x = (4.855 + 4.5) / 2
+    y = (1.88 + 1.8) / 2
     for out, touches in ((0.0, True), (5e-9, False)):
-        a, b = still(0, 0, size=EGO), moving(x + out + 1.0, y + out - 1.0, -2.0, 2.0)
+        a = still(0, 0, size=EGO)
+        b = moving(x + out + 1.0, y + out - 1.0, -2.0, 2.0)
         assert (contact(a, b) is not None) == touches
         assert_twins_agree(a, b)
 

@@ -33,7 +33,8 @@ from tests.evaluators.reference_strict import Motion, first_touch, side_at
 from tests.examples import examples
 
 STRICT = PRESETS["strict"]
-HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
+HALF_L = 4.855 / 2
+HALF_W = 1.88 / 2
 AXLE = 1.4  # box centre ahead of the rear axle
 POST = Box(0.3, 0.3, 1.0)
 
@@ -234,7 +235,8 @@ def twin_rows(log):
                     rows[i + 1].add(actor.actor_id)
                     sides[i + 1, actor.actor_id] = side_at(a, b, tau, PLACE_M)
                     break
-    out, last = [], {}
+    out = []
+    last = {}
     for i, names in enumerate(rows):
         for name in names:
             before = i > 0 and name in at_steps[i - 1].sides
@@ -247,10 +249,8 @@ def twin_rows(log):
 
 def overlap_side(log, actor, i):
     t = log.ego.t_us[i]
-    ego_size, size = (
-        (log.ego_box.length_m, log.ego_box.width_m),
-        (actor.box.length_m, actor.box.width_m),
-    )
+    ego_size = (log.ego_box.length_m, log.ego_box.width_m)
+    size = (actor.box.length_m, actor.box.width_m)
     return side_at(
         moved(log.ego, t, t, ego_size, log), moved(actor.track, t, t, size, log), 0.0, PLACE_M
     )
@@ -258,7 +258,8 @@ def overlap_side(log, actor, i):
 
 def pieces(log, actor, i):
     t = log.ego.t_us
-    first, last = max(t[i], actor.track.t_us[0]), min(t[i + 1], actor.track.t_us[-1])
+    first = max(t[i], actor.track.t_us[0])
+    last = min(t[i + 1], actor.track.t_us[-1])
     if first >= last:
         return
     inside = actor.track.t_us[(actor.track.t_us > first) & (actor.track.t_us < last)]
@@ -286,7 +287,8 @@ def moved(poses, t0, t1, size, log):
 
 def fast_rows(log):
     origin = origin_of(log.ego, STRICT)
-    ego, actors = ego_footprints(log, STRICT, origin), ActorTable(log, STRICT, origin)
+    ego = ego_footprints(log, STRICT, origin)
+    actors = ActorTable(log, STRICT, origin)
     contacts, _ = find_contacts(ego, actors, log.ego.t_us)
     swept = find_swept(ego, actors, log.ego.t_us, contacts, -1)
     out = [{} for _ in range(len(log.ego))]
@@ -317,7 +319,8 @@ def worlds(draw):
         period = draw(st.sampled_from([100_000, 70_000]))
         xs, ys = ([base + draw(number) for _ in range(m)] for base in (x0, y0))
         if draw(st.booleans()):  # edges on one line, corner on corner
-            xs, ys = [x0 + HALF_L + 2.25] * m, [y0 + draw(st.sampled_from([0.0, HALF_W + 0.9]))] * m
+            xs = [x0 + HALF_L + 2.25] * m
+            ys = [y0 + draw(st.sampled_from([0.0, HALF_W + 0.9]))] * m
         box = draw(st.sampled_from([CAR, POST, Box(4.855, 1.88, 1.6), Box(12.0, 1e-3, 1.0)]))
         yaws = [draw(ANGLES) for _ in range(m)]
         actors.append(
@@ -329,7 +332,8 @@ def worlds(draw):
 @settings(max_examples=examples(40), deadline=None, derandomize=True)
 @given(worlds())
 def test_random_worlds_agree_with_the_twin(log):
-    fast, slow = fast_rows(log), twin_rows(log)
+    fast = fast_rows(log)
+    slow = twin_rows(log)
     for row, (got, want) in enumerate(zip(fast, slow, strict=True)):
         for name in set(got) | set(want):
             if got.get(name) != want.get(name):

@@ -121,7 +121,8 @@ def test_means_whose_rare_scenes_were_not_drawn_are_covered(scenes):
         ("progress", 1.0, 0.3, 0.1),
         ("lateral_distance_m", 0.1, 3.0, 0.02),
     ):
-        truth, held = usual + share * (rare - usual), 0
+        truth = usual + share * (rare - usual)
+        held = 0
         for _ in range(100):
             means = np.where(rng.random(scenes) < share, rare, usual)
             one = mean_interval(means + rng.normal(0, 1e-3, scenes), METRICS[metric])
@@ -283,7 +284,8 @@ def test_the_ledger_counts_every_cause_and_bounds_every_rate():
 
 def test_bounds_with_sampling_error_hold_the_rate_where_crashes_hide_events():
     """Half of the rollouts with an event crash; the truth is 20 %."""
-    rng, held = np.random.default_rng(6), 0
+    rng = np.random.default_rng(6)
+    held = 0
     for _ in range(100):
         had = (rng.random(40) < 0.2).astype(float)
         gone = (had > 0) & (rng.random(40) < 0.5)

@@ -48,7 +48,8 @@ from tests.evaluators.eval_build import (
 )
 from tests.log.make_rollout import write_rollout
 
-ALPASIM, STRICT = PRESETS["alpasim"], PRESETS["strict"]
+ALPASIM = PRESETS["alpasim"]
+STRICT = PRESETS["strict"]
 STAND = track(np.zeros(4), 0.0)
 DRIVE = track(np.arange(80) * 1.0, 0.0)
 FRONT_WIDE = "camera_front_wide_120fov"
@@ -316,7 +317,8 @@ class Bomb:
 
 def test_d24_nothing_in_a_log_is_ever_unpickled(tmp_path):
     proof = tmp_path / "unpickled"
-    path, armed = write_rollout(tmp_path / "rollout.asl"), tmp_path / "armed.asl"
+    path = write_rollout(tmp_path / "rollout.asl")
+    armed = tmp_path / "armed.asl"
     with AslFile(armed) as out:
         for entry in AslReader(path):
             if entry.WhichOneof("log_entry") == "driver_return":

@@ -12,7 +12,8 @@ from tests.evaluators.test_tables_over_rollouts import rows_of
 
 
 def pair(base, other, metric="route_distance_m", margin=None):
-    side, base_side = Side.of(rows_of(other, metric)), Side.of(rows_of(base, metric))
+    side = Side.of(rows_of(other, metric))
+    base_side = Side.of(rows_of(base, metric))
     return compare(side, base_side, METRICS.info(metric), "clean", margin)
 
 
@@ -49,7 +50,8 @@ def test_a_metric_without_a_better_side_is_worse_on_either_side_of_its_margin():
 
 
 def test_margins_are_given_or_the_documented_defaults():
-    base, other = [[float(i)] for i in range(8)], [[i + 0.3 + 0.01 * (i % 3)] for i in range(8)]
+    base = [[float(i)] for i in range(8)]
+    other = [[i + 0.3 + 0.01 * (i % 3)] for i in range(8)]
     assert pair(base, other)["margin"] == 0.1
     assert pair(base, other, margin=0.2)["margin"] == 0.2
     assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad")["margin"] == 0.02
@@ -161,10 +163,8 @@ def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn(
 
 def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_it():
     def moved(by, n=20, **options):
-        base, other = (
-            [[50.0 + i] for i in range(n)],
-            [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)],
-        )
+        base = [[50.0 + i] for i in range(n)]
+        other = [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)]
         found = pair(base, other, "lateral_distance_m", **options)
         return found["verdict"], found["difference"], found.get("note", "")
 
@@ -178,7 +178,8 @@ def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_i
 
 
 def test_a_metric_of_which_nothing_says_how_much_a_scene_can_differ_decides_nothing_without_a_margin():
-    base, other = [[float(i)] for i in range(20)], [[i + 5.0 + 0.01 * (i % 3)] for i in range(20)]
+    base = [[float(i)] for i in range(20)]
+    other = [[i + 5.0 + 0.01 * (i % 3)] for i in range(20)]
     found = pair(base, other, "contact_x_m")
     assert (found["verdict"], found["guarded"]) == ("undecided", None)
     assert "nothing says how much a scene can differ" in found["note"]

@@ -33,10 +33,8 @@ def opened(folder, *parts, steer="", accel="", send=""):
     """
     (folder / "car.dbc").write_text(HEAD + "".join(parts))
     send = send or "{message: EGO, period_us: 10000, signals: {SPEED: speed_kph}}"
-    steer, accel = (
-        steer or "{message: CMD, signal: ANGLE}",
-        accel or "{message: CMD, signal: ACCEL}",
-    )
+    steer = steer or "{message: CMD, signal: ANGLE}"
+    accel = accel or "{message: CMD, signal: ACCEL}"
     text = f"dbc: car.dbc\nsteering_ratio: 15\nsend: [{send}]\nsteer: {steer}\naccel: {accel}\n"
     (folder / "map.yaml").write_text(text)
     return open_codec(*load_map(str(folder / "map.yaml"))), folder / "map.yaml"
@@ -53,7 +51,8 @@ def answered(codec, *frames):
         return exchange
 
 
-EGO, CMD = message(257, "EGO", 4, SPEED), message(512, "CMD", 4, ANGLE, ACCEL)
+EGO = message(257, "EGO", 4, SPEED)
+CMD = message(512, "CMD", 4, ANGLE, ACCEL)
 
 
 def test_one_message_may_carry_both_commands(tmp_path):

@@ -220,7 +220,8 @@ def test_a_pose_of_kitti_belongs_to_the_number_of_a_photograph(tmp_path):
     for path in (folder / "image_2").iterdir():
         (folder / "image_3" / path.name).write_bytes(path.read_bytes())
     (folder / "image_2/4.png").unlink()
-    left, right = read_source(folder).of("left"), read_source(folder).of("right")
+    left = read_source(folder).of("left")
+    right = read_source(folder).of("right")
     assert [one.file.stem for one in left] == ["0", "1", "2", "3", "5", "6", "7"]
     by_time = {one.t_us: one for one in right}
     for one in left:
@@ -401,9 +402,11 @@ def rig(model, folders, left, binary=False, turn=1.0):
     def numbers(T):
         return " ".join(repr(float(v)) for v in [*quat_from_matrix(T[:3, :3]), *T[:3, 3]])
 
-    images, frames = [], []
+    images = []
+    frames = []
     for i, pose in enumerate(poses(13)):
-        ahead, aside = 100 - i, 200 - i
+        ahead = 100 - i
+        aside = 200 - i
         T_rig_world = np.linalg.inv(pose)
         images.append(f"{ahead} {numbers(T_rig_world)} 7 {folders[0]}{i}.png")
         data = f"1 CAMERA 7 {ahead}"

@@ -160,7 +160,8 @@ def test_a_text_ply_is_the_same_model_and_the_same_points(tmp_path):
         opened(tmp_path / "b.ply")
     text = text.replace("element camera 1\nproperty float f\n", "").replace("\n5\n", "\n")
     (tmp_path / "b.ply").write_text(text)
-    one, two = opened(tmp_path / "a.ply")[0], opened(tmp_path / "b.ply")[0]
+    one = opened(tmp_path / "a.ply")[0]
+    two = opened(tmp_path / "b.ply")[0]
     assert all(
         np.array_equal(x, y) for x, y in zip(vars(one).values(), vars(two).values(), strict=True)
     )

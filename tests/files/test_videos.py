@@ -15,7 +15,8 @@ from alpasim_plugin.log.video import VideoReader
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 ONE = 1 << 16
-WIDTH, HEIGHT = 48, 32
+WIDTH = 48
+HEIGHT = 32
 
 
 def video(path, matrix=None, tracks=1):

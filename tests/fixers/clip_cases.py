@@ -27,7 +27,8 @@ def moving_picture(
     ).astype(np.uint8)
     out = []
     for i in range(count):
-        y, x = (i * 1) % 64, (i * 3) % 64
+        y = (i * 1) % 64
+        x = (i * 3) % 64
         alpha = np.ones(size, np.float32)
         if holes:
             alpha[: height // 2, : width // 3] = 0.0

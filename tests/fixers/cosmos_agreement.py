@@ -27,7 +27,8 @@ from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from tests.fixers.cosmos_clip import read_lenses, read_map, read_poses
 from tests.scenarios.ftheta_projection import RecordedLens, project_ftheta
 
-WIDTH, HEIGHT = 1280, 704
+WIDTH = 1280
+HEIGHT = 704
 N_FRAMES = 57
 LIT = 40  # brightest channel above this: drawn; below lies the noise of the video's compression
 NEARER = 255 * (1 - 115 / 200)  # our lines are brighter up to 115 m; published ones end there

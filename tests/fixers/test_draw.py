@@ -33,7 +33,8 @@ def test_line_lies_where_the_formula_puts_it_and_fades_with_depth():
     edge = line((5, -1, 0), (150, -1, 0))
     image = draw_map(prepare_map(replace(EMPTY, road_edges=(edge,))), BIG, at())
     for depth in (6.0, 10.0, 20.0, 50.0, 100.0):
-        u, v = 640 + 640 * 1.0 / depth, 360 + 640 * 1.5 / depth
+        u = 640 + 640 * 1.0 / depth
+        v = 360 + 640 * 1.5 / depth
         fade, pixel_m = (
             1 - depth / 200,
             depth**2 / (640 * 1.5),
@@ -103,7 +104,8 @@ def test_road_users_go_from_the_front_colour_to_the_back_colour():
     )
     row = side_on[78]  # heading left: front at the left
     inside = np.flatnonzero(row.any(axis=1))
-    first, last = row[inside[3]], row[inside[-4]]
+    first = row[inside[3]]
+    last = row[inside[-4]]
     assert_allclose(first, np.array([0, 46, 136]) * 0.955, atol=25)
     assert_allclose(last, np.array([126, 206, 255]) * 0.955, atol=25)
     assert (np.diff(row[inside[3:-3], 0].astype(int)) >= 0).all()
@@ -128,11 +130,10 @@ def test_classes_have_their_colours(label, back):
 def test_nearer_road_user_hides_the_farther_and_the_line_behind():
     edge = line((30, -10, 1), (30, 10, 1))
     scene = prepare_map(replace(EMPTY, road_edges=(edge,)))
-    far, near = ActorBox(se2(20, 0, 0, 0.8), CAR, "bus"), ActorBox(se2(10, 0, 0, 0.8), CAR, "car")
-    one, two = (
-        draw_map(scene, BIG, at(z=1), (far, near)),
-        draw_map(scene, BIG, at(z=1), (near, far)),
-    )
+    far = ActorBox(se2(20, 0, 0, 0.8), CAR, "bus")
+    near = ActorBox(se2(10, 0, 0, 0.8), CAR, "car")
+    one = draw_map(scene, BIG, at(z=1), (far, near))
+    two = draw_map(scene, BIG, at(z=1), (near, far))
     assert_array_equal(one, two)
     assert not lit(one[:, 600:680], COLOURS["road_boundary"]).any()
     assert lit(one, np.array(COLOURS["road_boundary"]) * 0.85).any()
@@ -216,10 +217,8 @@ def test_point_exactly_at_the_near_plane_and_lines_of_no_length():
 
 def test_utm_sized_coordinates_draw_the_same_picture():
     origin = np.array([512_345.0, 5_403_210.0, 230.0])
-    edge, ring = (
-        line((2, -1.5, 0), (90, -1.5, 0.3)),
-        line((8, -1, 0), (8, 1, 0), (11, 1, 0), (11, -1, 0)),
-    )
+    edge = line((2, -1.5, 0), (90, -1.5, 0.3))
+    ring = line((8, -1, 0), (8, 1, 0), (11, 1, 0), (11, -1, 0))
     box = se2(15, 2, 0.3, 0.8)
     near = draw_map(
         prepare_map(replace(EMPTY, road_edges=(edge,), crosswalks=(ring,))),

@@ -41,17 +41,16 @@ def images_in_range(*shape):
 def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, width):
     repaired = images_in_range(batch, height, width, 3)
     images = recordings(batch, references, height, width)
-    heads, floats = heads_of(batch, references, height, width), in_floats(images)
+    heads = heads_of(batch, references, height, width)
+    floats = in_floats(images)
     exact_cells = TORCH.gather_references(images, repaired)
     for one, other in zip(CPU.gather_references(images, repaired), exact_cells, strict=True):
         assert torch.allclose(one, other, atol=2e-6)
     exact = BlendHeads(
         *(part.double() for part in heads[:3])
     )  # in float32 the operations one by one are less exact
-    fast, plain = (
-        CPU.blend(repaired, images, heads),
-        mix(sources_of(repaired.double(), floats.double(), exact)),
-    )
+    fast = CPU.blend(repaired, images, heads)
+    plain = mix(sources_of(repaired.double(), floats.double(), exact))
     for one, other in zip(
         fast, plain, strict=True
     ):  # at the edge of what holds, a rounded offset weighs more than the rounding itself
@@ -70,15 +69,18 @@ def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, 
     ("references", "height", "width", "scale"), [(2, 32, 64, 2), (1, 130, 100, 8), (0, 45, 91, 3)]
 )
 def test_bands_enlarge_as_the_operations_one_by_one(references, height, width, scale):
-    rgb, images = recordings(2, 1, height, width)[:, 0, ..., :3], None
+    rgb = recordings(2, 1, height, width)[:, 0, ..., :3]
+    images = None
     seen = CPU.smaller(rgb, scale)
     apart = seen.int() - TORCH.smaller(rgb, scale)
     assert int(apart.abs().max()) <= 1  # halves are rounded to other sides
     assert torch.allclose(*(one.smaller(rgb.float(), scale) for one in (CPU, TORCH)))
     size = [-(-side // (16 * scale)) * 16 for side in (height, width)]
-    change, heads = images_in_range(2, *size, 3), None
+    change = images_in_range(2, *size, 3)
+    heads = None
     if references:
-        images, heads = recordings(2, references, height, width), heads_of(2, references, *size)
+        images = recordings(2, references, height, width)
+        heads = heads_of(2, references, *size)
         cells = 2, references, -(-height // FINER_PX), -(-width // FINER_PX)
         heads = heads._replace(finer=torch.randn(cells) if scale == 8 else None)
     one, other = (each.enlarge(rgb, change, images, heads, scale) for each in (CPU, TORCH))

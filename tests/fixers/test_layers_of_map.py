@@ -56,7 +56,8 @@ def test_edge_shared_with_oncoming_traffic_is_drawn_once():
 
 
 def test_edges_that_cross_are_both_drawn():
-    one, turned = lane("1", 0.0, "solid_white", "none"), lane("2", 0.0, "solid_white", "none")
+    one = lane("1", 0.0, "solid_white", "none")
+    turned = lane("2", 0.0, "solid_white", "none")
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     two = Lane(
         "2",
@@ -123,7 +124,8 @@ def test_dashes_lie_on_their_line_and_are_as_long_as_they_should(points, on, off
     )
     for piece in pieces:
         for p in piece:
-            a, b = line[:-1], line[1:]
+            a = line[:-1]
+            b = line[1:]
             d2 = np.maximum(np.sum((b - a) ** 2, axis=1), 1e-300)
             f = np.clip(np.sum((p - a) * (b - a), axis=1) / d2, 0, 1)
             assert np.linalg.norm(p - (a + f[:, None] * (b - a)), axis=1).min() < 1e-6

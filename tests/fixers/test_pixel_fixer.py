@@ -113,7 +113,8 @@ def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle):
 
 @pytest.mark.parametrize(("size", "scale"), [((17, 33), 1), ((30, 50), 1), ((70, 101), 3)])
 def test_odd_sizes_are_padded_and_cropped(bundle, size, scale):
-    fixer, frames = session(bundle, f"scale={scale}"), moving_picture(3, size)
+    fixer = session(bundle, f"scale={scale}")
+    frames = moving_picture(3, size)
     out = run(fixer, frames, maps_of(frames))
     assert [frame.rgb.shape for frame in out] == [(*size, 3)] * 3
     assert not any(frame.events for frame in out)
@@ -250,10 +251,8 @@ def test_a_reference_becomes_the_picture_and_the_facts_say_so(reading):
 
 
 def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading):
-    front, side = (
-        with_reference(FRAMES[0], 90),
-        replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us),
-    )
+    front = with_reference(FRAMES[0], 90)
+    side = replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us)
     both = session(reading, "holes=render").step([front, side], MAPS[:2])
     for i, frame in enumerate((front, side)):
         (alone,) = session(reading, "holes=render").step([frame], MAPS[i : i + 1])

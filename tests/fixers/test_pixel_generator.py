@@ -36,7 +36,8 @@ def frames(count, seed=1, batch=2):
 
 
 def rolled(net, clip):
-    state, out = net.start(clip[0][0]), []
+    state = net.start(clip[0][0])
+    out = []
     for render, opacity, sdmap in clip:
         made, state = net(render, opacity, sdmap, state)
         out.append(made)
@@ -68,7 +69,8 @@ def test_weights_that_do_not_fit_are_named(key, value):
 
 
 def test_the_state_is_all_that_goes_on():
-    net, clip = network(), frames(4)
+    net = network()
+    clip = frames(4)
     whole, _ = rolled(net, clip)
     _, after_two = rolled(net, clip[:2])
     third, _ = net(*clip[2], after_two)
@@ -83,7 +85,8 @@ def test_the_state_is_all_that_goes_on():
 def test_time_one_is_the_deployed_step_and_other_times_differ():
     net, (frame,) = network(), frames(1)
     torch.nn.init.normal_(net.time.weight)
-    state, source = net.start(frame[0]), torch.randn_like(frame[0])
+    state = net.start(frame[0])
+    source = torch.randn_like(frame[0])
     deployed, _ = net(*frame, state, source)
     at_one, _ = net(*frame, state, source, torch.ones(2))
     assert_close(at_one, deployed, atol=1e-6, rtol=0)
@@ -123,7 +126,8 @@ def test_weights_say_the_sizes():
 
 
 def test_clips_of_a_batch_do_not_see_each_other():
-    net, clip = network(), frames(3)
+    net = network()
+    clip = frames(3)
     whole, _ = rolled(net, clip)
     for b in range(2):
         alone, _ = rolled(net, [tuple(x[b : b + 1] for x in frame) for frame in clip])  # type: ignore[misc]

@@ -16,7 +16,8 @@ from alpasim_plugin.fixers.network.reference_blend import (
 )
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
-HEIGHT, WIDTH = 32, 64
+HEIGHT = 32
+WIDTH = 64
 
 
 def trained_like(seed=0):
@@ -99,7 +100,8 @@ def test_the_operations_of_a_processor_give_the_same_frame(batch, references):
 def test_a_large_image_is_not_bent_by_small_offsets_and_takes_more_of_its_references():
     offset = torch.tensor([0.5, 1.6]).view(1, 1, 1, 2, 1) * torch.tensor([0.6, 0.8])
     heads = BlendHeads(torch.zeros(1, 1, 1, 2, 4), offset, torch.ones(1, 1, 1, 2, 12))
-    half, tenth = enlarged(heads, 2), enlarged(heads, 10)
+    half = enlarged(heads, 2)
+    tenth = enlarged(heads, 10)
     assert torch.allclose(half.offset_px[..., 0, :], torch.zeros(2))
     assert torch.allclose(half.offset_px[..., 1, :].norm(), torch.tensor(1.0))
     assert torch.equal(half.weight, heads.weight)

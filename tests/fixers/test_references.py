@@ -29,7 +29,8 @@ from alpasim_plugin.fixers.warp import (
     warp,
 )
 
-WIDTH, HEIGHT = 64, 32
+WIDTH = 64
+HEIGHT = 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
 FORWARD = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
@@ -69,7 +70,8 @@ def test_a_frame_warped_into_its_own_view_is_itself():
 
 def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_there():
     here = at(0.0)
-    seen, depth = wall(20.0, here), wall(20.0, here)
+    seen = wall(20.0, here)
+    depth = wall(20.0, here)
     seen[:, 20:40] = 5.0  # a post hid the wall when the frame was recorded
     out = warp(picture(here, seen), WarpTarget(K, here, depth, {}, {}))
     assert (out[:, 20:40, 3] == INCONSISTENT).all()
@@ -97,10 +99,12 @@ def test_nothing_but_the_rotation_moves_the_sky():
 
 
 def test_the_pinholes_of_a_lens_show_together_what_one_of_them_does_not():
-    here, depth = at(0.0), np.zeros((HEIGHT, WIDTH), np.float32)
+    here = at(0.0)
+    depth = np.zeros((HEIGHT, WIDTH), np.float32)
     left, right = (picture(at(0.0, 0.0, yaw), depth) for yaw in (0.6, -0.6))
     view = WarpTarget(K, here, depth, {}, {})
-    alone, other = warp(left, view), warp(right, view)
+    alone = warp(left, view)
+    other = warp(right, view)
     whole = warp(replace(left, others=(right,)), view)
     shown = alone[..., 3:] > 0
     assert 0.2 < shown.mean() < 0.8
@@ -116,7 +120,8 @@ def test_a_car_is_looked_up_where_it_was():
     then = se2(14.0, 3.0, 0.0, 0.75)
     here = at(0.0)
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
-    rows, car = slice(16, 19), slice(30, 34)
+    rows = slice(16, 19)
+    car = slice(30, 34)
     depth[rows, car] = 18.0  # its rear
     before = np.zeros((HEIGHT, WIDTH), np.float32)
     before[:, :] = 12.0
@@ -243,7 +248,8 @@ def test_without_memory_the_same_view_has_the_same_references_whatever_came_befo
 def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
     found, _ = session(hysteresis=False)
     asked, frame = request(10.0, 500_000)
-    start, share = at(9.5, 0.0, 0.02), rolling(WIDTH, HEIGHT, "rows", backwards=False)
+    start = at(9.5, 0.0, 0.02)
+    share = rolling(WIDTH, HEIGHT, "rows", backwards=False)
     rolled = replace(
         asked,
         T_world_camera=np.stack([start, asked.T_world_camera[1]]),
@@ -263,7 +269,8 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
 
 
 def test_a_wall_seen_from_nearer_is_larger():
-    far, near = at(0.0), at(10.0)
+    far = at(0.0)
+    near = at(10.0)
     out = warp(
         picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {})
     )

@@ -35,10 +35,8 @@ def trust_cells(text):
 )
 def test_cells_are_the_means_of_their_pixels(height, width):
     rng = np.random.default_rng(height)
-    render, recorded = (
-        rng.uniform(-1, 1, (height, width, 3)).astype(np.float32),
-        rng.random((height, width), np.float32),
-    )
+    render = rng.uniform(-1, 1, (height, width, 3)).astype(np.float32)
+    recorded = rng.random((height, width), np.float32)
     output = render + rng.uniform(-0.4, 0.4, render.shape).astype(np.float32)
     found = trust(output, render, recorded)
     guessed = np.minimum(np.abs(output - render).mean(axis=2) / MADE_UP, 1) * (1 - recorded)
@@ -58,7 +56,8 @@ def test_cells_are_the_means_of_their_pixels(height, width):
 
 
 def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed():
-    grey, zero = np.zeros((32, 48, 3), np.float32), np.zeros((32, 48), np.float32)
+    grey = np.zeros((32, 48, 3), np.float32)
+    zero = np.zeros((32, 48), np.float32)
     assert trust(grey, grey, zero) == {
         RECORDED_SHARE: 0,
         GUESSED_SHARE: 0,

@@ -14,7 +14,8 @@ def driving_like_scene(n, seed=0):
     Sizes scale with n^-1/2, so that the covered share of an image does not depend on n.
     """
     rng = stream("raster-bench", seed, "scene")
-    is_road, is_far = rng.random(n) < 0.4, np.arange(n) % 20 == 0
+    is_road = rng.random(n) < 0.4
+    is_far = np.arange(n) % 20 == 0
     ahead = -8.0 + 140 * rng.uniform(0, 1, n) ** 1.5  # denser near the camera
     across = np.where(is_road, rng.uniform(-9, 9, n), rng.choice([-12.0, 12.0], n))
     means = np.stack([ahead, across, np.where(is_road, 0, rng.uniform(0, 14, n))], axis=1)

@@ -59,9 +59,11 @@ def road_lanes(
     out = {}
     for way, sign in (("a", -1.0), ("b", 1.0)):
         for i in range(lanes_each_way):
-            inner, outer = offset(axis, sign * i * LANE_M), offset(axis, sign * (i + 1) * LANE_M)
+            inner = offset(axis, sign * i * LANE_M)
+            outer = offset(axis, sign * (i + 1) * LANE_M)
             if way == "b":
-                inner, outer = inner[::-1].copy(), outer[::-1].copy()
+                inner = inner[::-1].copy()
+                outer = outer[::-1].copy()
             lane_id = f"{name}-{way}{i}"
             out[lane_id] = Lane(
                 lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection
@@ -110,7 +112,8 @@ def make_scenario(
 
 def line(start, end, step_m=2.0):
     """A straight polyline on level ground."""
-    a, b = np.array(start), np.array(end)
+    a = np.array(start)
+    b = np.array(end)
     n = max(2, int(np.linalg.norm(b - a) / step_m) + 1)
     xy = a + np.linspace(0, 1, n)[:, None] * (b - a)
     return np.column_stack([xy, np.zeros(n)])

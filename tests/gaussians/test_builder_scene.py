@@ -119,7 +119,8 @@ def test_lines_and_lamps_are_sharper_where_a_camera_has_more_pixels_per_radian(s
 
 def test_a_camera_sees_the_same_whatever_sharper_cameras_its_rig_has(street):
     scenario, usual = street
-    wide, tele = camera_spec(1280, 720), camera_spec(5120, 2880)
+    wide = camera_spec(1280, 720)
+    tele = camera_spec(5120, 2880)
     alone, rig = (built(replace(scenario, cameras=some)) for some in ((wide,), (wide, tele)))
     actors = {name: log_actors(scenario, scenario.start_us)[name] for name in usual.actors}
     for size, graph in (((320, 180), usual), ((1280, 720), alone)):
@@ -179,7 +180,8 @@ def test_actor_fills_its_box_and_stays_inside(street):
     for actor in STREET_ACTORS:
         cloud = street[1].actors[actor.actor_id].levels[0].cloud
         half = np.array([actor.box.length_m, actor.box.width_m, actor.box.height_m]) / 2
-        low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+        low = cloud.means.min(axis=0)
+        high = cloud.means.max(axis=0)
         assert np.all(low > -half - np.array([0.1, 0.15, 0.05]))
         assert np.all(high < half + np.array([0.1, 0.15, 0.05]))
         assert high[2] - low[2] > 1.4 * half[2]

@@ -71,7 +71,8 @@ def test_shapes_that_disagree_are_an_error(field):
 
 
 def test_moving_turns_covariances_and_leaves_scales_alone():
-    cloud, T = random_cloud(30), random_rigid(6)
+    cloud = random_cloud(30)
+    T = random_rigid(6)
     moved = cloud.transformed(T)
     R = T[:3, :3]
     assert np.abs(covariances(moved) - R @ covariances(cloud) @ R.T).max() < 1e-12
@@ -126,7 +127,8 @@ def test_one_transform_is_rigid_where_many_are(entry, by):
     else:
         with pytest.raises(InputError):
             require_rigid(T, "testing")
-    mirrored, far = random_rigid(7), random_rigid(7)
+    mirrored = random_rigid(7)
+    far = random_rigid(7)
     mirrored[:3, 0] *= -1
     far[0, 3] = np.inf
     assert not all_rigid(mirrored[None])

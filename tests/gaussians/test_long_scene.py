@@ -41,8 +41,10 @@ def in_sections(monkeypatch):
 
 
 def test_a_section_is_the_same_wherever_the_camera_was_before(in_sections):
-    first, last = view(in_sections, 0), view(in_sections, -1)
-    there_and_back, fresh = built(in_sections), built(in_sections)
+    first = view(in_sections, 0)
+    last = view(in_sections, -1)
+    there_and_back = built(in_sections)
+    fresh = built(in_sections)
     there_and_back.render(first, {}, 1)
     names = {node.name for node in there_and_back.background}
     there_and_back.render(last, {}, 1)

@@ -47,13 +47,12 @@ def as_stored(arrays):
 
 
 def test_both_bikers_have_the_published_facts(biker):
-    ply, spz = (
-        read_compressed_ply(biker / "biker.compressed.ply"),
-        as_stored(read_spz(biker / "biker.spz")),
-    )
+    ply = read_compressed_ply(biker / "biker.compressed.ply")
+    spz = as_stored(read_spz(biker / "biker.spz"))
     assert len(ply.means) == len(spz.means) == 152746
     assert read_ply_header(biker / "biker.compressed.ply").element("chunk").count == 597
-    low, high = (-0.62126, -3.18008, -0.53226), (0.41440, 0.0, 0.61328)
+    low = (-0.62126, -3.18008, -0.53226)
+    high = (0.41440, 0.0, 0.61328)
     assert_allclose(ply.means.min(axis=0), low, atol=6e-6)
     assert_allclose(ply.means.max(axis=0), high, atol=6e-6)
     assert f"{ply.opacities.mean():.10f}" == f"{spz.opacities.mean():.10f}" == "0.2966253344"

@@ -153,7 +153,8 @@ def test_big_endian_doubles_are_read(tmp_path):
 
 @pytest.fixture
 def street(tmp_path):
-    background, actor = np.zeros((3, len(NAMES))), np.zeros((2, len(NAMES)))
+    background = np.zeros((3, len(NAMES)))
+    actor = np.zeros((2, len(NAMES)))
     background[:, NAMES.index("rot_0")] = actor[:, NAMES.index("rot_0")] = 1
     actor[:, 0] = 5
     return write_elements(

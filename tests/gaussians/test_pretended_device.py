@@ -43,7 +43,8 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
 from alpasim_plugin.gaussians.raster.triton_kernels import BOX, RECORD
 from tests.pretended_device import pretended_device, traffic
 
-HEIGHT, WIDTH = 64, 96
+HEIGHT = 64
+WIDTH = 96
 
 
 def camera_size():
@@ -139,7 +140,8 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         )
 
     def fixed(device):
-        fixer, runner = make_fixer("onefixer", scene_id="scene", device=device), made(device)
+        fixer = make_fixer("onefixer", scene_id="scene", device=device)
+        runner = made(device)
         for t_us in (0, request.t_us):
             traffic.reset()
             if device != "cpu":
@@ -167,7 +169,8 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         assert len(served.render(request, True).pending.references) == 2
         assert not traffic.waits
         assert np.abs(found.alpha - wanted.alpha).max() <= LSB
-        launches, traffic.computes = [], False
+        launches = []
+        traffic.computes = False
         for count in (1, 6):
             cameras = [replace(view, name=f"camera {i}") for i in range(count)]
             traffic.reset()

@@ -137,7 +137,8 @@ def test_gradient_equals_finite_differences_of_the_reference(make):
 
 
 def test_image_equals_the_reference_without_its_clamp():
-    cloud, cam = random_cloud(300, 21), camera()
+    cloud = random_cloud(300, 21)
+    cam = camera()
     cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh * 3)
     splats = Splats.from_cloud(cloud)
     out = rasterize_gradient(splats, cam, background=torch.tensor([0.3, 0.2, 0.1]))
@@ -181,7 +182,8 @@ def test_gradient_on_the_screen_is_that_of_the_projected_mean():
 
 @pytest.mark.parametrize("threads", [2, 5])
 def test_image_and_gradients_do_not_depend_on_threads(threads):
-    cloud, cam = driving_like_scene(9000), driving_camera(120, 70)
+    cloud = driving_like_scene(9000)
+    cam = driving_camera(120, 70)
     runs = []
     for count in (1, threads):
         splats = Splats.from_cloud(cloud)

@@ -256,7 +256,8 @@ def test_colours_above_one_are_clamped_after_compositing(backend):
 @pytest.mark.parametrize("antialias_px2", [MIP_PX2, EPS2D_PX2])
 @pytest.mark.parametrize("name", HARD)
 def test_a_model_of_antialiasing_matches_float64(name, antialias_px2):
-    cloud, behind = replace(HARD[name], antialias_px2=antialias_px2), (0.2, 0.3, 0.4)
+    cloud = replace(HARD[name], antialias_px2=antialias_px2)
+    behind = (0.2, 0.3, 0.4)
     wanted = rasterize_reference(cloud, camera(), behind, brute=True)
     assert_same_image(rasterize(cloud, camera(), behind), wanted, LSB)
 

@@ -33,7 +33,8 @@ def small_object(seed, n=150):
 
 def test_nodes_at_poses_equal_one_cloud_moved_there():
     background = random_cloud(200, 1)
-    nodes, clouds = [(prepare(background), None)], [background]
+    nodes = [(prepare(background), None)]
+    clouds = [background]
     for seed in range(4):
         T = random_rigid(seed, 1.5)
         T[2, 3] += 5.0
@@ -49,10 +50,8 @@ def test_nodes_at_poses_equal_one_cloud_moved_there():
 
 
 def test_equal_depths_are_drawn_in_node_order():
-    red, green = (
-        prepare(splats([0, 0, 4.0], 3.0, 0.9, (1, 0, 0))),
-        prepare(splats([0, 0, 4.0], 3.0, 0.9, (0, 1, 0))),
-    )
+    red = prepare(splats([0, 0, 4.0], 3.0, 0.9, (1, 0, 0)))
+    green = prepare(splats([0, 0, 4.0], 3.0, 0.9, (0, 1, 0)))
     first = rasterize_prepared([(red, None), (green, np.eye(4))], camera()).rgb[32, 48]
     second = rasterize_prepared([(green, np.eye(4)), (red, None)], camera()).rgb[32, 48]
     assert first == pytest.approx([0.9, 0.09, 0], abs=2e-3)
@@ -80,7 +79,8 @@ def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copie
     nodes = []
     clouds = []
     for i in range(90):
-        n, degree = int(rng.choice([0, 1, 17, 40, 300])), int(rng.integers(0, 4))
+        n = int(rng.choice([0, 1, 17, 40, 300]))
+        degree = int(rng.integers(0, 4))
         cloud = small_object(i, n) if n else GaussianCloud.empty()
         cloud = GaussianCloud(
             cloud.means,
@@ -135,7 +135,8 @@ def test_a_pose_that_is_not_rigid_is_an_error(fault):
 
 @pytest.mark.parametrize("n", [2_000, 30_000])
 def test_any_number_of_threads_gives_the_same_bits(n):
-    scene, cam = prepare(driving_like_scene(n)), driving_camera(200, 120)
+    scene = prepare(driving_like_scene(n))
+    cam = driving_camera(200, 120)
     one = rasterize_prepared([(scene, None)], cam, threads=1)
     for threads in (2, 3, 7):
         for _ in range(3):
@@ -146,12 +147,14 @@ def test_any_number_of_threads_gives_the_same_bits(n):
 
 
 def _render_in_child(queue):
-    scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
+    scene = prepare(driving_like_scene(9_000))
+    cam = driving_camera(64, 36)
     queue.put(float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum()))
 
 
 def test_a_forked_process_renders_after_its_parent_used_threads():
-    scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
+    scene = prepare(driving_like_scene(9_000))
+    cam = driving_camera(64, 36)
     want = float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum())
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
@@ -184,7 +187,8 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
     """Same arithmetic with all culling switched off: what the tiles and blocks skip is exactly what
     the alpha cut would skip.
     """
-    scene, cam = prepare(driving_like_scene(2500, seed=3)), driving_camera(90, 50)
+    scene = prepare(driving_like_scene(2500, seed=3))
+    cam = driving_camera(90, 50)
     tiled = rasterize_prepared([(scene, None)], cam, threads=1)
     seen = {}
 

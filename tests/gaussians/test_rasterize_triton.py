@@ -72,7 +72,8 @@ LONG |= {(name, MIP_PX2) for name in HARD} - {
     ],
 )
 def test_every_pixel_of_a_hard_case_is_within_one_grey_level(name, antialias_px2):
-    cloud, behind = replace(HARD[name], antialias_px2=antialias_px2), (0.2, 0.3, 0.4)
+    cloud = replace(HARD[name], antialias_px2=antialias_px2)
+    behind = (0.2, 0.3, 0.4)
     found = interpreted(cloud, camera(), behind)
     wanted = rasterize_reference(cloud, camera(), behind, brute=True)
     assert_same_image(found, wanted, LSB)
@@ -88,10 +89,12 @@ def test_a_wall_at_the_near_plane_is_drawn_beyond_it_only():
 
 
 def test_coordinates_of_utm_size_cost_no_precision():
-    cloud, offset = random_cloud(20, 8), np.array([691_600.0, 5_334_760.0, 520.0])
+    cloud = random_cloud(20, 8)
+    offset = np.array([691_600.0, 5_334_760.0, 520.0])
     T = np.eye(4)
     T[:3, 3] = -offset
-    far, near = camera(48, 32, 40.0, T), camera(48, 32, 40.0)
+    far = camera(48, 32, 40.0, T)
+    near = camera(48, 32, 40.0)
     assert_same_image(interpreted(moved(cloud, offset), far), interpreted(cloud, near), LSB)
 
 

@@ -39,7 +39,8 @@ def blobs(centre, n=40, seed=0, sheen=False):
     sh[:, 0] = dc_from_rgb(rng.random((n, 3)))
     if sheen:
         sh[:, 1:] = rng.normal(0, 0.3, (n, 3, 3))
-    means, quats = np.array(centre) + rng.normal(0, 0.8, (n, 3)), rng.normal(size=(n, 4))
+    means = np.array(centre) + rng.normal(0, 0.8, (n, 3))
+    quats = rng.normal(size=(n, 4))
     return GaussianCloud(means, quats, 0.3 * rng.random((n, 3)), np.full(n, 0.8), sh)
 
 
@@ -78,8 +79,10 @@ def test_camera_and_actor_turned_together_see_the_same_image():
 
 
 def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image():
-    ahead, behind = node("ahead", blobs((10, 0, 1))), node("behind", blobs((-30, 0, 1), seed=3))
-    both, one = SceneGraph([ahead, behind], [], SKY), SceneGraph([ahead], [], SKY)
+    ahead = node("ahead", blobs((10, 0, 1)))
+    behind = node("behind", blobs((-30, 0, 1), seed=3))
+    both = SceneGraph([ahead, behind], [], SKY)
+    one = SceneGraph([ahead], [], SKY)
     assert_array_equal(both.render(camera(), {}).rgb, one.render(camera(), {}).rgb)
     assert [chosen.node for chosen in both._choose(camera(), {}, 0)] == [ahead]
 
@@ -140,7 +143,8 @@ def test_splitting_by_tile_loses_nothing():
 
 
 def test_same_sky_seen_while_turning_moves_across_the_image():
-    a, b = SKY.image(camera(256, 96)), SKY.image(camera(256, 96, se2(0, 0, 0.2)))
+    a = SKY.image(camera(256, 96))
+    b = SKY.image(camera(256, 96, se2(0, 0, 0.2)))
     assert np.abs(a - b).max() > 0.02  # clouds and hills moved
     assert_array_equal(
         SKY.image(camera(256, 96, se2(50, 9, 0.2))), b

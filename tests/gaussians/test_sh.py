@@ -25,7 +25,8 @@ def directions(n=200, seed=0):
 
 def test_basis_equals_real_harmonics_of_scipy_with_the_3dgs_signs():
     d = directions()
-    theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    theta = np.arccos(d[:, 2])
+    phi = np.arctan2(d[:, 1], d[:, 0])
     basis = sh_basis(d)
     for degree in range(4):
         for m in range(-degree, degree + 1):
@@ -47,7 +48,8 @@ def test_rotated_coefficients_show_the_colour_of_the_turned_back_direction(seed,
     R = random_rigid(seed)[:3, :3]
     sh = np.random.default_rng(seed).normal(size=(5, size, 3))
     d = directions(60, seed)
-    turned, original = rotate_sh(sh, R), sh
+    turned = rotate_sh(sh, R)
+    original = sh
     for i in range(5):
         seen = sh_basis(d, size) @ turned[i]
         assert np.abs(seen - sh_basis(d @ R, size) @ original[i]).max() < 1e-12
@@ -55,7 +57,8 @@ def test_rotated_coefficients_show_the_colour_of_the_turned_back_direction(seed,
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rotation_matrices_are_orthogonal_and_compose(degree):
-    A, B = random_rigid(1)[:3, :3], random_rigid(2)[:3, :3]
+    A = random_rigid(1)[:3, :3]
+    B = random_rigid(2)[:3, :3]
     a, b, ab = (sh_rotation(R, degree) for R in (A, B, A @ B))
     assert np.abs(a @ a.T - np.eye(2 * degree + 1)).max() < 1e-12
     assert np.abs(a @ b - ab).max() < 1e-12

@@ -43,7 +43,8 @@ def test_turning_left_moves_the_skyline_to_the_right():
 
 
 def test_nearest_view_that_looks_the_same_way_is_taken():
-    clear, hidden = np.zeros((18, 32), np.float32), np.ones((18, 32), np.float32)
+    clear = np.zeros((18, 32), np.float32)
+    hidden = np.ones((18, 32), np.float32)
     mask = SkyMask(
         [view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)]
     )
@@ -52,7 +53,8 @@ def test_nearest_view_that_looks_the_same_way_is_taken():
 
 
 def test_directions_between_corners_are_those_at_the_middles_of_pixels():
-    height, width = 2 * STEP_PX + 3, 3 * STEP_PX + 5
+    height = 2 * STEP_PX + 3
+    width = 3 * STEP_PX + 5
     grid = np.random.default_rng(0).uniform(-1e3, 1e3, (4, 5))
     rows, columns = np.indices((height, width), dtype=np.float32)
     plain = cv2.remap(

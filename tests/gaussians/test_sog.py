@@ -13,7 +13,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.files import read_gaussians
 
-N, SIDE = 90, 10
+N = 90
+SIDE = 10
 
 
 def write_sog(folder):
@@ -27,9 +28,11 @@ def write_sog(folder):
     scales, colours, alphas = (
         rng.integers(0, 256, shape).astype(np.uint8) for shape in ((N, 3), (N, 3), N)
     )
-    bands, palette = rng.integers(0, 256, (64, 3, 3)).astype(np.uint8), rng.integers(0, 64, N)
+    bands = rng.integers(0, 256, (64, 3, 3)).astype(np.uint8)
+    palette = rng.integers(0, 64, N)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
+    low = logs.min(axis=0)
+    high = logs.max(axis=0)
     sixteen = np.rint((logs - low) / (high - low) * 65535).astype(np.int64)
     turned = np.zeros((N, 4), np.uint8)
     for i, q in enumerate(quats):

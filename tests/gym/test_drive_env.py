@@ -127,7 +127,8 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run():
 def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_episode():
     env = DriveEnv("smoke/curve", camera="")
     _, first = env.reset(seed=0)
-    facts, total = [first], 0.0
+    facts = [first]
+    total = 0.0
     while True:
         _, worth, terminated, truncated, info = env.step(STRAIGHT_ON)
         facts.append(info)
@@ -144,7 +145,8 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
             [one[name] for one in facts], found[name].value[at], atol=1e-5
         )  # poses in the log are float32
     assert np.flatnonzero(found["offroad"].value).tolist() == [len(log.ego.t_us) - 1]
-    lateral, share = found["lateral_distance_m"].value[at], found["progress"].value[at]
+    lateral = found["lateral_distance_m"].value[at]
+    share = found["progress"].value[at]
     wanted = (
         0.1 * (share[-1] - share[0]) * found["gt_dist_traveled_m"].value[0]
         - 0.5 * 0.1 * lateral[1:].sum()

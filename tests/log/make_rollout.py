@@ -99,7 +99,8 @@ def write_rollout(path, encoding="png"):
             HEADER.render_start_us, ego_at(1).T_world_rig, present(HEADER.render_start_us)
         )
         for step in range(1, 5):
-            state, following = ego_at(step), ego_at(step + 1)
+            state = ego_at(step)
+            following = ego_at(step + 1)
             _frame(log, state, encoding)
             log.ego_trajectory([ego_at(0), state] if step == 1 else [state])
             log.route(

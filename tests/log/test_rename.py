@@ -26,8 +26,10 @@ def test_alpasims_own_logs_are_copied_byte_by_byte(logs, tmp_path):
 
 
 def test_a_renamed_log_differs_in_its_names_alone(logs, tmp_path):
-    source, target = logs[0], tmp_path / "copy.asl"
-    old, camera = source.parent.name, "camera_front_wide_120fov"
+    source = logs[0]
+    target = tmp_path / "copy.asl"
+    old = source.parent.name
+    camera = "camera_front_wide_120fov"
     new = session_uuid(7, "x")
     copy_log(source, target, new, cameras={camera: "other_camera_of_24_bytes"})
     assert old.encode() not in target.read_bytes()

@@ -69,7 +69,8 @@ def test_times_and_sizes_are_exact(log):
 
 
 def test_ego_in_the_log_is_the_box_centre(log):
-    yaw, offset = 0.3, HEADER.vehicle.rear_axle_to_centre_m
+    yaw = 0.3
+    offset = HEADER.vehicle.rear_axle_to_centre_m
     rig = HEADER.ego_log.xyz[:6]
     expected = rig + np.array(
         [offset * np.cos(yaw), offset * np.sin(yaw), HEADER.vehicle.box.height_m / 2]

@@ -92,7 +92,8 @@ def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
     assert "`rollout`" in page
     # Names of one kind stand together, followed by the kind in brackets.
     words = re.findall(r"`(\w+)`|\((text|integer|number|boolean)\)", line)
-    kinds, waiting = {}, []
+    kinds = {}
+    waiting = []
     for name, kind in words:
         if name:
             waiting.append(name)

@@ -54,7 +54,8 @@ def test_shifted_picture_shifts_the_plan_although_everything_else_is_the_same():
 
 def test_mirrored_picture_mirrors_what_is_seen():
     picture = ROAD.image(CAMERA, ROAD.pose(0.0, 0.5), seed=3)
-    seen, mirrored = look(policy(), picture), look(policy(), picture[:, ::-1].copy())
+    seen = look(policy(), picture)
+    mirrored = look(policy(), picture[:, ::-1].copy())
     assert seen.debug["lane_offset_m"] == pytest.approx(-mirrored.debug["lane_offset_m"], abs=0.03)
     assert seen.debug["lane_width_m"] == pytest.approx(mirrored.debug["lane_width_m"], abs=0.05)
 
@@ -81,7 +82,8 @@ def test_paint_outweighs_a_route_that_lies_beside_the_lane():
 def test_lane_is_remembered_over_frames_without_paint():
     one = policy()
     one.reset(0, Route(np.zeros((2, 3))))
-    modes, sure = [], 0.0
+    modes = []
+    sure = 0.0
     for k in range(30):
         pose = ROAD.pose(k * 0.8, 0.4)
         picture = (
@@ -159,7 +161,8 @@ def test_frame_that_is_late_is_read_for_where_the_car_was_then():
     one.reset(0, Route(np.zeros((2, 3))))
     curve = PaintedRoad(curvature_1pm=1 / 50)
     for k in range(8):
-        pose, then = curve.pose(k * 0.8 + 4.0), curve.pose((k - 3) * 0.8 + 4.0)
+        pose = curve.pose(k * 0.8 + 4.0)
+        then = curve.pose((k - 3) * 0.8 + 4.0)
         times = np.arange(-300_000, 1, 100_000) + 1_000_000 + k * 100_000
         poses = np.array([curve.pose(k * 0.8 + 4.0 - 0.8 * j) for j in (3, 2, 1, 0)])
         history = trajectory_from_poses(times, poses)

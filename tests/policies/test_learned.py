@@ -64,10 +64,8 @@ def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera():
 
 
 def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view():
-    road, pose = (
-        PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0)),
-        ROAD.pose(0.0, 0.4),
-    )
+    road = PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0))
+    pose = ROAD.pose(0.0, 0.4)
     views = []
     sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
     for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
@@ -304,7 +302,8 @@ def test_a_policy_of_a_device_fetches_no_image_and_drives_as_on_the_host(monkeyp
     scenario = load_scenario(
         "smoke/curve", 0, ["timing.duration_us=500000", "timing.warmup_us=100000"]
     )
-    egos, down = [], []
+    egos = []
+    down = []
     with pretended.pretended_device(monkeypatch, computes=False) as traffic:
         for device in (True, False):
             policy = Learned(scenario)

@@ -39,7 +39,8 @@ def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera):
     for row in (0, len(grid.x_m) // 2, len(grid.x_m) - 1):
         for column in (0, 160, 319):
             x, y, z = (T @ [grid.x_m[row], grid.y_m[column], 0.0, 1.0])[:3]
-            u, v = K[0, 0] * x / z + K[0, 2] - 0.5, K[1, 1] * y / z + K[1, 2] - 0.5
+            u = K[0, 0] * x / z + K[0, 2] - 0.5
+            v = K[1, 1] * y / z + K[1, 2] - 0.5
             assert grid.map_u[row, column] == pytest.approx(u, abs=1e-2)
             assert grid.map_v[row, column] == pytest.approx(v, abs=1e-2)
 
@@ -125,7 +126,8 @@ def test_lane_is_recovered_from_its_paint(offset, heading, curvature, width):
 def test_prediction_sees_the_lane_that_a_moved_ego_would_see():
     """The same curve, drawn from a pose further along it."""
     road = PaintedRoad(curvature_1pm=1 / 80)
-    before, after = road.pose(0.0, -0.3), road.pose(3.0, 0.1, 0.05)
+    before = road.pose(0.0, -0.3)
+    after = road.pose(3.0, 0.1, 0.05)
     step = inverse(before) @ after
     lane = predict(
         start(0.3, 0.0, 1 / 80),

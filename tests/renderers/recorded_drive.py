@@ -17,7 +17,8 @@ from tests.gaussians.scene_maps import parked, straight, with_camera
 
 SKY_LEVEL = 200
 EXPOSURE = 1.2  # of the fitted photographs
-WIDE, HIGH = 64, 48
+WIDE = 64
+HIGH = 48
 
 
 def recorded_drive(folder, count=9, long_m=60.0):
@@ -29,7 +30,8 @@ def recorded_drive(folder, count=9, long_m=60.0):
         for axis in np.meshgrid(np.arange(-5.0, long_m, 0.5), np.arange(-10.0, 10.0, 0.5))
     )
     n = len(x)
-    means, flat = np.column_stack([x, y, np.zeros(n)]), np.tile([0.3, 0.3, 0.02], (n, 1))
+    means = np.column_stack([x, y, np.zeros(n)])
+    flat = np.tile([0.3, 0.3, 0.02], (n, 1))
     colours = dc_from_rgb(np.full((n, 3), 0.4))[:, None, :]
     cloud = GaussianCloud(means, np.tile([1.0, 0, 0, 0], (n, 1)), flat, np.full(n, 0.99), colours)
     model = Reconstruction(cloud, {}, Sky(np.full((HEIGHT, WIDTH, 3), SKY_LEVEL / 255, np.float32)))
@@ -44,7 +46,8 @@ def recorded_drive(folder, count=9, long_m=60.0):
 
 
 def _photograph(scenario, folder, camera, i, aside_m):
-    spec, t_us = scenario.cameras[0], int(scenario.ego_log.t_us[0]) + 200_000 * i
+    spec = scenario.cameras[0]
+    t_us = int(scenario.ego_log.t_us[0]) + 200_000 * i
     shift = np.eye(4)
     shift[1, 3] = aside_m
     picture = np.full(

@@ -59,7 +59,8 @@ def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(
 ):
     views = requests(scenario, LATE_FRAMES + 3)
     clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
-    frozen, late = make_renderer("broken-frozen", scenario), make_renderer("broken-late", scenario)
+    frozen = make_renderer("broken-frozen", scenario)
+    late = make_renderer("broken-late", scenario)
     for i, r in enumerate(views):
         assert_array_equal(frozen.render(r).rgb, clean[0])
         assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])

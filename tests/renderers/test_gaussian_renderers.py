@@ -78,13 +78,12 @@ def test_depth_of_the_road_is_that_of_the_plane(scenario):
 
 
 def test_same_request_gives_the_same_frame_whatever_came_before(scenario):
-    a, b = make_renderer("clean", scenario, seed=3), make_renderer("clean", scenario, seed=3)
+    a = make_renderer("clean", scenario, seed=3)
+    b = make_renderer("clean", scenario, seed=3)
     for i in (30, 5, 17):
         a.render(request(scenario, i, 1.7))
-    first, second = (
-        a.render(request(scenario, left_m=0.9)),
-        b.render(request(scenario, left_m=0.9)),
-    )
+    first = a.render(request(scenario, left_m=0.9))
+    second = b.render(request(scenario, left_m=0.9))
     assert_array_equal(first.rgb, second.rgb)
     assert_array_equal(first.alpha, second.alpha)
 
@@ -92,7 +91,8 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario):
 def test_actor_hides_the_road_where_it_stands(scenario):
     renderer = make_renderer("clean", scenario)
     r = request(scenario)
-    with_car, without = renderer.render(r), renderer.render(replace(r, actors={}))
+    with_car = renderer.render(r)
+    without = renderer.render(replace(r, actors={}))
     changed = np.any(with_car.rgb != without.rgb, axis=2)
     assert 100 < changed.sum() < 0.3 * changed.size
     assert with_car.depth[changed].mean() < without.depth[changed].mean()

@@ -25,7 +25,8 @@ def drive(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frame(drive):
-    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
+    camera = drive.cameras[0]
+    t_us = int(drive.ego_log.t_us[0]) + 400_000
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     return make_renderer("3dgs", drive, threads=1).render(
         RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us))
@@ -48,7 +49,8 @@ def test_the_sky_is_opaque_and_has_no_depth(frame):
 
 def test_fog_hides_the_sky_of_an_imported_drive(drive):
     foggy = replace(drive, environment=replace(drive.environment, fog_visibility_m=50.0))
-    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
+    camera = drive.cameras[0]
+    t_us = int(drive.ego_log.t_us[0]) + 400_000
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     request = RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us))
     shown = make_renderer("3dgs", foggy, threads=1).render(request)
@@ -56,7 +58,8 @@ def test_fog_hides_the_sky_of_an_imported_drive(drive):
 
 
 def test_a_hole_below_the_horizon_stays_a_hole(drive):
-    camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0])
+    camera = drive.cameras[0]
+    t_us = int(drive.ego_log.t_us[0])
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     T[:3, 3] += [0.0, 200.0, 0.0]  # far beside the road, where there is nothing
     shown = make_renderer("3dgs", drive, threads=1).render(
@@ -100,7 +103,8 @@ def test_a_missing_photograph_is_named(drive, tmp_path):
 
 
 def test_exposure_follows_the_place_and_the_camera(drive):
-    one, other = drive.recording[0], drive.recording[8]
+    one = drive.recording[0]
+    other = drive.recording[8]
     recording = (replace(one, exposure=(1.0, 1.0, 1.0)), replace(other, exposure=(2.0, 1.0, 0.5)))
     assert np.allclose(exposure_near(recording, "front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)
     assert np.allclose(

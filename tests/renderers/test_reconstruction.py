@@ -131,7 +131,8 @@ def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(
 
 def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted, monkeypatch):
     monkeypatch.setattr(recorded, "KEPT_BYTES", 2 * 64 * 36 * recorded.BYTES_PER_PX)
-    scene, model = scene_of(fitted.scenario), fitted.model.graph.render
+    scene = scene_of(fitted.scenario)
+    model = fitted.model.graph.render
     first, second, third = recorded.built_recording(
         fitted.scenario, scene, model, recipe_of(fitted.scenario)
     )[:3]
@@ -181,7 +182,8 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
 
 def test_a_model_is_fitted_where_its_renderer_draws_and_kept_apart(cache, monkeypatch):
     del cache
-    scenario, places = street(replace(FITTED, share=0.06)), []
+    scenario = street(replace(FITTED, share=0.06))
+    places = []
 
     def fit_on(*views, device, **options):
         places.append(device)
@@ -208,7 +210,8 @@ def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cac
 def test_a_sharp_camera_is_fitted_with_more_steps_and_points_of_larger_views():
     scenario = street()
     sharp = replace(scenario, cameras=(camera_spec(1280, 720),))
-    usual, fine = recipe_of(scenario).splat, recipe_of(sharp).splat
+    usual = recipe_of(scenario).splat
+    fine = recipe_of(sharp).splat
     assert (fine.steps, fine.points) == (4 * usual.steps, 2 * usual.points)
     assert fine.width == 2 * usual.width
     assert len(sharp.cameras) == len(scenario.cameras)
@@ -252,7 +255,8 @@ def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path):
 
 
 def test_longer_logs_and_more_cameras_get_more_views_points_and_steps():
-    short, scenario = recipe_of(street()).splat, straight(degradation=FITTED)
+    short = recipe_of(street()).splat
+    scenario = straight(degradation=FITTED)
     log = scenario.ego_log
     minutes = replace(scenario, ego_log=replace(log, t_us=log.t_us * 40))
     long, two, six = (
@@ -297,7 +301,8 @@ def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(cach
 def test_every_camera_gives_points_to_start_from(cache):
     del cache
     damaged = replace(FITTED, share=1e-9, depth_error=0.0)
-    ahead, behind = turned_aside("front", 0.0), turned_aside("rear", np.pi)
+    ahead = turned_aside("front", 0.0)
+    behind = turned_aside("rear", np.pi)
     scenario = replace(street(damaged), cameras=(behind, ahead), actors=())
     model, _ = ensure(scenario, recipe_of(scenario), 1)
     first, last = scenario.ego_log.xyz[[0, -1], 0]
@@ -333,7 +338,8 @@ def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none()
 def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(
     fitted,
 ):
-    on_path, beside = error_db(fitted, 0.0), error_db(fitted, 3.0)
+    on_path = error_db(fitted, 0.0)
+    beside = error_db(fitted, 3.0)
     assert on_path > 19
     assert on_path > beside + 1
 

@@ -60,7 +60,8 @@ def draw(scenario):
 
 def case(scenario, speed_mps=0.0, turn_rad_s=0.0, car_mps=0.0):
     """A frame of a moving rig beside a car that drives along x."""
-    spec, start = scenario.cameras[0], STANDS
+    spec = scenario.cameras[0]
+    start = STANDS
     end = STANDS @ se2(speed_mps * SHUTTER_S, 0.0, turn_rad_s * SHUTTER_S)
     car = [se2(27.0 + car_mps * t, 1.8, 0.0, 0.75) for t in (-SHUTTER_S, 0.0)]
     exposure = Exposure(rolling(spec.width, spec.height, "rows", backwards=False), {"car": car[0]})
@@ -106,7 +107,8 @@ def test_a_rolling_frame_is_that_of_its_rows_where_the_end_pose_is_far_off(
     device,
 ):
     request = case(scenario, **HARD[name])
-    truth, rolled = truth_of(name), draw_requests([request], draw, device)[0]
+    truth = truth_of(name)
+    rolled = draw_requests([request], draw, device)[0]
     (at_end,) = draw_requests([replace(request, exposure=None)], draw, device)
     assert psnr(rolled, truth) > 34
     assert psnr(rolled, truth) > psnr(at_end, truth) + 8
@@ -134,7 +136,8 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
     monkeypatch,
 ):
     request = case(scenario, **HARD["all"])
-    truth, errors = truth_of("all"), []
+    truth = truth_of("all")
+    errors = []
     for count in (1, 4, 16, request.camera.height):
         monkeypatch.setattr(
             "alpasim_plugin.renderers.rolling.bands",
@@ -157,7 +160,8 @@ def test_a_window_shows_what_the_whole_picture_does(scenario, draw):
     """Splats that reach into a window from far outside of it keep their shape."""
     spec = scenario.cameras[0]
     camera = PinholeCamera.from_pose(spec.width, spec.height, spec.K, STANDS @ spec.T_rig_camera)
-    rows, columns = slice(100, 107), slice(60, 200)
+    rows = slice(100, 107)
+    columns = slice(60, 200)
     whole, part = draw([(camera, {}), (camera.window(rows, columns), {})])
     assert np.abs(part.rgb - whole.rgb[rows, columns]).max() < 2e-3
     assert (
@@ -170,7 +174,8 @@ def test_a_window_shows_what_the_whole_picture_does(scenario, draw):
 def test_renderers_roll_when_the_request_does(scenario, name):
     renderer = make_renderer(name, scenario)
     request = case(scenario, **HARD["all"])
-    rolled, still = renderer.render(request), renderer.render(replace(request, exposure=None))
+    rolled = renderer.render(request)
+    still = renderer.render(replace(request, exposure=None))
     assert (rolled.rgb != still.rgb).mean() > 0.2
     assert (
         np.abs(rolled.rgb[-1].astype(int) - still.rgb[-1]).mean()

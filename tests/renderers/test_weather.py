@@ -146,7 +146,8 @@ def test_a_hole_in_the_ground_is_as_far_as_the_ground_around_it():
 
 
 def test_ground_that_a_model_shows_too_near_is_put_on_the_ground():
-    true, near = view(depth_of_road()), view(0.9 * depth_of_road())
+    true = view(depth_of_road())
+    near = view(0.9 * depth_of_road())
     below = slice(36, None)
     assert (true.ground[below] == 1).all()
     assert (near.ground[below] == 1).all()
@@ -256,7 +257,8 @@ def test_a_low_sun_ahead_veils_the_image_unless_it_is_hidden():
     to_camera = np.eye(4)
     heading = scenario.ego_log.quat[0]
     yaw = 2 * np.arctan2(heading[3], heading[0])
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     to_camera[:2, :2] = [[c, -s], [s, c]]
     pose = to_camera @ AHEAD
     open_sky, walled = (
@@ -305,7 +307,8 @@ def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer):
         .rgb.astype(float)
         for scenario in scenarios
     )
-    far, near = slice(60, 72), slice(-12, None)
+    far = slice(60, 72)
+    near = slice(-12, None)
     assert foggy[far].std() < 0.8 * clear[far].std()
     assert foggy[near].std() > 0.3 * clear[near].std()
     assert (foggy[:10].max(axis=2) >= weather.FOG_SRGB[2] - 40).mean() > 0.2  # no blue sky

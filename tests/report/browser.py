@@ -162,7 +162,8 @@ class Browser:
         return dict(json.loads(message))
 
     def _note(self, event):
-        method, params = event.get("method"), event.get("params", {})
+        method = event.get("method")
+        params = event.get("params", {})
         if method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
         elif method == "Runtime.exceptionThrown":

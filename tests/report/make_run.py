@@ -76,7 +76,8 @@ def make_run(folder, plan=None):
     maps = {scene: _scene(scene, index, plan) for index, scene in enumerate(plan.scenes)}
     for scene, content in maps.items():
         _json(folder / "scenes" / f"{_slug(scene)}.json", content)
-    rows, steps = [], []
+    rows = []
+    steps = []
     for scene, content in maps.items():
         for seed in plan.seeds:
             wander = _smooth(rng, plan.steps) * 0.3  # shared by the renderers: pairs are sharp

@@ -221,7 +221,8 @@ def grey(value):
 
 def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, monkeypatch):
     run = read_run(three)
-    first, scene = run.rollouts[0], run.scenes[0]
+    first = run.rollouts[0]
+    scene = run.scenes[0]
     rollouts = []
     for one in run.rollouts:
         if (one.scene, one.seed) == (scene, first.seed):

@@ -48,9 +48,11 @@ def test_an_event_that_no_step_shows_is_listed_without_a_place():
 
 
 def test_far_from_the_origin_costs_no_precision():
-    rollout, maps = Rollout("a", "p", "s", 0, "ok"), []
+    rollout = Rollout("a", "p", "s", 0, "ok")
+    maps = []
     for offset in (0.0, 5_412_345.25):
-        x, y = X + offset, 0.05 * X + offset
+        x = X + offset
+        y = 0.05 * X + offset
         maps.append(drawn(rollout, scene(x, y), series_of(x, y)))
     assert maps[0] == maps[1]
 

@@ -182,7 +182,8 @@ class BrakesLate(Looker):
 class ByYellow(Looker):
     """Keeps right of the yellow line, which it finds by its colour some metres ahead."""
 
-    AHEAD_M, BESIDE_M = 7.0, 1.8
+    AHEAD_M = 7.0
+    BESIDE_M = 1.8
 
     def __init__(self, scenario):
         super().__init__(scenario)

@@ -18,7 +18,8 @@ def night(tmp_path_factory):
     root = tmp_path_factory.mktemp("night")
     whole = Many("whole", shift_m={"onefixer": 0.4})
     make_one(root, whole)
-    table, names = pq.read_table(root / "whole" / "rollouts.parquet"), list(SCENES)
+    table = pq.read_table(root / "whole" / "rollouts.parquet")
+    names = list(SCENES)
     for name, mine in (("part-1", names[:3]), ("part-2", names[3:])):
         part = make_one(
             root, replace(whole, name=name, scenes={scene: SCENES[scene] for scene in mine})

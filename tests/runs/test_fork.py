@@ -152,10 +152,8 @@ def test_a_scenario_that_has_changed_is_refused(root, tmp_path):
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period(straight_road):
-    first, then = (
-        (SensorSpec("front"), SensorSpec("left", 200_000)),
-        (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear")),
-    )
+    first = (SensorSpec("front"), SensorSpec("left", 200_000))
+    then = (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
     assert merge_sensors(first, then, straight_road) == (
         SensorSpec("front", 50_000),
         SensorSpec("left"),

@@ -53,7 +53,8 @@ def test_counts_of_a_block_of_the_largest_generator():
     weights, fix = blocks("last-forward", 960, 544, "meta")
     assert weights == pytest.approx(2.077e9, rel=0.001)
     # A query, key and channel takes four operations, a weight and token two, in 28 blocks.
-    tokens, width = 2 * 34 * 60, 2048
+    tokens = 2 * 34 * 60
+    width = 2048
     least = 28 * 4 * tokens * width * (3 * tokens + 6 * width)
     assert least / 1e9 < counted(fix).gflop < 1.3 * least / 1e9
 

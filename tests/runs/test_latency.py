@@ -12,7 +12,8 @@ def plan(t_us):
 
 def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due():
     queue = PlanQueue(Latency("fixed", 150_000))
-    first, second = plan(0), plan(100_000)
+    first = plan(0)
+    second = plan(100_000)
     queue.submit(first, 0, 0)
     assert queue.active(100_000) is None
     queue.submit(second, 100_000, 0)
@@ -22,7 +23,8 @@ def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due():
 
 def test_a_slow_answer_never_replaces_a_newer_fast_one():
     queue = PlanQueue(Latency("measured"))
-    slow, fast = plan(0), plan(100_000)
+    slow = plan(0)
+    fast = plan(100_000)
     queue.submit(slow, 0, wall_us=500_000)
     queue.submit(fast, 100_000, wall_us=10_000)
     assert queue.active(110_000) is fast

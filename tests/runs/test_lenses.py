@@ -70,7 +70,8 @@ def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
 def test_a_fixer_sees_the_image_of_the_lens(straight_road):
     camera = fisheye(straight_road)
     scenario = replace(straight_road, cameras=(camera,))
-    cover, inner = LensCover([camera]), Directions(scenario)
+    cover = LensCover([camera])
+    inner = Directions(scenario)
     T = np.stack([np.eye(4) @ camera.T_rig_camera] * 2)
     runner = BlockRunner(inner.render_batch, prepare_map(scenario.lane_map), (), cover=cover)
     (seen,) = runner.render([RenderRequest(0, camera, T, {})])

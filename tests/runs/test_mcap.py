@@ -28,7 +28,8 @@ def read(path):
     CRC.
     """
     found = defaultdict(list)
-    schemas, before = {}, 0
+    schemas = {}
+    before = 0
     with path.open("rb") as stream:
         reader = mcap_reader.make_reader(stream, validate_crcs=True)
         (metadata,) = reader.iter_metadata()
@@ -93,7 +94,8 @@ def test_channels_have_foxgloves_schemas(
 
 @pytest.mark.parametrize("renderer", ["clean", "3dgs"])
 def test_what_is_recorded_is_what_the_log_holds(watched, recorded, renderer):
-    found, log = recorded[0], watched.log(renderer)
+    found = recorded[0]
+    log = watched.log(renderer)
     for camera in ("front", "side"):
         kept = [(1000 * image.end_us, image.data) for image in log.images if image.camera == camera]
         assert [
@@ -183,7 +185,8 @@ def test_refusals(
     tmp_path,
     monkeypatch,
 ):
-    run, out = str(watched.folder), tmp_path / "a.mcap"
+    run = str(watched.folder)
+    out = tmp_path / "a.mcap"
     (tmp_path / "there.mcap").touch()
     rollout = f"{run}/rollouts/clean/lane-camera/urban-left_turn/0"
     for words in (

@@ -100,7 +100,8 @@ def places(tmp_path_factory):
 
 
 def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(places, capsys):
-    first, words = str(places / "first"), str(places / "words")
+    first = str(places / "first")
+    words = str(places / "words")
     assert run_command(["compare", first, words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["diff"] == 0.0
     joined = aggregate_runs([Path(first), Path(words)])
@@ -110,7 +111,8 @@ def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(places, c
 
 
 def test_another_unit_under_the_same_name_is_refused(places, capsys):
-    first, unit = str(places / "first"), str(places / "unit")
+    first = str(places / "first")
+    unit = str(places / "unit")
     assert run_command(["compare", first, unit]) == 2
     assert "metric 'height_m'" in capsys.readouterr().err
 

@@ -39,7 +39,8 @@ def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
 
 
 def test_a_program_that_the_repository_names_is_not_run(tmp_path):
-    spy, own = tmp_path / "spy", tmp_path / "own"
+    spy = tmp_path / "spy"
+    own = tmp_path / "own"
     spy.write_text(f"#!/bin/sh\necho $0 $@ >> {tmp_path}/was-run\ncat\n")
     spy.chmod(0o755)
     own.mkdir()

@@ -21,7 +21,8 @@ class Inverting:
     map.
     """
 
-    trained, label = True, "inverting"
+    trained = True
+    label = "inverting"
 
     def __init__(self, rule=BlockRule(5, 8)):
         self.blocks = rule
@@ -29,7 +30,8 @@ class Inverting:
         self.seen = []
 
     def reset(self, seed):
-        self.sizes, self.seen = [], []
+        self.sizes = []
+        self.seen = []
 
     def preview(self, block, maps):
         raise AssertionError("a video's blocks are final")
@@ -144,7 +146,8 @@ def write_odd(path, frames):
 
 def misfits(folder):
     """Return files that cannot be refined, by what is wrong."""
-    source, out = video(folder / "in.mp4", pictures(9)), folder / "out.mp4"
+    source = video(folder / "in.mp4", pictures(9))
+    out = folder / "out.mp4"
     taken = video(folder / "taken.mp4", pictures(1))
     (folder / "folder.mp4").mkdir()
     (folder / "link.mp4").symlink_to(source)

@@ -11,7 +11,8 @@ from scenarios.suite import expand
 from tests.runs.test_runs import Announced
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
-SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
+SHORT = "timing.duration_us=800000"
+LONGER = "timing.duration_us=1200000"
 FORGETFUL = "tests.runs.broken_policies:RemembersEarlierRollouts"
 
 

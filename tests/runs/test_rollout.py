@@ -179,7 +179,8 @@ class Writes(StandStill):
     """Writes into an array that it receives, as `pose -= origin` does by accident."""
 
     def __init__(self, array_of, at_reset=False):
-        self.array_of, self.at_reset = array_of, at_reset
+        self.array_of = array_of
+        self.at_reset = at_reset
 
     def reset(self, seed, route):
         super().reset(seed, route)

@@ -48,7 +48,8 @@ def fixed_key(*overrides):
 def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path):
     shipped = fixer_settings("onefixer-dit-tiny")
     assert shipped.weights.bundle is not None
-    moved, other = tmp_path / "moved.safetensors", tmp_path / "other.safetensors"
+    moved = tmp_path / "moved.safetensors"
+    other = tmp_path / "other.safetensors"
     shutil.copy(shipped.weights.bundle, moved)
     raw = bytearray(moved.read_bytes())
     raw[-1] ^= 1

@@ -76,7 +76,8 @@ def becomes(text):
     return lambda path: path.write_text(text) and None  # type: ignore[return-value]
 
 
-DRIVE, SCORE = "drive", "score"
+DRIVE = "drive"
+SCORE = "score"
 DAMAGES = {
     "log removed": ("rollout.asl", remove, DRIVE),
     "log cut": ("rollout.asl", cut, DRIVE),

@@ -18,7 +18,8 @@ from tests.evaluators.test_gate import add, rows, table_of
 def trial(margin, is_broken, change, limit=None):
     rules = {"lateral_distance_m": MetricRule(margin=margin, max=limit)}
     name = "broken-black" if is_broken else CONTROL
-    first, again = table_of(rows(REFERENCE)), table_of(add(change)(rows(name)))
+    first = table_of(rows(REFERENCE))
+    again = table_of(add(change)(rows(name)))
     spec = GateSpec(version=1, metrics=rules, min_scenes=100)  # the self-test asks for no more
     return Trial(name, is_broken, gate_against(again, spec, first, name))
 

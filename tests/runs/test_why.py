@@ -203,9 +203,11 @@ def test_no_page_names_a_false_cause_and_most_show_the_right_evidence_first(
     (tmp_path / "bend.yaml").write_text(bend)
     missed = []
     for scenario, faults in FAULTS.items():
-        renderer, source = ("clean", scenario)
+        renderer = "clean"
+        source = scenario
         if scenario == "bend":
-            renderer, source = (GREY, str(tmp_path / "bend.yaml"))
+            renderer = GREY
+            source = str(tmp_path / "bend.yaml")
         names = {f"tests.runs.faulty_policies:{one.__name__}": word for one, word in faults.items()}
         plan = make_plan(expand(source), (renderer,), tuple(names), (0,), RunOptions())
         folder = tmp_path / scenario.replace("/", "-")

@@ -53,7 +53,8 @@ def lens_of(values):
         radius = np.linspace(0.0, reach_px, 2000)
         angle = _polynomial(radius, given)
         top = int(np.argmax(angle))  # a polynomial may turn over beyond the image's corners
-        radius, angle = radius[: top + 1], angle[: top + 1]
+        radius = radius[: top + 1]
+        angle = angle[: top + 1]
         lens = FTheta(tuple(given.tolist()), tuple(_fit(angle, radius).tolist()), float(angle[-1]))
     else:
         angle = np.linspace(0.0, np.pi / 2, 4000)
@@ -61,7 +62,8 @@ def lens_of(values):
         inside = np.nonzero(np.maximum.accumulate(radius) > reach_px)[0]
         rising = np.nonzero(np.diff(radius) <= 0)[0]
         end = int(min([len(angle), *inside[:1] + 1, *rising[:1] + 1]))
-        angle, radius = angle[:end], radius[:end]
+        angle = angle[:end]
+        radius = radius[:end]
         lens = FTheta(tuple(_fit(radius, angle).tolist()), tuple(given.tolist()), float(angle[-1]))
     return RecordedLens(float(cx), float(cy), int(width), int(height), lens, backward)
 

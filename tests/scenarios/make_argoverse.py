@@ -55,7 +55,8 @@ def place(x, y, z):
     return ORIGIN + np.array([x, y, z])
 
 
-CAR, PERSON = (4.5, 1.9, 1.5), (0.6, 0.6, 1.8)
+CAR = (4.5, 1.9, 1.5)
+PERSON = (0.6, 0.6, 1.8)
 TRACKS = (
     ("parked", "REGULAR_VEHICLE", CAR, range(21), place(30.0, -6.0, 0.75)),
     (

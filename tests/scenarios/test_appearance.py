@@ -26,7 +26,8 @@ def written(folder, half, more=", appearance: car.ply"):
 
 
 def test_an_actor_looks_like_its_file_and_the_scene_is_another_one(tmp_path):
-    built, made = written(tmp_path, (2.2, 0.9, 0.7), ""), written(tmp_path, (2.2, 0.9, 0.7))
+    built = written(tmp_path, (2.2, 0.9, 0.7), "")
+    made = written(tmp_path, (2.2, 0.9, 0.7))
     plain, own = (build_actors(scenario)[0] for scenario in (built, made))
     assert (len(plain.levels), len(own.levels)) == (3, 1)
     assert 200 < len(own.levels[0].cloud) < 210
@@ -36,7 +37,8 @@ def test_an_actor_looks_like_its_file_and_the_scene_is_another_one(tmp_path):
 
 def test_a_file_without_gaussians_and_one_for_a_row_of_vehicles_are_refused(tmp_path):
     written(tmp_path, (2.2, 0.9, 0.7))
-    scene, file = tmp_path / "scene.yaml", tmp_path / "car.ply"
+    scene = tmp_path / "scene.yaml"
+    file = tmp_path / "car.ply"
     write_ply(file, cloud_from_points(np.zeros((0, 3)), np.zeros((0, 3))))
     with pytest.raises(InputError):
         build_actors(load_scenario(scene))

@@ -122,7 +122,8 @@ def test_the_record_in_force_counts():
 
 def test_lanes_of_both_sides_run_against_each_other():
     found = lanes_of(road(left=lane(1), right=lane(-1) + lane(-2, kind="shoulder")))
-    right, left = found.lanes["1.0.-1"], found.lanes["1.0.1"]
+    right = found.lanes["1.0.-1"]
+    left = found.lanes["1.0.1"]
     assert_allclose(right.centre[[0, -1]], [[0, -1.75, 0], [40, -1.75, 0]], atol=1e-9)
     assert_allclose(left.centre[[0, -1]], [[40, 1.75, 0], [0, 1.75, 0]], atol=1e-9)
     for one in (right, left):
@@ -366,7 +367,8 @@ def test_cars_of_another_simulator_drive_in_the_lanes(shared_data):
     assert inside.all()
     best = []
     for row in car[::40]:
-        at, yaw = np.array([float(row["x"]), float(row["y"])]), float(row["yaw"])
+        at = np.array([float(row["x"]), float(row["y"])])
+        yaw = float(row["yaw"])
         steps = [
             np.diff(one.centre[:, :2], axis=0)[np.argmin(np.hypot(*(one.centre[:-1, :2] - at).T))]
             for one in found.lanes.values()

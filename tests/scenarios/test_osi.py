@@ -19,7 +19,8 @@ TRUTH, VIEW = message_classes()
 def moving(message, key, x, y, yaw=0.0, kind=2):
     one = message.moving_object.add(type=kind)
     one.id.value = key
-    size, place = one.base.dimension, one.base.position
+    size = one.base.dimension
+    place = one.base.position
     size.length, size.width, size.height = (4.0, 1.8, 1.5) if kind == 2 else (0.5, 0.5, 1.8)
     place.x, place.y, place.z = x, y, size.height / 2
     one.base.orientation.yaw = yaw
@@ -76,7 +77,8 @@ def test_the_host_vehicle_is_the_ego_among_recorded_traffic(tmp_path):
     by = {actor.actor_id: actor for actor in made.actors}
     assert {key: actor.label for key, actor in by.items()} == {"3": "car", "9": "pedestrian"}
     assert by["9"].track.t_us[[0, -1]].tolist() == [500_000, 1_900_000]
-    one, other = made.lane_map.lanes["1"], made.lane_map.lanes["2"]
+    one = made.lane_map.lanes["1"]
+    other = made.lane_map.lanes["2"]
     assert one.centre[-1, 0] > one.centre[0, 0]
     assert other.centre[-1, 0] < other.centre[0, 0]
     assert (one.left_mark_type, one.right_mark_type) == ("solid_yellow", "none")

@@ -62,7 +62,8 @@ def test_other_seeds_change_road_actors_and_hash_and_name_the_scene(tmp_path):
 
 def measures(s):
     centre = s.lane_map.lanes["s0_f0"].centre
-    left, right = s.lane_map.lanes["s0_f0"].left, s.lane_map.lanes["s0_f0"].right
+    left = s.lane_map.lanes["s0_f0"].left
+    right = s.lane_map.lanes["s0_f0"].right
     return {
         "length": float(centre[-1, 0]),
         "width": float(left[0, 1] - right[0, 1]),

@@ -21,7 +21,8 @@ def drive_with_the_log(s):
     """Run the actors beside an ego on its log and return how far each reactive one strayed from its
     track.
     """
-    actors, strayed = make_actors(s), {}
+    actors = make_actors(s)
+    strayed = {}
     tracks = {a.actor_id: a.track for a in s.actors if a.behaviour.kind == "idm"}
     for t in range(s.start_us, s.end_us, 100_000):
         for name, pose in actors.step(t, ego_state_from_log(s.ego_log, t, s.vehicle)).items():
@@ -69,7 +70,8 @@ def test_other_recorded_car_as_ego(shared_data, tmp_path):
     path = tmp_path / "scene.yaml"
     xml = shared_data / "commonroad" / "USA_US101-3_3_T-1.xml"
     path.write_text(f"version: 1\nlog: {{commonroad: {xml}, ego: 408}}\n")
-    one, two = load_scenario(path), load_scenario(xml)
+    one = load_scenario(path)
+    two = load_scenario(xml)
     assert "408" not in {a.actor_id for a in one.actors}
     assert "408" in {a.actor_id for a in two.actors}
     assert one.content_hash != two.content_hash

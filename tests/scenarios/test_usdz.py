@@ -52,7 +52,8 @@ def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path):
         "usdz",
         "small",
     )
-    right, left = log.lane_map.lanes["L0"], log.lane_map.lanes["L1"]
+    right = log.lane_map.lanes["L0"]
+    left = log.lane_map.lanes["L1"]
     assert right.left_neighbour == "L1"
     assert left.left_neighbour is None
     assert_allclose(right.centre[:, 1], 0.0)

@@ -48,7 +48,8 @@ def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
     written,
 ):
     scenario, path = written
-    read, view = read_usdz(path), scenario.alpasim_map
+    read = read_usdz(path)
+    view = scenario.alpasim_map
     ids = {key: key.replace("-", "~") for key in view.lanes}
     assert list(read.lane_map.lanes) == [ids[key] for key in view.lanes]
     for key, lane in view.lanes.items():
@@ -115,7 +116,8 @@ def test_a_lane_with_unequal_edges_keeps_its_area():
     assert list(view.lanes) == ["a-1"]
     one, other = rails(lane)
     assert len(one) == len(other) >= 40
-    before, after = lane_polygon(lane), lane_polygon(view.lanes["a-1"])
+    before = lane_polygon(lane)
+    after = lane_polygon(view.lanes["a-1"])
     assert shapely.symmetric_difference(before, after).area < 1e-9 * before.area
     assert float(np.linalg.norm(np.diff(view.lanes["a-1"].centre, axis=0), axis=1).max()) <= 2.0
 

@@ -57,7 +57,8 @@ def test_a_larger_gap_never_brakes_harder(speed, gap, closing, more):
 
 
 def test_a_platoon_behind_a_stopped_car_stops_without_contact():
-    x, v = np.array([80.0, 40.0, 0.0]), np.array([0.0, 15.0, 15.0])
+    x = np.array([80.0, 40.0, 0.0])
+    v = np.array([0.0, 15.0, 15.0])
     for _ in range(6000):
         a = [
             idm_acceleration(v[i], x[i - 1] - 5.0 - x[i], v[i] - v[i - 1], P) if i else 0.0
@@ -109,11 +110,15 @@ def test_the_leaders_of_many_drivers_are_those_of_each():
     paths, count, met = [STRAIGHT, bend], 30, 0
     for _ in range(10):
         boxes = [Box(*random.uniform([1, 0.6, 1], [12, 2.5, 3])) for _ in range(count)]
-        xy, yaw = random.uniform(-40, 90, (count, 2)), random.uniform(-np.pi, np.pi, count)
+        xy = random.uniform(-40, 90, (count, 2))
+        yaw = random.uniform(-np.pi, np.pi, count)
         xy[:20, 1] = random.normal(0, 3, 20)
-        velocity, line = random.normal(0, 8, (count, 2)), random.integers(0, 2, 12)
-        front, horizon = random.uniform(-5, 120, 12), random.uniform(20, 120, 12)
-        half, own = random.uniform(0.4, 1.3, 12), np.full(12, -1)
+        velocity = random.normal(0, 8, (count, 2))
+        line = random.integers(0, 2, 12)
+        front = random.uniform(-5, 120, 12)
+        horizon = random.uniform(20, 120, 12)
+        half = random.uniform(0.4, 1.3, 12)
+        own = np.full(12, -1)
         everybody = bodies_from(xy, yaw, boxes, velocity)
         first = find_leaders(Lines(paths), line, front, half, everybody, horizon, own)
         own = np.array([leader.index for leader in first])  # so that leaving it out matters

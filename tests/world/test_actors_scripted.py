@@ -31,14 +31,16 @@ def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt(tmp_pa
         "actors: [{kind: cut_in, id: a, from_lane: 1, to_lane: 0, s_m: 30, speed_mps: 12, at_us: 1000000}]\n"
     )
     (actor,) = load_scenario(tmp_path / "a.yaml").actors
-    t, y = actor.track.t_us, actor.track.xyz[:, 1]
+    t = actor.track.t_us
+    y = actor.track.xyz[:, 1]
     assert_allclose(y[t <= 1_000_000], -5.25, atol=1e-9)
     assert_allclose(y[t >= 3_500_000], -1.75, atol=1e-9)
     assert (np.diff(y) >= -1e-9).all()
     lateral_accel = np.gradient(np.gradient(y[:-1], 0.05), 0.05)
     # Peak of the quintic: 10 / sqrt(3) * distance / duration^2.
     assert np.abs(lateral_accel).max() == pytest.approx(10 / np.sqrt(3) * 3.5 / 2.5**2, rel=0.03)
-    heading, v = yaw_from_quat(actor.track.quat), np.gradient(actor.track.xyz[:, :2], axis=0)
+    heading = yaw_from_quat(actor.track.quat)
+    v = np.gradient(actor.track.xyz[:, :2], axis=0)
     assert_allclose(heading[5:-5], np.arctan2(v[5:-5, 1], v[5:-5, 0]), atol=2e-3)
 
 

@@ -46,7 +46,8 @@ def test_points_of_a_plane_give_back_the_plane_wherever_it_lies(slope_x, slope_y
 def test_points_in_any_order_give_the_same_ground():
     rng = np.random.default_rng(2)
     points = rng.uniform(0, 30, (200, 3))
-    one, two = from_points(points), from_points(points[::-1])
+    one = from_points(points)
+    two = from_points(points[::-1])
     assert_allclose(one.z, two.z, atol=1e-9)
 
 

@@ -178,7 +178,8 @@ def test_impossible_roads_are_refused(elements, profile, text):  # type: ignore[
     st.floats(-3.0, 3.0),
 )
 def test_any_winding_road_is_sound(bends, forward, backward, shoulder, heading):
-    elements, before = [], 0.0
+    elements = []
+    before = 0.0
     for length, curvature in bends:
         elements.append(Curve(length, before, curvature))
         before = curvature
@@ -213,7 +214,8 @@ def test_t_junction_closes_the_missing_side():
 
 def test_merging_lane_ends_exactly_on_its_neighbour():
     road = build_road([Curve(30), LaneTaper("merge", 60), Curve(30)], Profile(3, 0))
-    slant, after = road.lane_map.lanes["s1_merge"], road.lane_map.lanes["s2_f1"]
+    slant = road.lane_map.lanes["s1_merge"]
+    after = road.lane_map.lanes["s2_f1"]
     assert slant.successors == ("s2_f1",)
     assert road.lane_map.lanes["s1_f1"].successors == ("s2_f1",)
     assert slant.right is not None

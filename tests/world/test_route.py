@@ -146,10 +146,8 @@ def test_far_maps_give_the_same_route():
     x = np.arange(5.0, 60.0, 0.5)
     log = drive(x, 0.3 * np.sin(x / 10))
     moved = Trajectory(log.t_us, log.xyz + FAR, log.quat)
-    near, far = (
-        route_from_log(ROAD, log),
-        route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved),
-    )
+    near = route_from_log(ROAD, log)
+    far = route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved)
     assert near.lane_ids == far.lane_ids
     assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
 

@@ -30,7 +30,8 @@ class RendererClient:
     """
 
     def __init__(self, address: str, timeout_s: float = 300.0) -> None:
-        self.address, self._timeout_s = address, timeout_s
+        self.address = address
+        self._timeout_s = timeout_s
         self._channel = grpc.insecure_channel(address, list(OPTIONS))
         self.stub = Stub(self._channel, "SensorsimService")
 
@@ -104,7 +105,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         with RendererClient(given[0]) as client:
-            version, scenes = client.version(), client.scenes()
+            version = client.version()
+            scenes = client.scenes()
             api = version.grpc_api_version
             print(
                 f"version {version.version_id}\nhash    {version.git_hash}\nwire    {api.major}.{api.minor}.{api.patch}"

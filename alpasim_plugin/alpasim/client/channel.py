@@ -111,7 +111,8 @@ class Service:
             try:
                 return ask(request, timeout=timeout_s, wait_for_ready=False)
             except grpc.RpcError as error:
-                code, text = error.code(), error.details() or ""
+                code = error.code()
+                text = error.details() or ""
                 passing = code == grpc.StatusCode.UNAVAILABLE or any(
                     phrase in text for phrase in PASSING_TEXTS
                 )

@@ -52,7 +52,8 @@ class Child:
                 "use Linux, macOS or WSL",
             )
         self.last: deque[str] = deque(maxlen=LAST_LINES)
-        self._heard, self._ended = heard, ended
+        self._heard = heard
+        self._ended = ended
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", str(SUPERVISOR), str(GRACE_S), *command],
             stdin=subprocess.PIPE,

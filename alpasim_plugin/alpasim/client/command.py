@@ -63,14 +63,16 @@ class SocketFile:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, path = folder, folder / "policy.sock"
+        self._folder = folder
+        path = folder / "policy.sock"
         if len(str(path)) > MAX_PATH:
             shutil.rmtree(folder)
             raise InputError(
                 f"the folder for temporary files: {path} is longer than {MAX_PATH} characters",
                 "set TMPDIR=/tmp, or name {port} in the command",
             )
-        self._path, self.address = path, f"unix:{path}"
+        self._path = path
+        self.address = f"unix:{path}"
 
     def filled_in(self, word: str) -> str:
         """Replace ``{address}`` and ``{folder}``, the socket's folder, which a container must

@@ -145,7 +145,8 @@ class DriverPolicy(Policy):
 
     def _end_session(self) -> None:
         if self._session:
-            session, self._session = self._session, ""
+            session = self._session
+            self._session = ""
             self._call(
                 "close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=session)
             )
@@ -176,7 +177,8 @@ class DriverPolicy(Policy):
             velocity = np.gradient(history.xyz, t_s, axis=0)
             speed = np.einsum("ti,ti->t", velocity, poses[:, :3, 0])
             yaw = np.unwrap([yaw_of(pose) for pose in poses])
-            rate, accel = np.gradient(yaw, t_s), np.gradient(speed, t_s)
+            rate = np.gradient(yaw, t_s)
+            accel = np.gradient(speed, t_s)
             rows = zip(history.t_us, poses, speed, accel, rate, strict=True)
             states = [
                 EgoState(int(t), pose, float(v), float(a), float(w)) for t, pose, v, a, w in rows

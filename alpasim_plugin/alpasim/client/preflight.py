@@ -77,7 +77,8 @@ class DriveTimes:
         if not poses:
             self.empty += 1
             return
-        now, t_us = int(request.time_now_us), [int(pose.timestamp_us) for pose in poses]
+        now = int(request.time_now_us)
+        t_us = [int(pose.timestamp_us) for pose in poses]
         if t_us[0] != now:
             self.problems.setdefault(
                 "the first pose is not at time_now", f"{t_us[0] - now:+d} us at {now}"

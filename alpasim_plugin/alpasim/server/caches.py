@@ -82,7 +82,8 @@ class FixerCache:
 
     def __init__(self, spec: RendererSpec, device: str = "cpu") -> None:
         assert spec.fixer is not None, "a renderer without a fixer has nothing to fix"
-        self._spec, self._session = spec.fixer, {"device": device, "threads": None}
+        self._spec = spec.fixer
+        self._session = {"device": device, "threads": None}
         self._made: dict[str, CausalFixer] = {}
 
     @property
@@ -150,11 +151,13 @@ class SceneCache:
         needs_map: bool,
         device: str = "cpu",
     ) -> None:
-        self._spec, self._needs_map = spec, needs_map
+        self._spec = spec
+        self._needs_map = needs_map
         self._session: dict[str, Any] = {"seed": 0, "device": device, "threads": None}
         self._sources: dict[str, str | Path] = {}
         self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
-        self._lock, self._loading = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
+        self._loading = threading.Lock()
         for place in places:
             for source in sources_in(place):
                 scene_id = (

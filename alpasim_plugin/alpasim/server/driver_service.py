@@ -87,8 +87,10 @@ class DriverService:
         clock: Callable[[], float] = time.monotonic,
         budget: int = SESSION_BYTES,
     ) -> None:
-        self._name, self._digest = name, digest
-        self._make, self._scenario_of = make, scenario_of
+        self._name = name
+        self._digest = digest
+        self._make = make
+        self._scenario_of = scenario_of
         self.sessions: Sessions[Driving] = Sessions(
             expiry_s, most_sessions, Driving.close, clock, budget
         )
@@ -287,7 +289,8 @@ class Driving:
         with self._lock:
             if not len(self._history) or len(self._images) < len(self._native):
                 return egodriver_pb2.DriveResponse()
-            ego, history = self._ego(), self._history
+            ego = self._ego()
+            history = self._history
             policy = self._policy = self._policy or self._started(ego)
             shown = {name: self._frame(name) for name in self._images if name in self._cameras}
             observation = Observation(
@@ -348,13 +351,15 @@ class Driving:
         return policy
 
     def _ego(self) -> EgoState:
-        known, now = self._history, int(self._history.t_us[-1])
+        known = self._history
+        now = int(self._history.t_us[-1])
         pose = se3(known.xyz[-1], known.quat[-1])
         stated = 0.0
         turn = 0.0
         accel = 0.0
         if self._state is not None:
-            stated, turn = self._state.linear_velocity.x, self._state.angular_velocity.z
+            stated = self._state.linear_velocity.x
+            turn = self._state.angular_velocity.z
             accel = self._state.linear_acceleration.x
         earlier = max(int(np.searchsorted(known.t_us, now - SPEED_WINDOW_US, side="right")) - 1, 0)
         dt_s = (now - int(known.t_us[earlier])) * 1e-6
@@ -362,7 +367,8 @@ class Driving:
             before = se3(known.xyz[earlier], known.quat[earlier])
             seen = float((known.xyz[-1] - before[:3, 3]) @ pose[:3, 0]) / dt_s
             if abs(seen) > MOVING_MPS:
-                stated, turn = seen, float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
+                stated = seen
+                turn = float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
         return EgoState(now, pose, float(stated), float(accel), float(turn))
 
 
@@ -373,8 +379,10 @@ def check_time(t_us: int, call: str) -> None:
 
 
 def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
-    yaw0, origin = yaw_of(T_world_rig), T_world_rig[:3, 3]
-    c, s = np.cos(yaw0), np.sin(yaw0)
+    yaw0 = yaw_of(T_world_rig)
+    origin = T_world_rig[:3, 3]
+    c = np.cos(yaw0)
+    s = np.sin(yaw0)
     xy = rows[:, :2] @ np.array([[c, s], [-s, c]]) + origin[:2]
     xyz = np.column_stack([xy, np.full(len(rows), origin[2])])
     return wire_trajectory(

@@ -56,7 +56,8 @@ def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tupl
         before: The earlier one.
         T_before: Camera pose and time of the frame before that one, where known.
     """
-    dt_us, shutter_us = view.t_us - before.t_us, view.t_us - view.start_us
+    dt_us = view.t_us - before.t_us
+    shutter_us = view.t_us - view.start_us
     reach_m = SLACK_M + ACCEL_MPS2 * (dt_us / 1e6) ** 2
     start, end = view.T_world_camera
     here = before.T_world_camera[1]
@@ -148,7 +149,8 @@ class HistoryTree(Generic[S]):
         self, max_bytes: int, expiry_s: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.max_bytes, self.expiry_s, self._clock = max_bytes, expiry_s, clock
-        self.bytes, self.counts = 0, Counts()
+        self.bytes = 0
+        self.counts = Counts()
         self._nodes: OrderedDict[bytes, Node[S]] = OrderedDict()  # the longest unused first
         self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(
             list

@@ -35,7 +35,8 @@ MARKING_SHARE = 0.035  # of the width: what is broader is no lane marking
 WIDEST_SHARE = 0.08
 NEIGHBOURS = (-4, -3, -2, 2, 3, 4)  # pieces beside a line, in its own widths
 LEAST_PIECES = 40  # of lines in rows; fewer say nothing
-DOUBT, FITS = 0.56, 0.64
+DOUBT = 0.56
+FITS = 0.64
 NOTHING = prepare_map(LaneMap({}))
 LATERAL_OFFSETS_M = (-2.2, -1.75, -1.3, -0.9, 0.9, 1.3, 1.75, 2.2)
 UNMOVED_M = 0.45
@@ -198,7 +199,8 @@ def agreement(pieces: Pieces, markings: U8) -> float | None:
     own = _brightest(markings, pieces.row, pieces.first, pieces.end)
     wins = compared = 0.0
     for times in NEIGHBOURS:
-        first, end = pieces.first + times * size, pieces.end + times * size
+        first = pieces.first + times * size
+        end = pieces.end + times * size
         inside = (first >= 0) & (end <= width)
         beside = _brightest(markings, pieces.row[inside], first[inside], end[inside])
         wins += float(np.sum(own[inside] > beside) + 0.5 * np.sum(own[inside] == beside))

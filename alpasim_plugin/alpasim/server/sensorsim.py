@@ -108,7 +108,8 @@ class Sensorsim(Failures):
         if len(set(names)) < len(names):
             raise InputError(f"a batch of {names}: a camera name twice", "send one item a camera")
         images = self.frames.answers([item.request for item in request.items], left)
-        item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
+        item = sensorsim_pb2.BatchRGBRenderReturnItem
+        result = sensorsim_pb2.RGBRenderReturn
         made = [
             item(camera_name=n, result=result(image_bytes=i), success=True)
             for n, i in zip(names, images, strict=True)
@@ -346,7 +347,8 @@ def points_of(
     """
     axes = np.array([camera.T_rig_camera[:3, 2] for camera in cameras])
     nearest = np.argmax(rays @ axes.T, axis=1)
-    points, bright = [], []
+    points = []
+    bright = []
     for index, (camera, depth, image) in enumerate(zip(cameras, depths, images, strict=True)):
         mine = rays[nearest == index]
         p = mine @ camera.T_rig_camera[:3, :3]
@@ -357,9 +359,11 @@ def points_of(
             np.clip(np.floor(x).astype(np.int64), 0, n - 2)
             for x, n in ((u, camera.width), (v, camera.height))
         )
-        a, b = np.clip(u - column, 0, 1), np.clip(v - row, 0, 1)
+        a = np.clip(u - column, 0, 1)
+        b = np.clip(v - row, 0, 1)
         inverse = np.divide(1.0, depth, out=np.full(depth.shape, np.nan), where=depth > 0)
-        down, right = _is_one_surface(inverse), _is_one_surface(inverse.T).T
+        down = _is_one_surface(inverse)
+        right = _is_one_surface(inverse.T).T
         smooth = (
             down[row, column] & down[row, column + 1] & right[row, column] & right[row + 1, column]
         )

@@ -142,7 +142,8 @@ def asked_of(
     Raises:
         InputError: A track that the scene does not have.
     """
-    actors, asked = boxes_at(entry, view), []
+    actors = boxes_at(entry, view)
+    asked = []
     for side in sides:
         camera = side.spec(view.camera, T_rig_camera, view.t_us - view.start_us)
         T = view.T_world_camera @ side.T_lens_pinhole
@@ -157,7 +158,8 @@ def drawn_map(
     """Return the semantic map as the lens sees it, of the device that drew its frame; None where
     the fixer takes none.
     """
-    scene_map, actors = entry.scene_map, entry.scenario.actors
+    scene_map = entry.scene_map
+    actors = entry.scenario.actors
     if scene_map is None:
         return None
     return joined_image(sides, draw_exposed_maps(scene_map, asked, actors, device=device))
@@ -223,7 +225,8 @@ class LocalSource:
         scenes: SceneCache,
         busy: threading.Lock,
     ) -> None:
-        self._scenes, self._busy = scenes, busy
+        self._scenes = scenes
+        self._busy = busy
 
     def render(
         self, requests: Sequence[Request], views: Sequence[View], left: CallTime
@@ -241,7 +244,8 @@ class LocalSource:
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         sides = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
-        asked, frames = asked_of(entry, request, view, mount_of(entry, view), sides), []
+        asked = asked_of(entry, request, view, mount_of(entry, view), sides)
+        frames = []
         for part in asked:
             with left.holding(self._busy):
                 frames.append(entry.render(part, entry.reads_device))
@@ -268,7 +272,8 @@ class LocalSource:
             RendererError: The renderer broke its contract.
         """
         entry = self._scenes.get(view.scene_id, left)
-        boxes, out = boxes_at(entry, view), []
+        boxes = boxes_at(entry, view)
+        out = []
         for camera in cameras:
             with left.holding(self._busy):
                 out.append(
@@ -302,7 +307,8 @@ class UpstreamSource:
         as_png: bool = True,
     ) -> None:
         self._stub, self._scenes, self._masks = stub, scenes, masks or {}
-        self._as_png, self._has_batch = as_png, True
+        self._as_png = as_png
+        self._has_batch = True
         self._paths: dict[str, F64] = {}
         self._mounts: dict[tuple[str, str], F64] = {}
 

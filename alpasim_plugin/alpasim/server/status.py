@@ -102,7 +102,8 @@ class CallTime:
 def status_of(error: Exception) -> tuple[Any, str]:
     """Return the status and text that a caller gets for an error."""
     if isinstance(error, grpc.RpcError):
-        code, text = error.code(), error.details() or ""
+        code = error.code()
+        text = error.details() or ""
         if BACKEND in text:
             return code, text
         return (

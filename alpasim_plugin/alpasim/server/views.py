@@ -31,7 +31,8 @@ from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, LensModel
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
-MAX_SIDE_PX, MAX_PIXELS = 8192, 1 << 24
+MAX_SIDE_PX = 8192
+MAX_PIXELS = 1 << 24
 MAX_TIME_US = 2**62
 
 
@@ -114,11 +115,10 @@ def read_pair(pair: sensorsim_pb2.PosePair, what: str) -> F64:
 
 def read_pose(pose: common_pb2.Pose, what: str) -> F64:
     """Return the ``(4, 4)`` matrix of a pose; see `read_view`."""
-    v, q = pose.vec, pose.quat
-    xyz, quat = (
-        np.array([v.x, v.y, v.z], dtype=np.float64),
-        np.array([q.w, q.x, q.y, q.z], dtype=np.float64),
-    )
+    v = pose.vec
+    q = pose.quat
+    xyz = np.array([v.x, v.y, v.z], dtype=np.float64)
+    quat = np.array([q.w, q.x, q.y, q.z], dtype=np.float64)
     square = float(quat @ quat)
     if not (np.isfinite(xyz).all() and abs(square - 1.0) <= QUAT_NORM_TOLERANCE):
         raise InputError(
@@ -250,7 +250,8 @@ def _fisheye(p: Any, what: str) -> LensModel:
 
 
 def _ftheta(p: Any, what: str) -> LensModel:
-    forward, backward = tuple(p.angle_to_pixeldist_poly), tuple(p.pixeldist_to_angle_poly)
+    forward = tuple(p.angle_to_pixeldist_poly)
+    backward = tuple(p.pixeldist_to_angle_poly)
     linear = (1.0, 0.0, 0.0)
     if p.HasField("linear_cde"):
         linear = p.linear_cde.linear_c, p.linear_cde.linear_d, p.linear_cde.linear_e

@@ -190,7 +190,8 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     else:
         scheme, rest = split_address(name)
         if scheme:
-            plain, address = scheme, rest
+            plain = scheme
+            address = rest
         elif kind == "fixer":
             plain, steps = split_steps(name)
         target = find(kind, plain).target
@@ -233,7 +234,8 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     front, plus, base = plain.partition("+")
     steps = re.fullmatch(r"(.+)@([0-9]+)", base)
     if steps is not None and "@" not in front:  # they stand at the end, and belong to the fixer
-        front, base = f"{front}@{steps[2]}", steps[1]
+        front = f"{front}@{steps[2]}"
+        base = steps[1]
     renderers = entries("renderer")
     if not plus and (front in renderers or "://" in front or _is_renderer(front)):
         if own:

@@ -28,7 +28,8 @@ INFIXES = ("_checkpoint_wrapped_module.", "_orig_mod.")  # of wrappers around la
 WRAPPER = "module."  # of data-parallel training, before all keys
 OWN, AVERAGED = "net.", "net_ema."  # where a training checkpoint holds both, the first is read
 LISTED = 8  # keys named in one error message; the rest is counted
-ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
+ZIP_MAGIC = b"PK\x03\x04"
+PICKLE_MAGIC = b"\x80"
 
 
 def load_weights(path: str | Path, sha256: str | None = None) -> StateDict:

@@ -321,12 +321,14 @@ class PixelGenerator(nn.Module):
         coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
         details = render, cover, state.output
         fine = torch.cat([cells(image, DETAIL) for image in details], dim=-1)
-        stem, detail = self.stem(coarse.to(dtype)), self.read(fine.to(dtype))
+        stem = self.stem(coarse.to(dtype))
+        detail = self.read(fine.to(dtype))
         seen = None
         if self.blend is not None and references is not None:
             seen = operations.gather_references(references, render)
             at4, at2 = self.blend.features(seen)
-            stem, detail = stem + at4, detail + at2
+            stem = stem + at4
+            detail = detail + at2
 
         x4 = self.encode4(self.mix(activation(stem, inplace=True)))
         x8 = self.down8(activation(x4))
@@ -368,7 +370,8 @@ def blended(
     repaired: Repaired, render: Tensor, references: Tensor | None, operations: Operations
 ) -> tuple[Tensor, PixelState]:
     """Blend what the network made of a render with the references; see `PixelGenerator.forward`."""
-    out, recorded = repaired.image, torch.zeros_like(render[..., :1])
+    out = repaired.image
+    recorded = torch.zeros_like(render[..., :1])
     if repaired.heads is not None and references is not None:
         out, recorded = operations.blend(out, references, repaired.heads)
     return out, PixelState(out.clamp(-1, 1), render, repaired.hidden, recorded)

@@ -66,7 +66,8 @@ def draw_tiles(scene: PreparedMap, device: torch.device | str, views: Sequence[M
     hidden = primitives[..., 4] == 0
     order = torch.sort(hidden, dim=1, stable=True).indices
     levels = torch.empty((len(views), rows, width, 3), dtype=torch.uint8, device=device)
-    tiles_x, tiles_y = -(-width // TILE), -(-rows // TILE)
+    tiles_x = -(-width // TILE)
+    tiles_y = -(-rows // TILE)
     tile_kernel.draw_tiles[(len(views) * tiles_x * tiles_y,)](
         torch.take_along_dim(primitives, order[..., None], dim=1),
         samples,
@@ -130,7 +131,8 @@ def _strokes(rows: Tensor, cameras: Tensor) -> Tensor:
             a stroke is as wide as it is high, and the first row.
     """
     size, pixels, scale = torch.split(cameras[:, None, 17:22], [2, 1, 2], dim=2)
-    ends, style = _seen_at(rows[..., :6].reshape(*rows.shape[:2], 2, 3), cameras), rows[..., 6:]
+    ends = _seen_at(rows[..., :6].reshape(*rows.shape[:2], 2, 3), cameras)
+    style = rows[..., 6:]
     begin, end = torch.split(ends, 1, dim=2)
     depth = ends[..., 2:]
     # Where a segment meets the near plane; beyond the far one the kernel draws nothing of it.
@@ -174,7 +176,8 @@ def _shapes(rows: Tensor, cameras: Tensor) -> Tensor:
     volume = (planes * seen_at)[:, :, :1].sum(3)  # negative where the front is seen
     planes = planes / volume[..., None]  # each 1/depth in a corner, and 0 on the opposite edge
     depth = seen_at[..., 2]
-    near, far = depth.amin(2, keepdim=True), depth.amax(2, keepdim=True)
+    near = depth.amin(2, keepdim=True)
+    far = depth.amax(2, keepdim=True)
     places = seen_at[..., :2] / depth[..., None]
     low = torch.where(near < NEAR_M, -torch.inf, places.amin(2))
     high = torch.where(near < NEAR_M, torch.inf, places.amax(2))

@@ -231,7 +231,8 @@ def _draw_shape(shape, band_row, height, width, depth, colour):
 @kernel
 def draw_bands(cursor, lines, box_edges, shapes, stretch, image):
     """Draw bands of rows until none is left: lines, then shapes, then the edges of boxes."""
-    height, width = image.shape[0], image.shape[1]
+    height = image.shape[0]
+    width = image.shape[1]
     depth = np.empty(BAND * width * COUNT, np.float32)
     colour = np.empty(BAND * width * COUNT, np.uint32)
     while True:
@@ -252,7 +253,8 @@ def draw_bands(cursor, lines, box_edges, shapes, stretch, image):
 @kernel
 def _resolve(band_row, colour, image):
     """Average the samples of a band into the image."""
-    height, width = image.shape[0], image.shape[1]
+    height = image.shape[0]
+    width = image.shape[1]
     for row in range(band_row, min(band_row + BAND, height)):
         for column in range(width):
             first = ((row - band_row) * width + column) * COUNT

@@ -55,7 +55,8 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         InputError: Truncated file, missing properties, or fewer chunks than the Gaussians need.
     """
     header = read_ply_header(path)
-    chunk_rows, rows = read_ply_element(header, "chunk"), read_ply_element(header, "vertex")
+    chunk_rows = read_ply_element(header, "chunk")
+    rows = read_ply_element(header, "vertex")
     _check(header, chunk_rows, rows)
     chunk = np.arange(len(rows)) // CHUNK
     bounds = {name: chunk_rows[name].astype(np.float64) for name in chunk_rows.dtype.names or ()}
@@ -229,7 +230,8 @@ class SpzHeader:
     @property
     def stream_bytes(self) -> tuple[int, int, int, int, int, int]:
         """Sizes of positions, alphas, colours, scales, rotations and harmonics once unpacked."""
-        n, rotation = self.count, 3 if self.version < 3 else 4
+        n = self.count
+        rotation = 3 if self.version < 3 else 4
         return 9 * n, n, 3 * n, 3 * n, rotation * n, 3 * n * ((self.sh_degree + 1) ** 2 - 1)
 
 
@@ -255,7 +257,8 @@ def read_spz(path: Path | str) -> GaussianArrays:
     header = _parse_header(path, data)
     if header.version == 4:
         table = struct.unpack_from("<I", data, 16)[0]
-        at, streams = table + 16 * data[15], []
+        at = table + 16 * data[15]
+        streams = []
         for i, need in enumerate(header.stream_bytes):
             if need == 0:
                 streams.append(np.zeros(0, np.uint8))
@@ -283,7 +286,8 @@ def read_spz(path: Path | str) -> GaussianArrays:
 
 def _stated_axes(path: Path, data: bytes) -> str:
     """Return the axes that extensions state: records of a type, a length and as many bytes."""
-    at, system = 0, SYSTEMS[0]
+    at = 0
+    system = SYSTEMS[0]
     while at < len(data):
         with parsing(path, _EXPORT_AGAIN, "damaged extensions"):
             kind, size = struct.unpack_from("<II", data, at)
@@ -303,7 +307,8 @@ def _in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
     means, quats, sh = arrays.means, arrays.quats, arrays.sh
     if np.linalg.det(M) < 0:
         M = M * [-1, 1, 1]
-        means, quats = means * [-1, 1, 1], quats * [1, 1, -1, -1]
+        means = means * [-1, 1, 1]
+        quats = quats * [1, 1, -1, -1]
         # The harmonic of order m holds x to the power of |m|, or one more where m is negative.
         orders = [m for degree in range(5) for m in range(-degree, degree + 1)]
         odd = np.array([(abs(m) + (m < 0)) % 2 for m in orders])[: sh.shape[1]]
@@ -333,7 +338,8 @@ def unpack_smallest_three(packed: U8) -> F64:
 
 
 def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
-    n, k = header.count, (header.sh_degree + 1) ** 2
+    n = header.count
+    k = (header.sh_degree + 1) ** 2
     positions, alphas, colours, scales, rotations, harmonics = streams
     parts = positions.reshape(n, 3, 3).astype(np.int32)
     fixed = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16

@@ -116,7 +116,8 @@ def _read(get: Get, where: Path) -> GaussianArrays:
         return pixels[:least]
 
     low, high = (plane(name, n)[:, :3].astype(np.float64) for name in meta["means"]["files"])
-    mins, maxs = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    mins = np.array(meta["means"]["mins"])
+    maxs = np.array(meta["means"]["maxs"])
     logs = mins + (low + 256 * high) / 65535 * (maxs - mins)
     means = np.sign(logs) * np.expm1(np.abs(logs))
     scales = np.exp(
@@ -165,8 +166,10 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -> F64:
     """Return the higher harmonics ``(N, K, 3)``."""
-    count, bands = int(facts["count"]), int(facts["bands"])
-    coefficients, codebook = BANDS[bands], np.array(facts["codebook"], np.float64)
+    count = int(facts["count"])
+    bands = int(facts["bands"])
+    coefficients = BANDS[bands]
+    codebook = np.array(facts["codebook"], np.float64)
     rows = -(-count // PALETTE_WIDTH)
     centroids = plane(facts["files"][0], rows * PALETTE_WIDTH * coefficients)[:, :3]
     palette = codebook[centroids].reshape(rows * PALETTE_WIDTH, coefficients, 3)

@@ -34,7 +34,8 @@ STRIDE = 2  # every such pixel is measured, in rows and columns
 RESIDUAL_PX = 0.7  # between flow and what the depth predicts
 LEAST_SUPPORT = 3  # neighbours that agree; two at the ends of the way
 NOISE_PX, LARGEST_SPREAD = 0.25, 0.10  # of flow; of a depth, as a share of it
-NEAR_M, FAR_M = 0.5, 300.0
+NEAR_M = 0.5
+FAR_M = 300.0
 LEAST_STEP = 1.2  # levels of brightness from pixel to pixel, within two pixels
 ROUNDS = 3
 FEWEST_POINTS = 12  # that tracks must place in a view
@@ -84,7 +85,8 @@ def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int
     good = (placed.error_px[rows] < 1.5) & (local > NEAR_M)
     if good.sum() < FEWEST_POINTS:
         return None
-    at, q = tracks.at[rows][good], 1 / local[good]
+    at = tracks.at[rows][good]
+    q = 1 / local[good]
     v, u = np.mgrid[0 : camera.height : 4, 0 : camera.width : 4] + 0.5
     inside = scipy.interpolate.LinearNDInterpolator(at, q)(u, v)
     outside = scipy.interpolate.NearestNDInterpolator(at, q)(u, v)
@@ -116,10 +118,8 @@ class _Seen:
         """Warp the neighbour by the guess, find the rest by flow."""
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32) + np.float32(0.5)
         T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
-        H, b = (
-            (other.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32),
-            (other.K @ T[:3, 3]).astype(np.float32),
-        )
+        H = (other.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32)
+        b = (other.K @ T[:3, 3]).astype(np.float32)
         a = u[..., None] * H[:, 0] + v[..., None] * H[:, 1] + H[:, 2]
         p = a + guess[..., None] * b
         at = p[..., :2] / np.maximum(p[..., 2:], 1e-3)
@@ -131,10 +131,8 @@ class _Seen:
             borderMode=cv2.BORDER_REPLICATE,
         )
         rest = flow.calc(grey, warped, None)
-        x, y = (
-            (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE],
-            (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE],
-        )
+        x = (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE]
+        y = (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE]
         at = cv2.remap(at, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         h, w = there.shape[:2]
         ok = (
@@ -160,14 +158,16 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
     """Find each measured pixel's inverse depth from where the neighbours see it, and how far they agree."""
     q = guess[::STRIDE, ::STRIDE].copy()
     for _ in range(ROUNDS):
-        H, g = np.full(q.shape, 1e-9, np.float32), np.zeros_like(q)
+        H = np.full(q.shape, 1e-9, np.float32)
+        g = np.zeros_like(q)
         for other in seen:
             e, J = other.error(q)
             weight = other.ok / np.maximum(np.linalg.norm(e, axis=2), 0.5)
             H += weight * (J * J).sum(axis=2)
             g += weight * (J * e).sum(axis=2)
         q = np.clip(q - g / H, 0.0, 1 / NEAR_M).astype(np.float32)
-    support, information = np.zeros(q.shape, np.int32), np.zeros_like(q)
+    support = np.zeros(q.shape, np.int32)
+    information = np.zeros_like(q)
     for other in seen:
         e, J = other.error(q)
         good = other.ok & (np.linalg.norm(e, axis=2) < RESIDUAL_PX)
@@ -196,7 +196,8 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
     local = camera.unprojected(rows, columns, z)
-    confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
+    confirmed = np.zeros(len(z), bool)
+    asked = np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
             other = views[i + gap].camera

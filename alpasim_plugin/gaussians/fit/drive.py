@@ -219,9 +219,7 @@ def _between(views: Sequence[PosedView], view: PosedView) -> tuple[float, float,
     were.
     """
     mine = [other for other in views if other.camera_name == view.camera_name] or list(views)
-    centres, gains = (
-        np.array([other.camera.centre_world for other in mine]),
-        np.array([other.gain for other in mine]),
-    )
+    centres = np.array([other.camera.centre_world for other in mine])
+    gains = np.array([other.gain for other in mine])
     red, green, blue = gain_between(centres, gains, view.camera.centre_world)
     return float(red), float(green), float(blue)

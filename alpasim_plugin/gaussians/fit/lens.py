@@ -173,7 +173,8 @@ def _solved(value: F64, view: I64, point: I64, views: int, points: int) -> F64:
     """Solve value = gain[view] + surface[point] for the gains: surfaces are means of what is left,
     so only V unknowns remain.
     """
-    gain, weight = np.zeros(views), np.ones(len(value))
+    gain = np.zeros(views)
+    weight = np.ones(len(value))
     for _ in range(ROUNDS):
         total = np.maximum(np.bincount(point, weight, points), 1e-12)
         seen = scipy.sparse.csr_matrix((weight, (view, point)), shape=(views, points))

@@ -176,7 +176,8 @@ class SplatFit:
         Raises:
             InfrastructureError: The loss or a gradient is not finite.
         """
-        target, recipe = self._next_view(), self.recipe
+        target = self._next_view()
+        recipe = self.recipe
         numbers = self._differentiate(target)
         if not math.isfinite(numbers["loss"]):
             self._stop(target, f"loss {numbers['loss']}")
@@ -268,7 +269,8 @@ class SplatFit:
 
     def _named(self) -> dict[str, dict[str, Tensor]]:
         """Return the tensors of the model and of both optimisers, by where they belong."""
-        adam, exposure = self.adam, self.exposure.adam
+        adam = self.adam
+        exposure = self.exposure.adam
         moments = {"first": adam.first, "second": adam.second}
         return {
             "value": self.model.params,
@@ -306,7 +308,8 @@ class SplatFit:
         return (self.coarse if begins else self.targets)[chosen]
 
     def _target(self, index: int, view: PosedView) -> _Target:
-        camera, device = view.camera, self.device
+        camera = view.camera
+        device = self.device
         T = camera.T_camera_world.copy()
         T[:3, 3] += T[:3, :3] @ self.model.origin
         rgb = upload(view.rgb, device).float() / 255

@@ -78,7 +78,8 @@ class SplatModel:
         names = tuple(sorted(start.actors))
         clouds = [start.background, *(start.actors[name] for name in names)]
         moved = [clouds[0].means - origin, *(c.means for c in clouds[1:])]
-        joined, size = GaussianCloud.concatenate(clouds), SH_SIZES[sh_degree]
+        joined = GaussianCloud.concatenate(clouds)
+        size = SH_SIZES[sh_degree]
         sh = np.zeros((len(joined), size, 3))
         have = min(size, joined.sh.shape[1])
         sh[:, :have] = joined.sh[:, :have]
@@ -100,9 +101,12 @@ class SplatModel:
 
     def motion(self, poses: Mapping[str, F64]) -> Motion:
         """Turn a view's actor poses ``T_world_box`` into tensors."""
-        m, size = len(self.actors) + 1, 1 + self.params["sh_rest"].shape[1]
-        present, T = np.zeros(m, bool), np.tile(np.eye(4), (m, 1, 1))
-        quat, harmonics = np.tile(np.eye(4), (m, 1, 1)), np.tile(np.eye(size), (m, 1, 1))
+        m = len(self.actors) + 1
+        size = 1 + self.params["sh_rest"].shape[1]
+        present = np.zeros(m, bool)
+        T = np.tile(np.eye(4), (m, 1, 1))
+        quat = np.tile(np.eye(4), (m, 1, 1))
+        harmonics = np.tile(np.eye(size), (m, 1, 1))
         present[0] = True
         for i, name in enumerate(self.actors, start=1):
             if name in poses:
@@ -222,11 +226,13 @@ class RowAdam:
         gradient stays as it is.
         """
         self.step += 1
-        correct1, correct2 = 1 - BETA1**self.step, 1 - BETA2**self.step
+        correct1 = 1 - BETA1**self.step
+        correct2 = 1 - BETA2**self.step
         for name, p in params.items():
             if p.grad is None:
                 continue
-            m, v = self.first[name], self.second[name]
+            m = self.first[name]
+            v = self.second[name]
             m.lerp_(p.grad, 1 - BETA1)
             v.mul_(BETA2).addcmul_(p.grad, p.grad, value=1 - BETA2)
             p.addcdiv_(m, (v / correct2).sqrt_().add_(EPS), value=-rates[name] / correct1)
@@ -344,7 +350,8 @@ def densify(
     room = max(recipe.cap - len(model), 0)
     wanted = wanted[torch.sort(pull[wanted], descending=True, stable=True).indices[:room]]
     large = size[wanted] > math.log(max(recipe.dense_share * extent_m, 1e-9))
-    clones, splits = wanted[~large], wanted[large]
+    clones = wanted[~large]
+    splits = wanted[large]
     kept = torch.ones(len(model), dtype=torch.bool)
     kept[splits] = False
     old = torch.nonzero(kept)[:, 0]
@@ -360,7 +367,8 @@ def densify(
     turned = along + 2 * torch.linalg.cross(u, torch.linalg.cross(u, along) + w[:, None] * along)
     p["means"][halves] += turned
     p["log_scales"][halves] -= math.log(SPLIT_SHRINK)
-    size, logits = size[rows], logits[rows]
+    size = size[rows]
+    logits = logits[rows]
     size[halves] -= math.log(SPLIT_SHRINK)
     faint = logits < math.log(recipe.prune_opacity / (1 - recipe.prune_opacity))
     oversized = size > math.log(recipe.prune_share * extent_m)

@@ -246,7 +246,8 @@ def resized(view: PosedView, width: int) -> PosedView:
 
 
 def _photograph(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> PosedPhotograph:
-    file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
+    file = _file(folder, frame, "file_path", where)
+    camera = frame.get("camera")
     t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us")
     pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
     return PosedPhotograph(
@@ -280,7 +281,8 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
             if "w" in frame or not os.path.isfile(file)
             else check_image(read_bytes(file, SOURCE_BYTES), file)
         )
-        width, height = int(size[0]), int(size[1])
+        width = int(size[0])
+        height = int(size[1])
         if "fl_x" not in frame and "camera_angle_x" in frame:
             focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
             frame = {"fl_y": focal, "cx": width / 2, "cy": height / 2, **frame, "fl_x": focal}

@@ -83,11 +83,13 @@ def _blurred_on_card(image: Tensor, window: Tensor) -> Tensor:
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: SsimTarget) -> Tensor:
-        x, my = image.detach().contiguous(), target.mean
+        x = image.detach().contiguous()
+        my = target.mean
         mx = target.blur(x)
         mxx = target.blur(x * x)
         mxy = target.blur(x * target.y)
-        a1, a2 = 2 * mx * my + C1, 2 * (mxy - mx * my) + C2
+        a1 = 2 * mx * my + C1
+        a2 = 2 * (mxy - mx * my) + C2
         b1 = mx * mx + my * my + C1
         b2 = mxx - mx * mx + target.square - my * my + C2
         over = (b1 * b2).reciprocal()

@@ -119,7 +119,8 @@ class Reconstruction:
 
 def sky_of(views: Sequence[PosedView]) -> Sky | None:
     """Return the sky that the views saw; None where no view has a sky pixel."""
-    total, weight = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
+    total = np.zeros((HEIGHT, WIDTH, 3))
+    weight = np.zeros((HEIGHT, WIDTH))
     for view in views:
         if view.sky is not None:
             rows, columns = np.nonzero(

@@ -33,7 +33,8 @@ RANGE_ERROR_M, RANGE_ERROR_SHARE = (
 # the ground
 BOX_MARGIN_M = 0.1
 START_OPACITY = 0.3
-SMALLEST_M, LARGEST_M = 0.01, 3.0
+SMALLEST_M = 0.01
+LARGEST_M = 3.0
 FEWEST_POINTS = 4  # an actor seen less often gets no model
 # an actor's points are sampled this many times as densely as the background, because they are few
 # and seen from near

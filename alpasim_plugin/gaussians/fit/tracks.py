@@ -110,8 +110,10 @@ def follow(views: Sequence[PosedView]) -> Tracks:
                 & (moved[:, 0] <= grey.shape[1] - 1)
                 & (moved[:, 1] <= grey.shape[0] - 1)
             )
-            points, kept = moved, (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
-            points, ids = points[kept], ids[kept]
+            points = moved
+            kept = (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
+            points = points[kept]
+            ids = ids[kept]
     view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
     all_ = Tracks(view[order], point[order], at[order], count)
@@ -277,8 +279,10 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     """Return changes of the poses ``(V, 6)`` (turn and shift in the camera's frame) and of the
     points ``(P, 3)``.
     """
-    view, point = tracks.view, tracks.point
-    views, points = len(R), len(xyz)
+    view = tracks.view
+    point = tracks.point
+    views = len(R)
+    points = len(xyz)
     error, slope, local = residuals(xyz, tracks, R, t, K)
     x, y, z = local.T
     o = np.zeros_like(x)

@@ -84,7 +84,8 @@ def logged_views(
         actors = log_actors(scenario, t_us)
         for spec in scenario.cameras:
             scale = min(1.0, width / np.sqrt(spec.width * spec.height * 16 / 9))
-            w, h = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
+            w = max(1, round(spec.width * scale))
+            h = max(1, round(spec.height * scale))
             K = spec.K.copy()
             K[0] *= w / spec.width
             K[1] *= h / spec.height
@@ -120,7 +121,8 @@ def halved(view: PosedView) -> PosedView:
     four do, and its depth is the first's.
     """
     camera = view.camera
-    h, w = camera.height // 2, camera.width // 2
+    h = camera.height // 2
+    w = camera.width // 2
     K = camera.K.copy()
     K[:2] /= 2
     rgb = cv2.resize(view.rgb[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)

@@ -53,7 +53,8 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
     behind the last splat drawn.
     """
     pixels[:] = _f(0.0)
-    live, end = 0, 0
+    live = 0
+    end = 0
     for block in range(16):
         at = (tile * 16 + block) * KEPT
         base = block * _BACK
@@ -125,7 +126,8 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             to_depth = v.fma(weight, g_depth, to_depth)
             # The clamp of alpha ends the gradient; colour and depth above still receive theirs.
             h = v.select(full <= ALPHA_MAX, alpha * v.fnma(behind, inverse, before * q), 0.0)
-            h_s, h_t = h * s, h * t
+            h_s = h * s
+            h_t = h * t
             m = m + h
             m_s = m_s + h_s
             m_t = m_t + h_t
@@ -169,9 +171,11 @@ def tile_gradients(
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:
             return
-        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        tile_x = tile % tiles_x
+        tile_y = tile // tiles_x
         live, end = _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth)
-        x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
+        x0 = _f(tile_x * TILE) + _f(0.5)
+        y0 = _f(tile_y * TILE) + _f(0.5)
         _tile_backward(starts[tile], end, lists, records, x0, y0, pixels, live, pairs)
 
 

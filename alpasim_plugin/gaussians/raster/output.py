@@ -52,7 +52,8 @@ class RasterOutput:
             again: Draws the image with all parts once more, where a device lacked room for one;
                 alone in a list.
         """
-        rgb, alpha = np.zeros((height, width, 3), np.float32), np.ones((height, width), np.float32)
+        rgb = np.zeros((height, width, 3), np.float32)
+        alpha = np.ones((height, width), np.float32)
         return RasterOutput(rgb, alpha, np.zeros_like(alpha))
 
     def beside(self, array: FloatArray | Bool) -> Any:

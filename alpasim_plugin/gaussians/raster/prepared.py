@@ -63,7 +63,8 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     """
     cloud.require_drawable()
     index = np.flatnonzero(cloud.opacities >= ALPHA_MIN)
-    n, size = len(index), cloud.sh.shape[1]
+    n = len(index)
+    size = cloud.sh.shape[1]
     kept = cloud.take(index)
     opacity = kept.opacities.astype(np.float64)
     geometry = np.zeros((n, GEO_SIZE), np.float32)

@@ -171,13 +171,17 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     right = _row(pose, POSE_ROTATION)
     down = _row(pose, POSE_ROTATION + 3)
     ahead = _row(pose, POSE_ROTATION + 6)
-    fx, fy = camera[CAM_FX], camera[CAM_FY]
-    x, y = _dot(right, d), _dot(down, d)
+    fx = camera[CAM_FX]
+    fy = camera[CAM_FY]
+    x = _dot(right, d)
+    y = _dot(down, d)
     if camera[CAM_REACH] > 0:
         x, y, z = _at_its_time((x, y, z), _row(pose, POSE_TURN), _row(pose, POSE_SHIFT), camera)
     inverse_z = 1.0 / z
-    slope_x, slope_y = x * inverse_z, y * inverse_z
-    u, w = v.fma(fx, slope_x, camera[CAM_CX]), v.fma(fy, slope_y, camera[CAM_CY])
+    slope_x = x * inverse_z
+    slope_y = y * inverse_z
+    u = v.fma(fx, slope_x, camera[CAM_CX])
+    w = v.fma(fy, slope_y, camera[CAM_CY])
     a = v.minimum(v.maximum(slope_x, camera[CAM_SLOPE_LOW_X]), camera[CAM_SLOPE_HIGH_X])
     b = v.minimum(v.maximum(slope_y, camera[CAM_SLOPE_LOW_Y]), camera[CAM_SLOPE_HIGH_Y])
 
@@ -192,9 +196,11 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     mn = _dot(m, n)
     antialias = pose[POSE_ANTIALIAS]
     eps = antialias if antialias > 0 else EPS2D_PX2
-    c11, c22 = mm + eps, nn + eps
+    c11 = mm + eps
+    c22 = nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
-    radius_x, radius_y = extent * v.sqrt(c11), extent * v.sqrt(c22)
+    radius_x = extent * v.sqrt(c11)
+    radius_y = extent * v.sqrt(c22)
     mask = mask & (u + radius_x + MARGIN_PX >= 0.5) & (w + radius_y + MARGIN_PX >= 0.5)
     mask = mask & (u - radius_x - MARGIN_PX <= camera[CAM_WIDTH] - 0.5)
     mask = mask & (w - radius_y - MARGIN_PX <= camera[CAM_HEIGHT] - 0.5)
@@ -225,7 +231,8 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
             lanes[lane] = np.log2(lanes[lane]) / 16
         peak = peak + v.load(lanes, PEAK * 16)
         chosen &= v.bits(peak >= _CUT)
-    corner_s, corner_t = BLOCK_HALF * (l11 + v.absolute(l12)), BLOCK_HALF * l22
+    corner_s = BLOCK_HALF * (l11 + v.absolute(l12))
+    corner_t = BLOCK_HALF * l22
     block_radius = (
         v.sqrt(peak - _CUT) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + 1e-3
     )

@@ -57,7 +57,8 @@ CUT = _f((np.log2(ALPHA_MIN) + 4.0) / 8.0)
 STATE_T, STATE_R, STATE_G, STATE_B, STATE_D, STATE = range(0, 96, 16)
 # What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen
 # pixels each.
-KEPT_T, KEPT_LAST = 0, 16
+KEPT_T = 0
+KEPT_LAST = 16
 KEPT = 32
 CHUNK = 256  # splats of a tile that are taken at once, a multiple of 64
 
@@ -106,7 +107,8 @@ def whitened(records, at, x, y):
     """Return ``s`` and ``t`` at sixteen pixel centres: the splat's exponent is ``peak - s^2 -
     t^2``.
     """
-    dx, dy = x - records[at + U], y - records[at + V]
+    dx = x - records[at + U]
+    dy = y - records[at + V]
     s = v.fma(records[at + L11], dx, records[at + L12] * dy)
     return s, records[at + L22] * dy
 
@@ -241,15 +243,18 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:
             return
-        tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
+        tile_x = tile % tiles_x
+        tile_y = tile // tiles_x
+        x0 = _f(tile_x * TILE) + _f(0.5)
+        y0 = _f(tile_y * TILE) + _f(0.5)
         live = start_tile(state, x0, y0, width, height)
         kept_at = tile * 16 * KEPT
         if kept is not None:
             for at in range(kept_at, kept_at + 16 * KEPT, KEPT):
                 v.store(kept, at + KEPT_T, v.splat(_f(1.0)))
                 v.store(kept, at + KEPT_LAST, v.splat(_f(-1.0)))
-        first, end = starts[tile], starts[tile + 1]
+        first = starts[tile]
+        end = starts[tile + 1]
         composite_tile(lists, first, end, records, x0, y0, state, live, kept, kept_at, near, masks)
         for row in range(min(TILE, height - tile_y * TILE)):
             y = tile_y * TILE + row

@@ -151,7 +151,8 @@ class TileLists:
 def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int) -> TileLists:
     """List projected records per tile; ``order`` is that of `depth_order`."""
     count = len(order)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    tiles_x = -(-camera.width // TILE)
+    tiles_y = -(-camera.height // TILE)
     # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(2048, -(-count // 64))

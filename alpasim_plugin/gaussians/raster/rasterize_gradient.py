@@ -185,7 +185,8 @@ def rasterize_gradient(
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
         records = _records(*projected, scale)
-        centre, reach = records[:, U : V + 1], records[:, RADIUS_X : RADIUS_Y + 1]
+        centre = records[:, U : V + 1]
+        reach = records[:, RADIUS_X : RADIUS_Y + 1]
         last = upload([camera.width - 0.5, camera.height - 0.5], records.device)
         on_screen = ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
         if compositor is None:
@@ -237,8 +238,10 @@ def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     x, y, z = local[:, index]
     low_x, high_x, low_y, high_y = camera.slope_limits()
     largest = splats.log_scales.index_select(0, index).amax(dim=1).exp() / z
-    slope_x, slope_y = x / z, y / z
-    steep_x, steep_y = slope_x.clamp(low_x, high_x), slope_y.clamp(low_y, high_y)
+    slope_x = x / z
+    slope_y = y / z
+    steep_x = slope_x.clamp(low_x, high_x)
+    steep_y = slope_y.clamp(low_y, high_y)
     inside = torch.ones(len(index), dtype=torch.bool)
     for slope, steep, focal, middle, size in (
         (slope_x, steep_x, camera.fx, camera.cx, camera.width),
@@ -287,7 +290,8 @@ def _ellipses(
     low_x, high_x, low_y, high_y = camera.slope_limits()
     right, down, ahead = upload(camera.T_camera_world[:3, :3, None], local.device).float()
     x, y, z = local
-    slope_x, slope_y = x / z, y / z
+    slope_x = x / z
+    slope_y = y / z
     uv = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=1)
     j = camera.fx / z * (right - slope_x.clamp(low_x, high_x) * ahead)
     k = camera.fy / z * (down - slope_y.clamp(low_y, high_y) * ahead)
@@ -326,7 +330,8 @@ def _records(
     """
     c11, c12, c22, det = _covariance(m, n)
     extent = (2 * (log_opacity - np.log(ALPHA_MIN))).clamp(min=0).sqrt().clamp(max=EXTENT_MAX_SIGMA)
-    radius_x, radius_y = extent * c11.sqrt(), extent * c22.sqrt()
+    radius_x = extent * c11.sqrt()
+    radius_y = extent * c22.sqrt()
     l11 = scale * (c22 / det).sqrt()
     l12 = -l11 * c12 / c22
     l22 = scale * c22.rsqrt()
@@ -374,7 +379,8 @@ def _on_gpu(
     camera: PinholeCamera,
     compositor: TileCompositor,
 ) -> tuple[Images, Sums, Tensor]:
-    centre, reach = records[:, U : V + 1], records[:, RADIUS_X : RADIUS_Y + 1]
+    centre = records[:, U : V + 1]
+    reach = records[:, RADIUS_X : RADIUS_Y + 1]
     tiles = upload(tile_grid(camera), records.device)
     first = ((centre - reach) / TILE).floor().clamp(min=0).minimum(tiles)
     end = ((centre + reach) / TILE).floor().clamp(min=-1).minimum(tiles - 1) + 1
@@ -410,7 +416,8 @@ class _Composite(torch.autograd.Function):
         scale: float,
     ) -> Images:
         ctx.save_for_backward(m, n, colour)
-        ctx.sums, ctx.scale = sums, scale
+        ctx.sums = sums
+        ctx.scale = scale
         return images
 
     @staticmethod
@@ -425,11 +432,13 @@ class _Composite(torch.autograd.Function):
         sums = ctx.sums(*gradients).T.contiguous()
         _, c12, c22, det = _covariance(m, n)
         # The moments are over whitened coordinates times the scale: each w holds one.
-        w11, w22 = (c22 / det).sqrt() / ctx.scale, c22.rsqrt() / ctx.scale
+        w11 = (c22 / det).sqrt() / ctx.scale
+        w22 = c22.rsqrt() / ctx.scale
         w12 = -w11 * c12 / c22
         by_u = w11 * sums[PAIR_S]
         by_v = w12 * sums[PAIR_S] + w22 * sums[PAIR_T]
-        s, t = w11 * m + w12 * n, w22 * n
+        s = w11 * m + w12 * n
+        t = w22 * n
         a = sums[PAIR_SS] * s + sums[PAIR_ST] * t
         b = sums[PAIR_ST] * s + sums[PAIR_TT] * t
         by_colour = torch.where(colour > 0, sums[PAIR_R : PAIR_R + 3].T, 0.0)

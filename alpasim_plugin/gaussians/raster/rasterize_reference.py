@@ -172,8 +172,10 @@ def composite_reference(
         Colour ``(H, W, 3)`` with background, not clamped; alpha ``(H, W)``; depth ``(H, W)``,
         metres, 0 where alpha is 0.
     """
-    height, width = camera.height, camera.width
-    rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
+    height = camera.height
+    width = camera.width
+    rows = np.arange(height) + 0.5
+    columns = np.arange(width) + 0.5
     colour = np.zeros((height, width, 3))
     depth_sum = np.zeros((height, width))
     transmittance = np.ones((height, width))

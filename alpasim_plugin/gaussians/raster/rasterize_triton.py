@@ -118,7 +118,8 @@ class TileCompositor:
         """
         kernels, width, height = self.kernels, camera.width, camera.height
         tiles_x, tiles_y = tile_grid(camera)
-        total, tile_count = len(records), views * tiles_x * tiles_y
+        total = len(records)
+        tile_count = views * tiles_x * tiles_y
         order = torch.sort(depths, stable=True).indices
         ends = torch.cumsum(counts[order], dim=0)
         tiles = torch.full((self.capacity,), tile_count, dtype=torch.int32, device=self.device)

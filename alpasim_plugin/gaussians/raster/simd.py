@@ -269,7 +269,8 @@ def total(typingctx, a):
     """
 
     def codegen(context, builder, sig, args):
-        value, lanes = args[0], LANES
+        value = args[0]
+        lanes = LANES
         while lanes > 1:
             lanes //= 2
             low, high = (

@@ -74,7 +74,8 @@ class Loft:
             colours.append(rgb)
             gloss.append(shine)
 
-        low, last = self.clearance, len(self.x) - 1
+        low = self.clearance
+        last = len(self.x) - 1
         stations = []  # x, and the outline: y and z of: lower edge, sill, belt line, roof
         for i, (belt, roof) in enumerate(zip(self.belt, self.roof, strict=True)):
             half = 0.45 if i in (0, last) else 0.5
@@ -98,7 +99,8 @@ class Loft:
             add(cover, *covers[cover_kind])
         for i, sign in ((0, 1.0), (last, -1.0)):
             (w, _), (_, belt), (roof_half, roof) = stations[i][1][1:]
-            belt, x = min(belt, roof), self.x[i]
+            belt = min(belt, roof)
+            x = self.x[i]
             add(_end(x, sign, (w, low), (w, belt)), body, 0.12)
             if roof - belt > 0.05:
                 glazed = sign > 0 or self.rear_glass

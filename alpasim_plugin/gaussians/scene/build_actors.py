@@ -99,7 +99,8 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
         parts = GaussianCloud.concatenate([cloud, _shadow(actor.box, actor.label)])
         return SceneNode(actor.actor_id, "actor", (Level(0.0, parts),))
     rng = stream(scenario.scene_id, scenario.seed, f"scene/actor/{actor.actor_id}")
-    draw, noise = rng.random(8), rng.standard_normal(4096)
+    draw = rng.random(8)
+    noise = rng.standard_normal(4096)
     shape = _SHAPES.get(actor.label, _other)
     levels = []
     coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
@@ -152,7 +153,8 @@ def _blobs(
 
 def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     """Draw head lamps, tail lamps and number plates on the two ends."""
-    half, z = box.length_m / 2, loft.lamp_z * box.height_m - box.height_m / 2
+    half = box.length_m / 2
+    z = loft.lamp_z * box.height_m - box.height_m / 2
     y = 0.36 * box.width_m
     plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
     end = half + 0.02
@@ -189,9 +191,11 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
 
 
 def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> GaussianCloud:
-    kind, colours = label, {"truck": TRUCK_RGB, "bus": BUS_RGB}.get(label, BODY_RGB)
+    kind = label
+    colours = {"truck": TRUCK_RGB, "bus": BUS_RGB}.get(label, BODY_RGB)
     if label == "truck" and box.length_m < 6.0 and box.height_m < 2.3:
-        kind, colours = "pickup", BODY_RGB
+        kind = "pickup"
+        colours = BODY_RGB
     if label == "car":
         kind = "hatch" if draw[1] < 0.4 else "sedan"
         if box.height_m > 1.65:
@@ -229,7 +233,8 @@ def _person(
     """Return a standing or riding figure with its feet at ``(x0, 0, z0)``; ``lean`` and ``stride``
     are shares of its height.
     """
-    h, w = height_m, min(max(width_m, 0.45), 0.75)
+    h = height_m
+    w = min(max(width_m, 0.45), 0.75)
     coat = _drawn(CLOTHES_RGB, draw[2])
     legs = _drawn(CLOTHES_RGB, draw[3]) * 0.8
     skin = _drawn(SKIN_RGB, draw[4])
@@ -262,7 +267,8 @@ def _pedestrian(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud
 
 def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) -> GaussianCloud:
     """Put a rider on two wheels and a frame."""
-    length, height = box.length_m, box.height_m
+    length = box.length_m
+    height = box.height_m
     radius = min(0.34, 0.21 * length)
     bottom = -height / 2
     wheel_x = np.array([1.0, -1.0]) * (length / 2 - radius)
@@ -304,12 +310,14 @@ def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
             means, IDENTITY, np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb
         )
     x, y, z = length / 2, width / 2, height / 2
-    faces, colours = [], []
+    faces = []
+    colours = []
     for turn in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         middle = np.array([*turn, 0]) * [x, y, 0]
         side = np.array([-turn[1] * x, turn[0] * y, 0.0])
         for k in range(4):
-            low, high = np.array([0, 0, -z + z * k / 2]), np.array([0, 0, -z + z * (k + 1) / 2])
+            low = np.array([0, 0, -z + z * k / 2])
+            high = np.array([0, 0, -z + z * (k + 1) / 2])
             ring = (
                 middle - side + low,
                 middle + side + low,

@@ -28,7 +28,8 @@ from alpasim_plugin.gaussians.scene.surfels import (
 
 SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not
 WITHIN_M = 75.0
-FLOOR_M, BAY_M = 3.1, 3.0
+FLOOR_M = 3.1
+BAY_M = 3.0
 WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
@@ -94,7 +95,8 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
         "awning": AWNINGS[rng.integers(len(AWNINGS), size=m)],
         "wide": rng.random(m) < 0.35,
     }
-    right, left = houses.front[:, 0], houses.front[:, 1]
+    right = houses.front[:, 0]
+    left = houses.front[:, 1]
     back = DEPTH_M * houses.away
     starts = np.concatenate([right, left, right + back, left + back])
     ends = np.concatenate([left, left + back, right, right + back])
@@ -152,7 +154,8 @@ def lit_windows(site: Site, houses: Houses) -> tuple[float, F64, F64]:
     """Return half the size of the windows that have light at night, their middles ``(N, 3)`` and
     where they face ``(N, 3)``; shops are dark.
     """
-    start, end = houses.front[:, 0], houses.front[:, 1]
+    start = houses.front[:, 0]
+    end = houses.front[:, 1]
     floors = cell_counts(houses.height_m, FLOOR_M)
     bays = cell_counts(np.linalg.norm(end - start, axis=1), BAY_M)
     house, u, v = grid_cells(bays, floors)
@@ -190,14 +193,18 @@ def _walls(
     """
     starts, ends, base, height, owner, is_front = walls
     length = np.linalg.norm(ends - starts, axis=1)
-    bays, floors = cell_counts(length, BAY_M), cell_counts(height, FLOOR_M)
+    bays = cell_counts(length, BAY_M)
+    floors = cell_counts(height, FLOOR_M)
     finest = CELLS[0][0]
     wall, u, v = grid_cells(bays * finest, floors * finest)
     column = (u * (bays * finest)[wall]).astype(np.int64)
     row = (v * (floors * finest)[wall]).astype(np.int64)
-    bay, floor = column // finest, row // finest
-    fu, fv = (column % finest + 0.5) / finest, (row % finest + 0.5) / finest
-    house, front = owner[wall], is_front[wall]
+    bay = column // finest
+    floor = row // finest
+    fu = (column % finest + 0.5) / finest
+    fv = (row % finest + 0.5) / finest
+    house = owner[wall]
+    front = is_front[wall]
     # One number per window.
     key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
     pick = (key * 48_271 % 2_147_483_647) / 2_147_483_647
@@ -229,7 +236,8 @@ def _walls(
     levels = []
     quats = _facing(site, starts, ends)
     for cells, _ in CELLS:
-        across, up = bays * cells, floors * cells
+        across = bays * cells
+        up = floors * cells
         begin = np.cumsum(across * up) - across * up
         block = finest // cells
         cell = begin[wall] + row // block * across[wall] + column // block
@@ -257,7 +265,8 @@ def _roofs(
     site: Site, houses: Houses, wall_rgb: F64, base: F64, cell_m: float
 ) -> tuple[GaussianCloud, I64]:
     """Cover the flat roofs, so that a house seen from above or afar is closed."""
-    a, b = houses.front[:, 0], houses.front[:, 1]
+    a = houses.front[:, 0]
+    b = houses.front[:, 1]
     length = np.linalg.norm(b - a, axis=1)
     n_u = cell_counts(length, 2 * cell_m)
     n_v = np.full(len(a), max(1, round(DEPTH_M / cell_m / 2)), np.int64)

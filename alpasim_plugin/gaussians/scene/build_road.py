@@ -53,7 +53,8 @@ GRAVEL = (0.46, 0.43, 0.38)
 FORECOURT = (0.47, 0.45, 0.42)
 KERB_M = 0.12
 # Asphalt this near to lane markings lies this much lower, see build_road.
-TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03
+TRENCH_M = 0.16
+TRENCH_DEPTH_M = 0.03
 PAVEMENT_M = 2.6  # width of the pavement beside the road
 FORECOURT_M = 6.5  # paved or planted strip up to the facades
 
@@ -175,7 +176,8 @@ def _verge(site: Site, off: F32, grain: F32, texture: float) -> F64:
     """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then
     forecourt or grass.
     """
-    colour, contrast = np.tile(GRASS, (len(off), 1)), np.full(len(off), 0.20)
+    colour = np.tile(GRASS, (len(off), 1))
+    contrast = np.full(len(off), 0.20)
     if site.highway:
         zones = [(1.0, GRAVEL, 0.08)]
     else:
@@ -230,7 +232,8 @@ def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
         centre = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
         half = rng.uniform([0.6, 0.4], [2.2, 1.2])
         angle = rng.normal(0.0, 0.05)
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         ring = centre + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ np.array(
             [[c, s], [-s, c]]
         )
@@ -288,8 +291,10 @@ def _coverage(
     return mask.astype(np.float32) / 255.0
 
 
-FINE_M, COARSE_M = 0.125, 0.5
-TILE_M, FAR_TILE_M = 16.0, 32.0
+FINE_M = 0.125
+COARSE_M = 0.5
+TILE_M = 16.0
+FAR_TILE_M = 32.0
 CORRIDOR_M = 9.0  # tiles that come this near to the path get the fine levels
 LIFT_M = 0.02
 STROKE_M = 0.125  # length of the finest cells of lane markings for usual cameras
@@ -304,12 +309,14 @@ def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
     # Tiles of the site's raster that come near the path.
     d = site.path_m
     n = round(TILE_M / 0.25)
-    h, w = -(-d.shape[0] // n), -(-d.shape[1] // n)
+    h = -(-d.shape[0] // n)
+    w = -(-d.shape[1] // n)
     padded = np.full((h * n, w * n), np.inf, np.float32)
     padded[: d.shape[0], : d.shape[1]] = d
     fine_tiles = padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
     # The fine tiles in cells of the image.
-    rows, columns = np.flatnonzero(fine_tiles.any(axis=1)), np.flatnonzero(fine_tiles.any(axis=0))
+    rows = np.flatnonzero(fine_tiles.any(axis=1))
+    columns = np.flatnonzero(fine_tiles.any(axis=0))
     n = round(TILE_M / FINE_M)
     fine = paint_ground(
         site,
@@ -397,7 +404,8 @@ def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
     """
     xy = site.frame.to_world(plan)
     z = site.height_at(xy)
-    east, north = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    east = np.array([1.0, 0.0])
+    north = np.array([0.0, 1.0])
     dx = site.height_at(xy + east) - site.height_at(xy - east)
     dy = site.height_at(xy + north) - site.height_at(xy - north)
     normals = np.column_stack([-dx / 2, -dy / 2, np.ones_like(z)])

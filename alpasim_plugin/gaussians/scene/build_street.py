@@ -108,7 +108,8 @@ def _kerb_rows(count: int) -> list[tuple[float, float, tuple[float, float], floa
     if count == 1:
         return [(0.0, 0.4 * KERB_M, (0.05, 0.08), 0.80), (0.08, KERB_M, (0.09, 0.015), 1.05)]
     middles = (np.arange(count) + 0.5) / count
-    face, top = SPREAD * KERB_M / count, SPREAD * KERB_WIDTH_M / count
+    face = SPREAD * KERB_M / count
+    top = SPREAD * KERB_WIDTH_M / count
     return [
         *((0.0, m * KERB_M, (0.01, face), 0.80) for m in middles),
         *((m * KERB_WIDTH_M, KERB_M, (top, 0.01), 1.05) for m in middles),
@@ -232,7 +233,8 @@ def lamp_posts(site: Site, houses: Houses) -> LampPosts:
     tips.
     """
     spacing = site.scenario.environment.poles_spacing_m
-    feet, arms = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    feet = [np.zeros((0, 2))]
+    arms = [np.zeros((0, 2))]
     rng = site.rng("poles")
     if spacing > 0:
         for line in contours(site, 0.7 if not site.highway else 2.0, 60.0):
@@ -240,7 +242,8 @@ def lamp_posts(site: Site, houses: Houses) -> LampPosts:
             free = _free(site, houses, spot.xy, 0.3)
             feet.append(spot.xy[free])
             arms.append(-spot.away[free])
-    at, arm = np.concatenate(feet), np.concatenate(arms)
+    at = np.concatenate(feet)
+    arm = np.concatenate(arms)
     foot = site.world(at)
     top = foot + np.array([0, 0, 6.8])
     tip = site.world(at + 1.7 * arm)
@@ -256,7 +259,8 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
         return []
     starts = [foot, top, *[p[:-1] for p in mapped]]
     ends = [top, tip, *[p[1:] for p in mapped]]
-    start, end = np.concatenate(starts), np.concatenate(ends)
+    start = np.concatenate(starts)
+    end = np.concatenate(ends)
     owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
     items = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
@@ -303,7 +307,8 @@ def _signs(site: Site) -> list[Item]:
     finer = [(usual_m / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
     for cell_m, size in (*finer, (usual_m, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
-        clouds, where = [plates], [plan[owner]]
+        clouds = [plates]
+        where = [plan[owner]]
         if feet:
             posts = rods(np.stack(feet), np.stack(tops), 0.04, POST_RGB, 3.0)
             clouds.append(posts)

@@ -81,7 +81,8 @@ class LongScene(SceneGraph):
         self, scenario: Scenario, height_at: HeightAt, actors: Sequence[SceneNode], sky: Sky
     ) -> None:
         super().__init__([], actors, sky)
-        self._scenario, self._height_at = scenario, height_at
+        self._scenario = scenario
+        self._height_at = height_at
         self._path = path_of(scenario)
         self._sections: dict[int, list[SceneNode]] = {}
         self._lock = Lock()  # a server draws views of several drives at once

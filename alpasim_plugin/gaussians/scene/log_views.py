@@ -61,7 +61,8 @@ class SkyMask:
         if not self._views:
             return np.zeros((camera.height, camera.width), np.float32)
         T = inverse(camera.T_camera_world)
-        R, eye = T[:3, :3], T[:3, 3]
+        R = T[:3, :3]
+        eye = T[:3, 3]
         turned_away = self._axes @ R[:, 2] < 0.5
         nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
         view = self._views[nearest]

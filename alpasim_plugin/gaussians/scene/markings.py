@@ -23,7 +23,8 @@ STEP_M = 0.75  # length of a stroke of a line; a quarter of a dash
 BAR_M = 0.45  # zebra bar and the gap beside it
 STOP_LINE_M = 0.4
 JOINED_M = 0.7  # a line that begins this near to the end of another goes on with its dashes
-WHITE, YELLOW = 0, 1
+WHITE = 0
+YELLOW = 1
 
 
 class Strokes(NamedTuple):
@@ -99,7 +100,8 @@ def _line_strokes(line: F64, mark_type: LaneMarkType, phase_m: float) -> Strokes
     s1 = np.clip(s0 + STEP_M, 0.0, length)
     s0 = np.clip(s0, 0.0, length)
     keep = s1 - s0 > 0.05
-    a, b = resample(line, s0[keep]), resample(line, s1[keep])
+    a = resample(line, s0[keep])
+    b = resample(line, s1[keep])
     if mark_type != "double_yellow":
         return _strokes(a, b, LINE_WIDTH_M, colour)
     side = DOUBLE_OFFSET_M * left_of(unit(b - a))

@@ -92,7 +92,8 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     """Return the Gaussians of each tile; ``tile (N,)`` names the tile of each Gaussian."""
     order = np.argsort(tile, kind="stable")
     ids, first = np.unique(tile[order], return_index=True)
-    ordered, ends = cloud.take(order), [*first[1:], len(order)]
+    ordered = cloud.take(order)
+    ends = [*first[1:], len(order)]
     return {
         int(i): ordered.take(slice(begin, end))
         for i, begin, end in zip(ids, first, ends, strict=True)
@@ -272,14 +273,13 @@ class SceneGraph:
         poses = np.array([actor_poses[node.name] for node in present]).reshape(-1, 4, 4)
         centre, radius = _spheres(present)
         moved = np.einsum("nij,nj->ni", poses[:, :3, :3], centre) + poses[:, :3, 3]
-        centres, radii = (
-            np.concatenate([self._centre, moved]),
-            np.concatenate([self._radius, radius]),
-        )
+        centres = np.concatenate([self._centre, moved])
+        radii = np.concatenate([self._radius, radius])
         distance = np.linalg.norm(centres - camera.centre_world, axis=1) - radii
         seen = in_view(camera, centres, radii)
         seen[: len(self._far)] &= distance[: len(self._far)] < self._far
-        nodes, places = (*self.background, *present), [None] * len(self.background) + list(poses)
+        nodes = (*self.background, *present)
+        places = [None] * len(self.background) + list(poses)
         allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
         return [
             ChosenNode(

@@ -48,7 +48,8 @@ class GroundFrame:
 
     def to_ground(self, xy: F64) -> F64:
         """Map world points ``(N, 2+)`` to ground coordinates ``(N, 2)``."""
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        c = np.cos(self.yaw_rad)
+        s = np.sin(self.yaw_rad)
         d = np.asarray(xy, np.float64)[:, :2] - self.origin_xy
         return np.column_stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]])
 
@@ -58,7 +59,8 @@ class GroundFrame:
 
     def turned(self, plan: F64) -> F64:
         """Turn ground directions ``(N, 2)`` to level world directions ``(N, 3)``."""
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        c = np.cos(self.yaw_rad)
+        s = np.sin(self.yaw_rad)
         return np.column_stack(
             [c * plan[:, 0] - s * plan[:, 1], s * plan[:, 0] + c * plan[:, 1], np.zeros(len(plan))]
         )
@@ -106,7 +108,8 @@ class Site:
     @property
     def owned_cells(self) -> Bool:
         """Return ``(H, W)`` which cells of the rasters lie in tiles that are built."""
-        first, cells = round(HORIZON_M / TILE_M), round(TILE_M / CELL_M)
+        first = round(HORIZON_M / TILE_M)
+        cells = round(TILE_M / CELL_M)
         h, w = self.road.shape
         tiles = self.owned[first:, first:]
         return np.repeat(np.repeat(tiles, cells, axis=0), cells, axis=1)[:h, :w]
@@ -262,7 +265,8 @@ def path_of(scenario: Scenario) -> F64:
     if length < 1.0:
         q = scenario.ego_log.quat[0]
         forward = np.array([1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3]), 0.0])
-        line, length = np.stack([log[0], log[0] + 2.0 * forward]), 2.0
+        line = np.stack([log[0], log[0] + 2.0 * forward])
+        length = 2.0
     return resample(line, np.linspace(0.0, length, max(2, int(np.ceil(length)) + 1)))
 
 
@@ -294,12 +298,14 @@ def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
     lanes = scenario.lane_map.lanes
 
     def abreast(lane: Lane) -> int:
-        count, seen = 1, {lane.lane_id}
+        count = 1
+        seen = {lane.lane_id}
         for side in ("left_neighbour", "right_neighbour"):
             at: Lane | None = lane
             while at is not None and (name := getattr(at, side)) in lanes and name not in seen:
                 seen.add(name)
-                at, count = lanes[name], count + 1
+                at = lanes[name]
+                count = count + 1
         return count
 
     return max((abreast(lane) for lane in near), default=1) >= 4
@@ -357,7 +363,8 @@ def _runs(points: F64, keep: Bool) -> list[F64]:
     if keep.all():
         return [np.concatenate([points, points[:1]])]
     start = int(np.argmin(keep))
-    points, keep = np.roll(points, -start, axis=0), np.roll(keep, -start)
+    points = np.roll(points, -start, axis=0)
+    keep = np.roll(keep, -start)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
     return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
 

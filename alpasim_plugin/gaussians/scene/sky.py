@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 Kind = Literal["clear", "overcast", "dusk"]
 WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
-LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
+LOW_RAD = np.radians(-20.0)
+HIGH_RAD = np.radians(70.0)
 SPAN_PX = np.array([WIDTH, HEIGHT - 1], np.float32)
 PX_PER_RAD = SPAN_PX / np.array([2 * np.pi, LOW_RAD - HIGH_RAD])
 BLOCK = 16  # rows that are painted at once
@@ -77,7 +78,8 @@ class Sky:
 
     def image(self, camera: PinholeCamera) -> F32:
         """Return the sky behind every pixel, ``(H, W, 3)`` float32, 0..1."""
-        h, w = camera.height, camera.width
+        h = camera.height
+        w = camera.width
         columns, rows = (_upsample(grid, h, w) for grid in self._places(camera))
         # All lie within a turn of column 0: what % would give, in a tenth of its time.
         columns += np.float32(WIDTH) * (columns < 0)
@@ -95,7 +97,8 @@ class Sky:
             self._uploaded[device] = [upload(part, device) for part in parts]
         panorama, px_per_rad, shares = self._uploaded[device]
         numbers = upload(np.stack([_seen_from(camera) for camera in cameras]), device)
-        height, width = cameras[0].height, cameras[0].width
+        height = cameras[0].height
+        width = cameras[0].width
         corners = _corners(height, width, device)
         x, y, z = (numbers[:, :9].view(-1, 3, 3) @ corners.flatten(1)).unbind(1)
         angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
@@ -120,9 +123,12 @@ class Sky:
         """Return columns and rows of the panorama at every `STEP_PX`-th pixel corner; columns may
         be negative.
         """
-        h, w = camera.height, camera.width
-        u, v = _steps(w), _steps(h)
-        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        h = camera.height
+        w = camera.width
+        u = _steps(w)
+        v = _steps(h)
+        x = (u - camera.cx) / camera.fx
+        y = (v - camera.cy) / camera.fy
         ray = np.stack(
             [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
         )

@@ -141,18 +141,22 @@ def quad_surfels(
     c = corners.reshape(-1, 4, 3)
     edge_u = (c[:, 1] - c[:, 0] + c[:, 2] - c[:, 3]) / 2
     edge_v = (c[:, 3] - c[:, 0] + c[:, 2] - c[:, 1]) / 2
-    len_u, len_v = np.linalg.norm(edge_u, axis=1), np.linalg.norm(edge_v, axis=1)
-    n_u, n_v = cell_counts(len_u, cell_m), cell_counts(len_v, cell_m)
+    len_u = np.linalg.norm(edge_u, axis=1)
+    len_v = np.linalg.norm(edge_v, axis=1)
+    n_u = cell_counts(len_u, cell_m)
+    n_v = cell_counts(len_v, cell_m)
     x = edge_u / np.maximum(len_u, 1e-9)[:, None]
     normal = np.cross(edge_u, edge_v)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     quats = quat_from_matrix(np.stack([x, np.cross(normal, x), normal], axis=-1))
-    size_u, size_v = len_u / n_u, len_v / n_v
+    size_u = len_u / n_u
+    size_v = len_v / n_v
     scales = np.column_stack(
         [spread * size_u, spread * size_v, THICKNESS * np.minimum(size_u, size_v) + 0.004]
     )
     owner, u, v = grid_cells(n_u, n_v)
-    u, v = u[:, None], v[:, None]
+    u = u[:, None]
+    v = v[:, None]
     corner = c[owner]
     means = (corner[:, 0] * (1 - u) + corner[:, 1] * u) * (1 - v) + (
         corner[:, 3] * (1 - u) + corner[:, 2] * u

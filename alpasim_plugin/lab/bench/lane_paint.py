@@ -142,14 +142,16 @@ def _brighter(row: F64, side: int) -> Bool:
     wide = np.pad(row, 2 * side, mode="edge")
     middle = np.median(np.lib.stride_tricks.sliding_window_view(wide, side), axis=1)
     i = np.arange(len(row))
-    left, right = middle[i], middle[i + 3 * side + 1]
+    left = middle[i]
+    right = middle[i + 3 * side + 1]
     alike = np.abs(left - right) < CONTRAST_LEVELS
     return np.asarray((row > left + CONTRAST_LEVELS) & (row > right + CONTRAST_LEVELS) & alike)
 
 
 def compare_paint(made: U8, truth: U8, road: Road) -> PaintCounts:
     """Count the painted pixels of an image and of its photograph, both ``(H, W, 3)``."""
-    a, b = paint_of(made, road), paint_of(truth, road)
+    a = paint_of(made, road)
+    b = paint_of(truth, road)
     size = 2 * TOLERANCE_PX + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     near_a, near_b = (cv2.dilate(mask.astype(np.uint8), disc) > 0 for mask in (a, b))

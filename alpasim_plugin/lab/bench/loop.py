@@ -126,7 +126,8 @@ class RecordingRenderer(Renderer):
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
-        self.lookahead, self.block = renderer.lookahead, renderer.block
+        self.lookahead = renderer.lookahead
+        self.block = renderer.block
         self.requests: list[RenderRequest] = []
         self.frames: list[Frame] = []
 
@@ -218,7 +219,8 @@ def command_cost(name: str, folder: Path, repeats: int) -> CommandCost:
         # A report is of a run that is there; a rollout begins in a new folder.
         run = folder / ("run-0" if name == "report" else f"run-{repeat}")
         words = [word.format(run=run) for word in COMMANDS[name]]
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        began = time.perf_counter()
         command = [
             sys.executable,
             "-P",
@@ -227,7 +229,8 @@ def command_cost(name: str, folder: Path, repeats: int) -> CommandCost:
             *words,
         ]
         subprocess.run(command, check=True, capture_output=True)
-        wall_s, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+        wall_s = time.perf_counter() - began
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         costs.append((after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall_s))
     return CommandCost(name, min(cost[0] for cost in costs), min(cost[1] for cost in costs))
 
@@ -285,7 +288,8 @@ def markdown(record: Mapping[str, Any]) -> str:
         f"| {row['command']} | {row['processor_s']:.2f} | {row['wall_s']:.2f} | {row['ratio']:.0f} |"
         for row in record["commands"]
     ]
-    where, used = record["machine"], record["versions"]
+    where = record["machine"]
+    used = record["versions"]
     lines += [
         "",
         f"Reference work: {record['reference_ms']:.2f} ms. {record['scene']}, best of {record['repeats']}; {where['cpu']}, one thread of "

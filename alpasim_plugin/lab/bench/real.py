@@ -231,7 +231,8 @@ def _rows(
 
 
 def _values(taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judges: Judges) -> Row:
-    truth, shown = np.stack([taken[i].rgb for i in part]), np.stack([made[i] for i in part])
+    truth = np.stack([taken[i].rgb for i in part])
+    shown = np.stack([made[i] for i in part])
     pairs = [warp_l1(np.stack([made[i - 1], made[i]]))[0] for i in part if i > 0]
     paint = PaintCounts()
     for i in part:

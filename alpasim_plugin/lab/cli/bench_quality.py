@@ -163,7 +163,8 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
     for part in split_names(text):
         label, equals, named = part.partition("=")
         if "[" in label:  # settings in brackets, not a label
-            label, equals = part, ""
+            label = part
+            equals = ""
         fixer = named if equals else label
         if label in variants or label == TRUTH or "/" in label:
             raise InputError(

@@ -71,7 +71,8 @@ def real(
     for scenario in scenarios.values():
         unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
     vdp, why_not = load_metric()
-    judges, console = Judges(load_distance(NAME), vdp), Console(stderr=True)
+    judges = Judges(load_distance(NAME), vdp)
+    console = Console(stderr=True)
     if why_not:
         console.print(why_not, highlight=False)
     rows: list[Row] = []

@@ -60,12 +60,11 @@ def photographs(
     were fitted as recorded frames.
     """
     del debug
-    console, rows = Console(stderr=True), []
+    console = Console(stderr=True)
+    rows = []
     missing: tuple[str, ...] = ()
-    recipe, named = (
-        PhotographRecipe(width, every, steps, split=split, seed=seed),
-        name or folder.resolve().name,
-    )
+    recipe = PhotographRecipe(width, every, steps, split=split, seed=seed)
+    named = name or folder.resolve().name
     if (folder / DRIVE_FILE).is_file():
         scenario = load_scenario(str(folder / SCENARIO_FILE))
         made = make_drive_pairs(scenario, named, out, recipe, require_device(device))

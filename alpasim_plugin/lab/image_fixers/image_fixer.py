@@ -132,7 +132,8 @@ class ImageFixer(MaplessFixer):
         views = group_views(block, (), 1)
         for view in views:
             check_continues(view, self._history)
-        out, after = list(block), dict(self._history)
+        out = list(block)
+        after = dict(self._history)
         for view in views:
             pasts = [self._history.get(camera) for camera in view.cameras]
             video = crop_clip(self._run(view, pasts), view.size)

@@ -43,7 +43,8 @@ from alpasim_plugin.lab.image_fixers.settings import (
     RenderStepSettings,
 )
 
-LATENT_KEY, CONDITION_KEY = "x_embedder.proj.1.weight", "additional_patch_embedding.proj.1.weight"
+LATENT_KEY = "x_embedder.proj.1.weight"
+CONDITION_KEY = "additional_patch_embedding.proj.1.weight"
 AREA = PATCH * PATCH
 
 

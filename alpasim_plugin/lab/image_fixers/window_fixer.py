@@ -161,7 +161,8 @@ class WindowFixer(MaplessFixer):
         """Return window ``index`` of the clip ``(B, 3, len(window), H, W)``; a short clip's last
         frame is repeated up to a window.
         """
-        frames, settings = slice(window.start, window.stop), self.settings
+        frames = slice(window.start, window.stop)
+        settings = self.settings
         alpha = None if view.alpha is None else view.alpha[:, frames]
         cut = replace(view, rgb=view.rgb[:, frames], alpha=alpha, maps=None)
         clip = to_clip(cut, settings.window_frames, self.networks.device)

@@ -131,7 +131,8 @@ class ClipBatches:
         latents = slice(0, form.latents)
         w = int(rng.integers(len(range(z_0.shape[2])[latents])))
         z_r, z_0, z_map, m = (z[:, :, latents, :, columns] for z in (z_r, z_0, z_map, m))
-        b, n = z_0.shape[0], z_0.shape[2]
+        b = z_0.shape[0]
+        n = z_0.shape[2]
 
         def normal(what: str) -> Tensor:
             noise = stream("training", form.seed, f"generator.{what}", index).standard_normal(
@@ -151,11 +152,13 @@ class ClipBatches:
     def _as_seen(self, drawn: Drawn) -> Sample:
         """Replace map, mask and condition by what the network sees."""
         s = drawn.sample
-        condition, m = s.condition, s.m
+        condition = s.condition
+        m = s.m
         if self._map is not None:
             condition = self._map[:, : s.z_0.shape[2], :, drawn.columns].expand_as(condition)
         if self.seen.source == "noise":
-            m, condition = torch.zeros_like(m), torch.cat([condition, s.z_r], dim=1)
+            m = torch.zeros_like(m)
+            condition = torch.cat([condition, s.z_r], dim=1)
         if self.seen.opacity:
             _, opacity = drawn.frames(1 + GROUP * (s.z_0.shape[2] - 1))
             condition = torch.cat([condition, opacity_values(opacity)], dim=1)

@@ -76,8 +76,10 @@ def fitted(frames: U8, width: int, height: int) -> U8:
     """Scale frames ``(T, H, W, 3)`` to cover ``width x height`` and cut that from the centre."""
     h, w = frames.shape[1:3]
     scale = max(width / w, height / h)
-    wide, high = round(w * scale), round(h * scale)
-    left, top = (wide - width) // 2, (high - height) // 2
+    wide = round(w * scale)
+    high = round(h * scale)
+    left = (wide - width) // 2
+    top = (high - height) // 2
     small = [
         cv2.resize(f, (wide, high), interpolation=cv2.INTER_AREA)[
             top : top + height, left : left + width

@@ -209,7 +209,8 @@ class DecoderTask:
             int(rng.integers(have - want + 1))
             for have, want in zip(z.shape[2:], (self.recipe.rows, self.recipe.columns), strict=True)
         )
-        rows, columns = slice(top, top + self.recipe.rows), slice(left, left + self.recipe.columns)
+        rows = slice(top, top + self.recipe.rows)
+        columns = slice(left, left + self.recipe.columns)
         pixels = [slice(s.start * SIDE, s.stop * SIDE) for s in (rows, columns)]
         end = 1 + GROUP * (z.shape[1] - 1)
         render, opacity = clip.frames(end)

@@ -40,7 +40,8 @@ DEMONSTRATIONS_VERSION = 5  # of the format
 GIVE = "give a folder that 'simrun train policy-data' wrote"
 SKY_SHARE = 0.2  # of a frame's rows: most of the sky, which is cut
 MAX_YAW_RAD = np.deg2rad(8.5)
-COMES_MPS, LETS_PASS_MPS = 1.5, 1.0
+COMES_MPS = 1.5
+LETS_PASS_MPS = 1.0
 
 
 @dataclass(frozen=True)
@@ -301,7 +302,8 @@ class Demonstrations:
         out = []
         for view, frames in zip(self.views, self.frames, strict=True):
             camera = self.info["cameras"][view.name]
-            K, T_rig_camera = np.array(camera["K"]), np.array(camera["T_rig_camera"])
+            K = np.array(camera["K"])
+            T_rig_camera = np.array(camera["T_rig_camera"])
             out.append(CameraSpec(view.name, frames.shape[2], frames.shape[1], K, T_rig_camera))
         return tuple(out)
 

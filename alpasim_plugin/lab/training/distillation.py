@@ -118,10 +118,8 @@ class DistillationTask:
         self.fake = ScoreNet(fake, taps)
         parts: dict[str, nn.Module] = {"dit": self.student, "vae": inputs.vae, "fake": fake}
         if config.adversarial is not None:
-            a, seed = (
-                config.adversarial,
-                derive_seed("training", inputs.form.seed, "adversarial head"),
-            )
+            a = config.adversarial
+            seed = derive_seed("training", inputs.form.seed, "adversarial head")
             parts["head"] = AdversarialHead(
                 self.student.sizes.width, len(a.taps), a.heads, a.inner, seed
             )
@@ -136,7 +134,8 @@ class DistillationTask:
 
     def batch(self, index: int) -> DistillationBatch:
         """Make batch ``index``."""
-        seed, sample = self.batches.form.seed, self.batches[index].sample
+        seed = self.batches.form.seed
+        sample = self.batches[index].sample
         if self.config.tail_drop is not None:
             sample = self.config.tail_drop(sample, seed, index)
         exit_step = int(stream("training", seed, "dmd.exit", index).integers(self.config.steps))
@@ -161,7 +160,8 @@ class DistillationTask:
         """Return the fake score's loss, with the student's where it is trained; neither reaches the
         other's weights.
         """
-        s, z = batch.sample, None
+        s = batch.sample
+        z = None
         numbers: dict[str, Tensor] = {}
         losses: list[Tensor] = []
         if batch.student is not None:
@@ -193,7 +193,8 @@ class DistillationTask:
     def _student_loss(
         self, z: Tensor, s: Sample, noise: RolloutNoise
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        n, sigma = mixed_source(s.z_r, s.m, noise.score), noise.sigma
+        n = mixed_source(s.z_r, s.m, noise.score)
+        sigma = noise.sigma
         g, normaliser = direction(
             self.real.given(s.condition), self.fake.given(s.condition), z.detach(), n, sigma
         )
@@ -224,7 +225,8 @@ class DistillationTask:
         fake = self.parts["head"](
             self.fake.features
         )  # of the forward just made, on the noised rollout
-        x_real, x_fake = noised(s.z_0, n, sigma), noised(z, n, sigma)
+        x_real = noised(s.z_0, n, sigma)
+        x_fake = noised(z, n, sigma)
         adversarial, real = term.critic(
             lambda x: self._logits(x, sigma, s.condition), x_real, x_fake, fake, noise.xi
         )
@@ -284,10 +286,8 @@ class ScoreNet:
         """Return the velocity of noised clips ``(B, C, N, H, W)`` at levels ``(B,)``; ``frozen``
         sends no gradient to the weights.
         """
-        args, attention = (
-            (x, T_SOURCE * sigma[:, None], no_text(self.net, x), condition),
-            {"block_latents": None},
-        )
+        args = (x, T_SOURCE * sigma[:, None], no_text(self.net, x), condition)
+        attention = {"block_latents": None}
         v: Tensor = (
             functional_call(self.net, _detached(self.net), args, attention)
             if frozen

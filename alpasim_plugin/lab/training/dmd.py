@@ -25,7 +25,8 @@ from alpasim_plugin.lab.training.shared_rollout import channel_weighted
 
 Score = Callable[[Tensor, Tensor], Tensor]  # x (B, C, N, H, W), sigma (B,) -> velocity like x
 NORMALISER_FLOOR = 1e-6
-LEAST_SIGMA, MOST_SIGMA = 0.02, 0.98
+LEAST_SIGMA = 0.02
+MOST_SIGMA = 0.98
 
 
 class Direction(NamedTuple):

@@ -85,7 +85,8 @@ def pair_references(
     K = _cropped(references.K, rows, columns)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
-        wanted, t_us = draw.skipped + draw.count, int(references.t_us[i])
+        wanted = draw.skipped + draw.count
+        t_us = int(references.t_us[i])
         last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
         chosen = [j for j in last if references.rgb_t_us[j] != t_us][
             :wanted
@@ -156,7 +157,8 @@ def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
     grey = [
         cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (here, there)
     ]
-    forward, backward = flow.calc(*grey, None), flow.calc(*grey[::-1], None)
+    forward = flow.calc(*grey, None)
+    backward = flow.calc(*grey[::-1], None)
     height, width = grey[0].shape
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
     at = place + forward

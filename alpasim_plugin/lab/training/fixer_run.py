@@ -94,7 +94,8 @@ class FixerRun:
 
     def stages(self) -> list[Stage]:
         """Return the stages to train: those that the last needs and whose weights are not given."""
-        needed, out = {self.recipe.stages[-1].name}, []
+        needed = {self.recipe.stages[-1].name}
+        out = []
         for stage in reversed(self.recipe.stages):
             if stage.name in needed and stage.name not in self.weights:
                 out.append(stage)
@@ -309,7 +310,8 @@ def write_bundle(
     schedule: Schedule,
 ) -> Path:
     """Write a stage's weights after ``updates`` updates as one float16 bundle, with its card."""
-    recipe, path = run.recipe, folder / BUNDLE_FILE
+    recipe = run.recipe
+    path = folder / BUNDLE_FILE
     _write_weights(run, stage, path, averaged, updates, schedule)
     rows, hours = curves(folder / LOG_FILE)
     trained = {part: asdict(own) for part, own in stage.trained.items()}

@@ -69,7 +69,8 @@ class FlowMatchingTask:
     """Batches and loss of `FlowMatching`."""
 
     def __init__(self, config: FlowMatching, inputs: StageInputs) -> None:
-        self.config, self.attention = config, inputs.attention
+        self.config = config
+        self.attention = inputs.attention
         self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.net = transformer_of(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": inputs.vae})

@@ -81,7 +81,8 @@ class GraphCache(BlockCache):
         copy = GraphCache(
             self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device
         )
-        copy.position, copy.filled = self.position, self.filled
+        copy.position = self.position
+        copy.filled = self.filled
         copy._kept = {
             layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()
         }

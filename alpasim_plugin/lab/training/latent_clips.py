@@ -128,7 +128,8 @@ class LatentClips:
                 "choose one with --size WIDTHxHEIGHT",
             )
         encoder = digest(vae, form)
-        self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
+        self.form = form
+        self.digest = f"{encoder}-{pairs_digest(sequences)}"
         self.folder = folder / encoder
         self.folder.mkdir(parents=True, exist_ok=True)
         self._where: list[tuple[PairSequence, F16, int]] = []

@@ -65,7 +65,8 @@ def draw_lost_resolution(rng: np.random.Generator, height: int, width: int) -> L
     opacity = np.ones((height, width), np.float32)
     y, x = np.mgrid[:height, :width].astype(np.float32)
     for _ in range(int(rng.integers(HOLES[0], HOLES[1] + 1))):
-        radius, stretch = rng.uniform(*RADIUS_PX), rng.uniform(*STRETCH)
+        radius = rng.uniform(*RADIUS_PX)
+        stretch = rng.uniform(*STRETCH)
         distance = ((y - rng.uniform(0, height)) / radius) ** 2 + (
             (x - rng.uniform(0, width)) / (radius * stretch)
         ) ** 2

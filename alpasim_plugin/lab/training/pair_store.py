@@ -184,7 +184,8 @@ class PairDataset:
     """
 
     def __init__(self, root: Path | str, split: str, size: tuple[int, int] | None = None) -> None:
-        self.folder, self.size = Path(root) / split, size
+        self.folder = Path(root) / split
+        self.size = size
         self.sequences: tuple[PairSequence, ...] = ()
         self.refresh()
 

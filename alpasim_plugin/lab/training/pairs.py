@@ -162,7 +162,8 @@ def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
     t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
     on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"
     size = 0.0 if on_path else recipe.max_offset_m * np.sqrt(rng.uniform(0.05, 1.0))
-    periods_s, phases = rng.uniform([6.0, 12.0], [12.0, 30.0]), rng.uniform(0, 2 * np.pi, 2)
+    periods_s = rng.uniform([6.0, 12.0], [12.0, 30.0])
+    phases = rng.uniform(0, 2 * np.pi, 2)
     waves = np.sin(2 * np.pi * t_s[:, None] / periods_s + phases) @ np.array([0.35, 0.65])
     return np.asarray(size * waves)
 

@@ -48,7 +48,8 @@ class DecodedDistance:
         return self.distance(flatten_frames(made), flatten_frames(wanted)).mean()
 
     def _decode(self, z: Tensor, w: int) -> Tensor:
-        state, end = None, 0
+        state = None
+        end = 0
         if w > 0:
             end = 1 + GROUP * (w - 1)
             with torch.no_grad():

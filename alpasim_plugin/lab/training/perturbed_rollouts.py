@@ -109,7 +109,8 @@ def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
     """Return the turns at the route's junctions that the route does not take: the line, and the arc
     length where the turn begins.
     """
-    index, lanes = LaneIndex(scenario.lane_map), scenario.lane_map.lanes
+    index = LaneIndex(scenario.lane_map)
+    lanes = scenario.lane_map.lanes
     out = []
     for i, lane_id in enumerate(scenario.route.lane_ids[:-1]):
         for other in lanes[lane_id].successors:
@@ -166,7 +167,8 @@ def _drive(
     # The speed must not say whether somebody comes: some drivers do not look, some brake for nobody.
     looks = random.random() < LOOKS_SHARE
     brakes_s = np.inf if random.random() > HESITATES_SHARE else random.uniform(0.0, drive_s)
-    brakes_until_s, brakes_mps2 = brakes_s + random.uniform(0.5, 3.0), random.uniform(1.0, 4.0)
+    brakes_until_s = brakes_s + random.uniform(0.5, 3.0)
+    brakes_mps2 = random.uniform(1.0, 4.0)
     states = []
     lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
@@ -356,6 +358,7 @@ class _SyntheticLeader:
     def pose(self, scenario: Scenario) -> F64:
         xyz, yaw = self.path.at(self.s_m)
         over = max(self.s_m - self.path.length_m, 0.0)
-        x, y = float(xyz[0] + over * np.cos(yaw)), float(xyz[1] + over * np.sin(yaw))
+        x = float(xyz[0] + over * np.cos(yaw))
+        y = float(xyz[1] + over * np.sin(yaw))
         middle = se3([0.0, 0.0, self.actor.box.height_m / 2], [1.0, 0.0, 0.0, 0.0])
         return np.asarray(ground_pose(scenario.ground, x, y, float(yaw)) @ middle)

@@ -120,7 +120,8 @@ def triangulated(
     pairs = sorted({(m.first, m.second) for m in found if m.first in may and m.second in may})
     for i, j in pairs:
         mine = [m for m in found if (m.first, m.second) == (i, j)]
-        a, b = np.array([m.at_first for m in mine]), np.array([m.at_second for m in mine])
+        a = np.array([m.at_first for m in mine])
+        b = np.array([m.at_second for m in mine])
         place, good = _triangulate(views[i].camera, views[j].camera, a, b)
         at = a[good].astype(np.int64)
         parts.append((place[good], views[i].rgb[at[:, 1], at[:, 0]] / 255.0))

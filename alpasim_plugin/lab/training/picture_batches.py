@@ -40,7 +40,8 @@ class PictureBatches:
                 f"{frames} frames of a clip: clips of {have} frames",
                 f"train on clips of at least {1 + -(-(frames - 1) // 4)} latents (--latents)",
             )
-        self.frames, self._latest = frames, have - frames
+        self.frames = frames
+        self._latest = have - frames
         self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.seed = inputs.form.seed
 
@@ -49,5 +50,6 @@ class PictureBatches:
         begin = int(
             stream("training", self.seed, "pictures.begin", index).integers(self._latest + 1)
         )
-        drawn, end = self._clips[index], begin + self.frames
+        drawn = self._clips[index]
+        end = begin + self.frames
         return Pictures(drawn.frames(end, begin)[0], drawn.clean(end, begin))

@@ -184,7 +184,8 @@ def pixel_losses(
             flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
         if i and i % objectives.horizon == 0:
             state = detached(state)
-        before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
+        before = state
+        source = _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
             out, state, sources = with_sources(
                 net, render, opacity, sdmap, before, source, references

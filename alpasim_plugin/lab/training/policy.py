@@ -180,8 +180,10 @@ class PolicyTask:
     def _sample(self, number: int, random: np.random.Generator | None) -> tuple[Any, ...]:
         scene = int(np.searchsorted(self.ends, number, side="right"))
         demonstrations = self.demonstrations[scene]
-        a, row = demonstrations.arrays, number - int(self.ends[scene] - len(demonstrations))
-        speed, desired = float(a["speed"][row]), float(a["desired_speed"][row])
+        a = demonstrations.arrays
+        row = number - int(self.ends[scene] - len(demonstrations))
+        speed = float(a["speed"][row])
+        desired = float(a["desired_speed"][row])
         real = float(a["frame"][row] != a["before"][row])
         state = np.array([speed, desired], dtype=np.float32)
         contrast = brightness = 1.0
@@ -205,7 +207,8 @@ class PolicyTask:
                 for frame, yaw in (("frame", "yaw"), ("before", "yaw_before"))
             )
             if random is not None and view != FRONT and random.random() < self.recipe.black_share:
-                now, before = np.zeros_like(now), np.zeros_like(before)
+                now = np.zeros_like(now)
+                before = np.zeros_like(before)
             images.append(network_input(in_planes(now), in_planes(before))[0])
         inputs = np.array([*(state / SPEED_UNIT_MPS), real], dtype=np.float32)
         gap = float(a["gap"][row])
@@ -234,7 +237,8 @@ def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
     with the plans of ``front``.
     """
     known = front.state_dict()
-    wide, narrow = net.state_dict()["plan.0.weight"], known["plan.0.weight"]
+    wide = net.state_dict()["plan.0.weight"]
+    narrow = known["plan.0.weight"]
     others = wide.shape[1] - narrow.shape[1]
     after = narrow.shape[1] - front.state[0].out_features - front.word.embedding_dim
     zeros = torch.zeros(len(wide), others)

@@ -34,7 +34,8 @@ LATERAL_MPS2 = 2.0
 ACCEL_MPS2 = 1.5
 BRAKE_MPS2 = 2.0
 HARD_BRAKE_MPS2 = 7.0
-LINE_BEFORE_M, LINE_AHEAD_M = 4.0, 80.0
+LINE_BEFORE_M = 4.0
+LINE_AHEAD_M = 80.0
 MIN_PURSUIT_MPS = 4.0  # so that a stationary car has a path too
 SIGHT_M = 60.0  # objects beyond cover only a few pixels of the image
 SIDE_SIGHT_M = 42.0  # the same, of the smaller views to the sides
@@ -122,7 +123,8 @@ class RightOfWay:
             tuple(table.boxes),
             np.zeros(len(table.boxes), dtype=np.bool_),
         )
-        front_s, half_m = s_m + self.front_m, self.box.width_m / 2
+        front_s = s_m + self.front_m
+        half_m = self.box.width_m / 2
         most = yielding_acceleration(self.line, front_s, speed_mps, self.box, ahead)
         leader = find_leader(self.line, front_s, half_m, ahead.now(), horizon_m=SIGHT_M)
         return min(most, following_acceleration(speed_mps, leader, style))

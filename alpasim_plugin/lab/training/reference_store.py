@@ -66,7 +66,8 @@ class SequenceReferences:
         """Yield the references of the first frames, at most ``count`` each, as the closed loop
         gives them.
         """
-        index, whole = self.index(), slice(None)
+        index = self.index()
+        whole = slice(None)
         last: Sequence[int] = ()
         picture = lru_cache(count + 1)(
             self.picture

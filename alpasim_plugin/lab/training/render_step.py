@@ -105,7 +105,8 @@ def warp_term(made: Tensor, clean: Tensor, weight: float) -> Mapping[str, Tensor
     """Return the weighted warping loss of a prediction ``(B, 3, 1, H, W)`` of the last of the clean
     frames ``(B, 3, T, H, W)``, T >= 5.
     """
-    earlier, now = newest_first(clean[:, :, :-1]), clean[:, :, -1]
+    earlier = newest_first(clean[:, :, :-1])
+    now = clean[:, :, -1]
     return {
         "warp-farneback": weight * warping_loss(made[:, :, 0], earlier, flow_between(earlier, now))
     }

@@ -86,7 +86,8 @@ class RenderStepTask:
             )
         if inputs.distance is None:
             raise InputError(f"{config}: a perceptual term without a distance", "give one")
-        self.config, self.distance = config, inputs.distance[1]
+        self.config = config
+        self.distance = inputs.distance[1]
         self.batches = PictureBatches(inputs, 1 if config.references is None else ROLLOUT)
         net = transformer_of(inputs, "dit")
         self.step = RenderStep(
@@ -132,7 +133,8 @@ class RenderStepTask:
                 else self.step.outputs(render[:, :, :w])
             )
             references = newest_first(shown)
-        made, wanted = self.step(render[:, :, w : w + 1], references), clean[:, :, w : w + 1]
+        made = self.step(render[:, :, w : w + 1], references)
+        wanted = clean[:, :, w : w + 1]
         parts = picture_losses(made, wanted, self.distance, self.config.weight, self.largest)
         if batch.joined and self.config.warp:
             parts |= warp_term(made, clean[:, :, : w + 1], self.config.warp)

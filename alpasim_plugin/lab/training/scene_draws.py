@@ -46,7 +46,8 @@ def pick(rng: Rng, *choices: Any) -> Any:
 
 def label(rng: Rng, weights: Mapping[str, float]) -> str:
     """Draw a class of road user."""
-    names, shares = list(weights), np.array(list(weights.values()))
+    names = list(weights)
+    shares = np.array(list(weights.values()))
     return str(names[int(rng.choice(len(names), p=shares / shares.sum()))])
 
 
@@ -130,7 +131,8 @@ def oncoming(rng: Rng, count: int, first_m: float, speed_mps: float, road_m: flo
     """Return at most ``count`` vehicles that come the other way, far enough apart for every class
     and not beyond the road.
     """
-    out, s_m = [], first_m
+    out = []
+    s_m = first_m
     for i in range(count):
         if s_m > road_m - 15.0:
             break

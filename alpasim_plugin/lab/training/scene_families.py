@@ -217,7 +217,8 @@ def _winding(rng: Rng, time_s: float) -> Spec:
 
 def _walkers(rng: Rng, time_s: float) -> Spec:
     v = number(rng, 7, 9)
-    width, parking = number(rng, 3.1, 3.6), number(rng, 2.2, 2.6)
+    width = number(rng, 3.1, 3.6)
+    parking = number(rng, 2.2, 2.6)
     road = {
         "segments": to_length([straight(60)], path_m(v, time_s)),
         "parking_m": parking,
@@ -294,7 +295,8 @@ def _composed(rng: Rng, time_s: float) -> Spec:
     traffic.
     """
     v = number(rng, 6.5, 8.5)
-    lanes, wanted_m = int(rng.integers(1, 3)), path_m(v, time_s)
+    lanes = int(rng.integers(1, 3))
+    wanted_m = path_m(v, time_s)
     segments = [straight(number(rng, 30, 50))]
     length_m = 0.0
     junctions = 0

@@ -42,8 +42,10 @@ def _junction(rng: Rng, time_s: float, turn: str, sides: tuple[Side, ...]) -> Sp
     across = turn == "straight"
     v = number(rng, 6, 9) if across else number(rng, 6, 8)
     u = number(rng, 10, 15) if across else number(rng, 8, 11)
-    before_m, corner_m = number(rng, 42, 58), number(rng, 7, 11, 1)
-    width_m, shoulder_m = number(rng, 3.2, 3.8), 0.5
+    before_m = number(rng, 42, 58)
+    corner_m = number(rng, 7, 11, 1)
+    width_m = number(rng, 3.2, 3.8)
+    shoulder_m = 0.5
     junction = {
         "kind": "intersection",
         "turn": turn,
@@ -70,7 +72,8 @@ def _junction(rng: Rng, time_s: float, turn: str, sides: tuple[Side, ...]) -> Sp
         meets_s = (x - START_M - FRONT_M) / (v if across else 0.85 * v)
         kind = label(rng, CROSSING)
         headway_s = SPACING_M[kind] / u + number(rng, 0.5, 1.1)
-        first_s, alone_s = number(rng, -1.8, -0.3), pick(rng, -1, 1) * number(rng, 4, 6)
+        first_s = number(rng, -1.8, -0.3)
+        alone_s = pick(rng, -1, 1) * number(rng, 4, 6)
         places: list[tuple[float, float]] = []  # along y at 0 and 20 s, in the direction of travel
         if share < 0.7:
             late_s = [first_s + i * headway_s for i in range(4)] if share < 0.5 else [alone_s]

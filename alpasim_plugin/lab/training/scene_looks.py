@@ -62,7 +62,8 @@ def draw_damage(rng: Rng, ranges: DamageRanges, kind: str | None = None) -> Spec
         "views_per_s": log_number(rng, *ranges.views_per_s, digits=2),
         "depth_error": number(rng, *ranges.depth_error, digits=3),
     }
-    posed, pose_error_m = rng.random() < 0.5, number(rng, *ranges.pose_error_m, digits=3)
+    posed = rng.random() < 0.5
+    pose_error_m = number(rng, *ranges.pose_error_m, digits=3)
     out["pose_error_m"] = pose_error_m if posed or ranges.pose_error_m[0] > 0 else 0.0
     shift_m = sign(rng) * number(rng, *ranges.shift_m)
     return out | ({"shift_m": shift_m} if out["kind"] == "cycle" else {})
@@ -87,7 +88,8 @@ def draw_rig(rng: Rng) -> list[Spec]:
     front["pitch_down_deg"] = number(rng, 0, 6, 1)
     side = {"width": 200, "height": 100, "hfov_deg": number(rng, 78, 90, 1)}
     side |= {"x_m": number(rng, 1.4, 2.2), "z_m": number(rng, 1.1, 1.6)}
-    yaw_deg, out_m = number(rng, 55, 65, 1), number(rng, 0.4, 0.95)
+    yaw_deg = number(rng, 55, 65, 1)
+    out_m = number(rng, 0.4, 0.95)
     left = {"name": "left", "y_m": out_m, "yaw_deg": yaw_deg}
     right = {"name": "right", "y_m": -out_m, "yaw_deg": -yaw_deg}
     return [front, left | side, right | side]

@@ -238,10 +238,8 @@ class _Rollout:
         """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and compute
         the rollouts that are needed.
         """
-        flow, compared = (
-            self.objectives.flow,
-            self.objectives.predicted if self.objectives.horizon else None,
-        )
+        flow = self.objectives.flow
+        compared = self.objectives.predicted if self.objectives.horizon else None
         with torch.no_grad():
             if compared is not None:
                 self.predicted = self._roll(self.predict, fork_at=self.first)
@@ -322,7 +320,8 @@ class _Rollout:
         """Predict the blocks in order, each with its predecessors as history; keep a fork of the
         cache before the block of ``fork_at``.
         """
-        cache, parts = self._new_cache(), []
+        cache = self._new_cache()
+        parts = []
         for b in self.blocks:
             if fork_at is not None and b.start <= fork_at < b.stop:
                 self._before = cache.fork()

@@ -319,17 +319,14 @@ class TrainingStreams:
         key = f"streams.{slot}.{number}"
         loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
-        references, better = (
-            draw_references(rng),
-            float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER),
-        )
-        moved_px, doubled = (
-            float(rng.uniform(*MOVED_PX)) * (rng.random() < P_MOVED),
-            bool(rng.random() < P_DOUBLED),
-        )
+        references = draw_references(rng)
+        better = float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER)
+        moved_px = float(rng.uniform(*MOVED_PX)) * (rng.random() < P_MOVED)
+        doubled = bool(rng.random() < P_DOUBLED)
         without_colour = rng.random() < P_GREY
         car_class = other if class_colours else None
-        map_error, elsewhere = draw_map_error(rng), self.pairs[int(rng.integers(len(self.pairs)))]
+        map_error = draw_map_error(rng)
+        elsewhere = self.pairs[int(rng.integers(len(self.pairs)))]
         return Episode(
             kind,
             sequence,
@@ -357,7 +354,8 @@ class TrainingStreams:
         """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target, references and
         road users of an episode's update.
         """
-        clip, kind = episode.sequence.clip, KINDS[episode.kind]
+        clip = episode.sequence.clip
+        kind = KINDS[episode.kind]
         index = there_and_back(
             episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip)
         )
@@ -382,14 +380,13 @@ class TrainingStreams:
         )
         opacity: F32 = np.ones((len(index), 1, *self.crop), np.float32)
         if episode.lost:
-            render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
+            render = episode.lost.apply(target)
+            opacity = opacity * episode.lost.opacity
         elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
         if episode.moved_px and kind == "pairs":
-            render, opacity = (
-                _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved")),
-                np.ones_like(opacity),
-            )
+            render = _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved"))
+            opacity = np.ones_like(opacity)
         elif episode.sequence not in self.drives:  # a real fit is never exact where it looks so
             render = render + np.float32(episode.better) * (target - render)
         drawn = episode.references, index, rows, columns

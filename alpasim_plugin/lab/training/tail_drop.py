@@ -39,7 +39,8 @@ class TailDrop:
         """
         rng = stream("training", seed, "artifixer.tail", index)
         n = s.z_0.shape[2]
-        m, condition = s.m.clone(), s.condition.clone()
+        m = s.m.clone()
+        condition = s.condition.clone()
         for b in range(len(m)):
             shown = self.shown_frames(1 + GROUP * (n - 1), rng)
             latents = 0 if not shown else 1 + -(-(shown - 1) // GROUP)

@@ -291,7 +291,8 @@ class Trainer(Generic[Batch]):
         write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
     def _update(self) -> dict[str, float]:
-        began, core_began = time.perf_counter(), time.process_time()
+        began = time.perf_counter()
+        core_began = time.process_time()
         self.optimiser.zero_grad(set_to_none=True)
         sums: dict[str, Tensor | float] = {}
         n = self.schedule.accumulate

@@ -126,7 +126,8 @@ def damage_video(
         if rng.random() < 0.7
         else np.zeros(3)
     )
-    exposure, before = 1.0, np.asarray(frames[0])
+    exposure = 1.0
+    before = np.asarray(frames[0])
     splats = _born(rng, before, damage, thin, blotches, np.zeros((0, 2)))
     floaters = _floaters(rng, before, damage, damage.floaters)
     for frame in frames:
@@ -135,7 +136,8 @@ def damage_video(
         flow = flow_between.calc(
             cv2.cvtColor(before, cv2.COLOR_RGB2GRAY), cv2.cvtColor(now, cv2.COLOR_RGB2GRAY), empty
         )
-        splats, floaters = _moved(splats, flow, now, damage), _moved(floaters, flow, None, damage)
+        splats = _moved(splats, flow, now, damage)
+        floaters = _moved(floaters, flow, None, damage)
         splats = splats.join(_born(rng, now, damage, thin, blotches, splats.xy))
         floaters = floaters.join(_floaters(rng, now, damage, damage.floaters - len(floaters.xy)))
         exposure = float(
@@ -175,7 +177,8 @@ def _born(
     """
     h, w = frame.shape[:2]
     cell = damage.cell_px
-    rows, columns = int(np.ceil(h / cell)) + 2, int(np.ceil(w / cell)) + 2
+    rows = int(np.ceil(h / cell)) + 2
+    columns = int(np.ceil(w / cell)) + 2
     free = np.ones((rows, columns), dtype=bool)
     at = np.floor(taken / cell + 1).astype(int)
     inside = (at >= 0).all(axis=1) & (at[:, 0] < columns) & (at[:, 1] < rows)

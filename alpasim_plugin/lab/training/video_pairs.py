@@ -22,7 +22,8 @@ from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.video_damage import damage_video, draw_damage
 from alpasim_plugin.log.video import read_mp4
 
-TRAIN, HELD_OUT = "train", "held-out"
+TRAIN = "train"
+HELD_OUT = "held-out"
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,8 @@ def split_frames(count: int, recipe: VideoRecipe) -> dict[str, range]:
     Raises:
         InputError: Shares without room for both parts, or a part without a frame.
     """
-    first, last = (
-        round(recipe.train_share * count),
-        round((recipe.train_share + recipe.gap_share) * count),
-    )
+    first = round(recipe.train_share * count)
+    last = round((recipe.train_share + recipe.gap_share) * count)
     if not 0 < first <= last < count:
         raise InputError(
             f"{count} frames, shares {recipe.train_share} and {recipe.gap_share}: a part without frames",

@@ -23,7 +23,8 @@ from alpasim_plugin.fixers.network.checkpoints import StateDict, load_weights, w
 from alpasim_plugin.lab.video_metrics.perceptual_net import check_images
 
 Kind = Literal["alex", "vgg"]
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
 LENGTH_EPS = 1e-10  # added to the length of a feature
 SMALLEST_PX = 32  # four poolings by two
 
@@ -79,7 +80,8 @@ def _vgg() -> tuple[Convolution, ...]:
                     index, inputs, outputs, pooled_first=stage > 0 and i == 0, tapped=i == count - 1
                 )
             )
-            index, inputs = index + 2, outputs
+            index = index + 2
+            inputs = outputs
         index += 1
     return tuple(rows)
 
@@ -120,7 +122,8 @@ class LPIPS(nn.Module):
 
     def __init__(self, kind: Kind) -> None:
         super().__init__()
-        self.kind, self.plan = kind, TRUNKS[kind]
+        self.kind = kind
+        self.plan = TRUNKS[kind]
         layers = {
             str(c.index): nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.padding)
             for c in self.plan.convolutions
@@ -174,7 +177,8 @@ def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
             f"kind {kind!r}: no such trunk", f"choose one of {', '.join(get_args(Kind))}"
         )
     net = LPIPS(kind)
-    plan, folder = net.plan, Path(folder)
+    plan = net.plan
+    folder = Path(folder)
     missing = missing_files(kind, folder)
     if missing:
         raise InputError(

@@ -10,7 +10,8 @@ import numpy as np
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import U8
 
-TITLE_PX, GAP_PX = 18, 3
+TITLE_PX = 18
+GAP_PX = 3
 
 
 def sheet(columns: Mapping[str, Sequence[U8]], rows: Sequence[str]) -> U8:

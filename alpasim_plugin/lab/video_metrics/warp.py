@@ -66,7 +66,8 @@ def late_window(pairs: int) -> slice:
 def _pair(previous: U8, frame: U8, flow: F32) -> float:
     h, w = frame.shape[:2]
     rows, columns = np.indices((h, w), dtype=np.float32)
-    x, y = columns + flow[..., 0], rows + flow[..., 1]
+    x = columns + flow[..., 0]
+    y = rows + flow[..., 1]
     valid = (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     if not valid.any():
         raise EvaluatorError(

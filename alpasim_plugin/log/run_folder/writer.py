@@ -169,7 +169,8 @@ def write_tables(root: Path, manifests: Sequence[JsonObject], tables: Path) -> p
             rows += len(held[-1])
             if rows >= GROUP_ROWS:
                 writer.write_table(pa.concat_tables(held))
-                held, rows = [], 0
+                held = []
+                rows = 0
         writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
     return rollouts
 
@@ -225,7 +226,8 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> JsonObject:
     """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a
     centimetre.
     """
-    scene, log = scenario.scene, scenario.scene.ego_log
+    scene = scenario.scene
+    log = scenario.scene.ego_log
     lanes = [
         {
             "id": lane.lane_id,

@@ -62,7 +62,8 @@ def is_lost_connection(error: Any) -> bool:
     """Tell whether a call failed because its peer is away, or went away, and not by the peer's own
     answer.
     """
-    code, text = error.code(), error.details() or ""
+    code = error.code()
+    text = error.details() or ""
     broken = code in (grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL) and any(
         sign in text for sign in BROKEN_TRANSPORT
     )
@@ -266,7 +267,8 @@ class Reflection:
         response = reflection_pb2.ServerReflectionResponse(
             valid_host=request.host, original_request=request
         )
-        kind, pool = request.WhichOneof("message_request"), public_pool()
+        kind = request.WhichOneof("message_request")
+        pool = public_pool()
         if kind == "list_services":
             response.list_services_response.service.extend(
                 reflection_pb2.ServiceResponse(name=name) for name in self.names

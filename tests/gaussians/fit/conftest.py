@@ -19,7 +19,8 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneN
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 
-WIDTH, HEIGHT = 48, 32
+WIDTH = 48
+HEIGHT = 32
 FAR = np.array([4.0e5, -2.0e5, 100.0])  # a scene that lies where float32 has steps of 3 cm
 BOX = Box(4.0, 2.0, 1.6)
 

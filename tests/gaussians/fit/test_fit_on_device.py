@@ -41,7 +41,8 @@ def test_every_view_gives_the_processors_gradients(case, monkeypatch):
     with pretended_device(monkeypatch):
         card = begun(case, "cuda")
         for ours, theirs in zip(card.targets, host.targets, strict=True):
-            found, wanted = card._differentiate(ours), host._differentiate(theirs)
+            found = card._differentiate(ours)
+            wanted = host._differentiate(theirs)
             assert found["loss"] == pytest.approx(wanted["loss"], rel=1e-5)
             assert found["mse"] == pytest.approx(wanted["mse"], rel=1e-5)
             for name, p in host.model.params.items():
@@ -50,7 +51,8 @@ def test_every_view_gives_the_processors_gradients(case, monkeypatch):
                 torch.testing.assert_close(*gradients, rtol=0, atol=atol)
                 p.grad = card.model.params[name].grad = None
         for name in ("total", "count"):
-            found, wanted = getattr(card.gradients, name).cpu(), getattr(host.gradients, name)
+            found = getattr(card.gradients, name).cpu()
+            wanted = getattr(host.gradients, name)
             torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-6)
 
 

@@ -68,7 +68,8 @@ def test_updates_follow_the_published_algorithm():
         p.pow(3).sum().backward()
         adam.update({"p": p}, {"p": 0.01 / t})
         gradient = 3 * wanted**2
-        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+        m = 0.9 * m + 0.1 * gradient
+        v = 0.999 * v + 0.001 * gradient**2
         wanted -= 0.01 / t * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
     assert np.allclose(p.detach().numpy(), wanted, atol=1e-5)
 
@@ -87,8 +88,10 @@ def test_rows_keep_their_moments_when_others_come_and_go():
 
 
 def test_an_actor_is_placed_as_a_moved_cloud_is():
-    ground, car = random_cloud(20, 1), random_cloud(15, 2)
-    model, T = model_of(ground, {"car": car, "gone": random_cloud(5, 3)}, degree=3), random_rigid(4)
+    ground = random_cloud(20, 1)
+    car = random_cloud(15, 2)
+    model = model_of(ground, {"car": car, "gone": random_cloud(5, 3)}, degree=3)
+    T = random_rigid(4)
     splats, rows = model.placed(model.motion({"car": T, "stranger": T}), 16)
     wanted = GaussianCloud.concatenate([ground, car.transformed(T)])
     assert rows.tolist() == list(range(35)), "background and car, without what is not there"
@@ -100,7 +103,8 @@ def test_an_actor_is_placed_as_a_moved_cloud_is():
 
 
 def test_a_placed_actor_passes_gradients_to_its_own_frame():
-    model, T = model_of(random_cloud(3, 1), {"car": random_cloud(4, 2)}), random_rigid(5)
+    model = model_of(random_cloud(3, 1), {"car": random_cloud(4, 2)})
+    T = random_rigid(5)
     splats, _ = model.placed(model.motion({"car": T}), 4)
     splats.means[3:, 0].sum().backward()
     gradient = model.params["means"].grad
@@ -219,10 +223,8 @@ def test_the_panorama_shows_the_sky_that_the_views_saw(posed):
 
 
 def test_the_schedule_stretches_with_the_steps():
-    short, long = (
-        SplatRecipe(steps=100, densify_every=10),
-        SplatRecipe(steps=1000, densify_every=100),
-    )
+    short = SplatRecipe(steps=100, densify_every=10)
+    long = SplatRecipe(steps=1000, densify_every=100)
     assert [i for i in range(101) if short.densifies_after(i)] == [20, 30, 40, 50, 60]
     assert [i // 10 for i in range(1001) if long.densifies_after(i)] == [20, 30, 40, 50, 60]
     assert short.lr_means_at(0) == pytest.approx(short.lr_means)

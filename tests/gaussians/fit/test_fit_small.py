@@ -95,7 +95,8 @@ def test_the_actor_is_learned_in_its_own_frame(posed):
     )
     assert inside.mean() > 0.9, "in the frame of its box, not in the world"
     # Put where no view saw it, it is drawn there and nowhere else.
-    camera, graph = camera_at(0.0), model.graph()
+    camera = camera_at(0.0)
+    graph = model.graph()
     T = actor_pose(0)
     T[:3, 3] = at(8.0, 2.0, 0.8)
     moved = np.abs(graph.render(camera, {"car": T}, 1).rgb - graph.render(camera, {}, 1).rgb).max(
@@ -109,7 +110,8 @@ def test_the_actor_is_learned_in_its_own_frame(posed):
 def test_a_mask_keeps_what_it_hides_out_of_the_model(posed):
     spoiled = []
     for view in posed.views:
-        rgb, mask = view.rgb.copy(), np.ones(view.rgb.shape[:2], bool)
+        rgb = view.rgb.copy()
+        mask = np.ones(view.rgb.shape[:2], bool)
         rgb[-8:], mask[-8:] = (255, 0, 255), False
         spoiled.append(replace(view, rgb=rgb, mask=mask))
     model = fit(spoiled, posed.start, replace(QUICK, steps=40)).graph()
@@ -121,7 +123,8 @@ def test_a_mask_keeps_what_it_hides_out_of_the_model(posed):
 def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
     posed, tmp_path, monkeypatch
 ):
-    real, calls = loop.rasterize_gradient, []
+    real = loop.rasterize_gradient
+    calls = []
 
     def breaks(*args, **kwargs):
         calls.append(1)

@@ -35,7 +35,8 @@ def test_points_followed_through_the_street_lie_on_its_surfaces(tracks, placed):
     good &= placed.angle_rad > 0.05
     xyz = placed.xyz[good]
     slack = 0.03 * np.linalg.norm(xyz, axis=1)  # a small angle leaves the distance uncertain
-    on_wall, on_road = np.abs(np.abs(xyz[:, 1]) - 5.0) < slack, np.abs(xyz[:, 2]) < slack
+    on_wall = np.abs(np.abs(xyz[:, 1]) - 5.0) < slack
+    on_road = np.abs(xyz[:, 2]) < slack
     on_box = (np.abs(xyz[:, 1] - 2.9) < 1.0 + slack) & (np.abs(xyz[:, 0] - 16.0) < 2.2 + slack)
     assert good.sum() > 200
     assert (on_wall | on_road | on_box).mean() > 0.95
@@ -62,10 +63,8 @@ def test_poses_that_are_off_come_back_to_the_truth(views):
         """
         out = []
         for a, b, c, d in zip(cameras, cameras[1:], views, views[1:], strict=False):
-            mine, true = (
-                b.T_camera_world @ np.linalg.inv(a.T_camera_world),
-                d.camera.T_camera_world @ np.linalg.inv(c.camera.T_camera_world),
-            )
+            mine = b.T_camera_world @ np.linalg.inv(a.T_camera_world)
+            true = d.camera.T_camera_world @ np.linalg.inv(c.camera.T_camera_world)
             out.append(
                 np.degrees(
                     np.arccos(np.clip((np.trace(mine[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))
@@ -81,7 +80,8 @@ def test_poses_that_are_off_come_back_to_the_truth(views):
 def test_depth_by_flow_is_the_street_s(views, tracks, placed):
     maps = depth_maps(views, tracks, placed)
     middle = 4
-    depth, truth = maps[middle], true_depth(views[middle])
+    depth = maps[middle]
+    truth = true_depth(views[middle])
     known = (depth > 0) & np.isfinite(truth)
     error = np.abs(depth[known] / truth[known] - 1)
     assert STRIDE**2 * known.mean() > 0.3
@@ -131,10 +131,8 @@ def test_exposure_and_white_balance_are_found_to_a_percent(views, tracks):
 
 
 def test_a_gain_between_photographs_is_that_of_the_nearest_two():
-    centres, gains = (
-        np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]),
-        np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3]),
-    )
+    centres = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]])
+    gains = np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3])
     assert np.allclose(gain_between(centres, gains, np.array([0.5, 0, 0])), 1.1, atol=1e-3)
     assert np.allclose(gain_between(centres, gains, np.zeros(3)), 1.0, atol=1e-3)
     assert np.allclose(gain_between(centres[:0], gains[:0], np.zeros(3)), 1.0)

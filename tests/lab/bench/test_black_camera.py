@@ -27,7 +27,8 @@ cameras:
 - {name: left, hfov_deg: 85, y_m: 0.5, yaw_deg: 60}
 - {name: right, hfov_deg: 85, y_m: -0.5, yaw_deg: -60}
 """
-SPEED_MPS, HEADWAY_S = 13.0, 1.2
+SPEED_MPS = 13.0
+HEADWAY_S = 1.2
 
 
 def row_of_cars(side):

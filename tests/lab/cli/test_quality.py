@@ -160,7 +160,8 @@ def test_variants_that_cannot_be_are_refused(text, overrides, words):
 
 
 def row(variant, clip, psnr, frames=200):
-    values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
+    values = {"psnr_db": psnr}
+    series = {"psnr_db": [psnr] * frames}
     return {
         "arm": variant,
         "clip": clip,

@@ -34,7 +34,8 @@ def busy_settings(folder, name, *overrides):
     path = folder / f"{name}_{kind}.safetensors"
     if not path.exists():
         parts = Parts(image_settings(name, "untrained=random", f"decoder.kind={kind}"))
-        dit, vae = parts.dit(), parts.vae()
+        dit = parts.dit()
+        vae = parts.vae()
         fill_random(vae.encoder, 1, "tests.encoder")
         fill_random(vae.decoder, 1, "tests.decoder")
         damp(dit.final_layer.linear.weight, vae.encoder.head.weight, vae.decoder.head.weight)  # type: ignore[union-attr]

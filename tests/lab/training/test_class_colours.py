@@ -30,7 +30,8 @@ def drawn(label):
 
 @pytest.mark.parametrize("kind", OTHERS)
 def test_augmented_cars_have_the_colours_of_the_other_class(kind):
-    car, wanted = drawn("car"), drawn(LABELS[kind])
+    car = drawn("car")
+    wanted = drawn(LABELS[kind])
     made = swap_class_colours(car, kind)
     differs = (car != wanted).any(axis=-1)
     off = np.abs(made.astype(int) - wanted).max(axis=-1)

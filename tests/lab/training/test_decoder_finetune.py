@@ -32,7 +32,8 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(data, bundle, tmp_path)
     path = finetune_decoder(
         bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness)
     )
-    before, after = load_weights(bundle), load_weights(path)
+    before = load_weights(bundle)
+    after = load_weights(path)
     assert before.keys() == after.keys()
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed

@@ -52,7 +52,8 @@ def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
     before = (folder / "frames_front.npy").stat().st_mtime_ns
     assert not write_demonstrations(scenario, folder, QUICK, 0)
     assert (folder / "frames_front.npy").stat().st_mtime_ns == before
-    first, other = Demonstrations(folder), root / "other"
+    first = Demonstrations(folder)
+    other = root / "other"
     write_demonstrations(scenario, other, QUICK, 0)
     assert_array_equal(first.frames[0], Demonstrations(other).frames[0])
     for name, array in first.arrays.items():
@@ -90,7 +91,8 @@ def test_scene_with_side_cameras_has_three_views_and_the_network_begins_as_the_f
     assert len({len(frames) for frames in demonstrations.frames}) == 1
     with pytest.raises(InputError):
         common_views([demonstrations, *read_demonstrations(root, "train")])
-    net, front = LearnedNet(0, demonstrations.views), load_net(WEIGHTS)
+    net = LearnedNet(0, demonstrations.views)
+    front = load_net(WEIGHTS)
     start_from_front(net, front)
     batch = PolicyTask(net, [demonstrations], PolicyRecipe(batch=4)).batch(0)
     with torch.inference_mode():

@@ -78,7 +78,8 @@ def test_a_run_goes_on_on_another_device_and_makes_batches_ahead(tmp_path, monke
     host, both, schedule = tmp_path / "host", tmp_path / "both", Schedule(steps=6)
     trainer(host, schedule).run()
     trainer(both, schedule).run(until=2)
-    made, made_at = [], []
+    made = []
+    made_at = []
     with pretended_device(monkeypatch):
         there = trainer(both, schedule, device="cuda")
         monkeypatch.setattr(there, "_batch", lambda index: made.append(index) or batch(index))
@@ -98,7 +99,8 @@ def train_in_a_rank(rank, folder, port):
 
 @pytest.mark.slow
 def test_two_processes_train_to_the_weights_and_the_log_of_one(tmp_path):
-    one, two = tmp_path / "one", tmp_path / "two"
+    one = tmp_path / "one"
+    two = tmp_path / "two"
     trainer(one, Schedule(steps=3, accumulate=4, save_every=1)).run()
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

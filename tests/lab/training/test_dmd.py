@@ -41,7 +41,8 @@ class Gaussian:
     """A normal distribution of clean latents and the exact velocity of its noised samples."""
 
     def __init__(self, mean, std):
-        self.mean, self.std = mean, std
+        self.mean = mean
+        self.std = std
 
     def __call__(self, x, sigma):
         s = sigma[:, None, None, None, None].double()
@@ -70,7 +71,8 @@ def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the
     fake = Gaussian(0.7, 0.5)
     real = Gaussian(-0.4, 1.2)
     h = 1e-5
-    a, n = noise("a", 64, 1, 1, 1, 1).double(), noise("n", 64, 1, 1, 1, 1).double()
+    a = noise("a", 64, 1, 1, 1, 1).double()
+    n = noise("n", 64, 1, 1, 1, 1).double()
     a, n = (
         torch.cat([a, -a, a, -a]),
         torch.cat([n, n, -n, -n]),

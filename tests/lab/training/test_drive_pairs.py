@@ -46,7 +46,8 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(drive
         sequence = PairSequence(one.folder)
         references = open_references(sequence)
         assert sequence.size == (64, 48)
-        held, recorded = set(sequence.clip.t_us.tolist()), set(references.rgb_t_us.tolist())
+        held = set(sequence.clip.t_us.tolist())
+        recorded = set(references.rgb_t_us.tolist())
         assert not held & recorded
         assert held | recorded == taken
         assert (references.depth[0, 40:] > 0).any()

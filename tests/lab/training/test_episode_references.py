@@ -64,8 +64,10 @@ def shown(
 
 
 def test_a_crop_has_the_references_of_the_whole_frame_cut_to_it(sequence):
-    rows, columns = slice(8, 24), slice(16, 48)
-    whole, part = shown(sequence, EXACT), shown(sequence, EXACT, rows, columns)
+    rows = slice(8, 24)
+    columns = slice(16, 48)
+    whole = shown(sequence, EXACT)
+    part = shown(sequence, EXACT, rows, columns)
     assert part.shape == (3, SLOTS, 16, 32, 4)
     assert np.abs(whole[:, :, rows, columns].astype(int) - part).max() <= 1
 

@@ -38,7 +38,8 @@ def test_frozen_scenes_pass_their_check(scenes, tmp_path):
 
 
 def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(scenes, tmp_path):
-    record, one = tmp_path / "record.json", scenes / TEST_SPLITS[1] / "b.yaml"
+    record = tmp_path / "record.json"
+    one = scenes / TEST_SPLITS[1] / "b.yaml"
     freeze(scenes, record)
     before = one.read_text()
     one.write_text(before + "seed: 1\n")

@@ -114,7 +114,8 @@ def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(data, trained, recipe
         (recipe, TRAINED[recipe]),
         (recipe, {"dit", "vae"}),
     ]
-    after, vae = load_weights(path), load_weights(data / "vae.safetensors")
+    after = load_weights(path)
+    vae = load_weights(data / "vae.safetensors")
     learned = [
         key
         for key, value in after.items()

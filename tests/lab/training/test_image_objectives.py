@@ -56,7 +56,8 @@ def ddpm(steps=1000):
 def test_difixs_step_is_the_ddpm_formula_at_199(net):
     settings = fixer_settings("difix")
     level, (alphas, sigmas) = settings.level, ddpm()
-    alpha, sigma = float(alphas[199]), float(sigmas[199])
+    alpha = float(alphas[199])
+    sigma = float(sigmas[199])
     assert (alpha, sigma) == pytest.approx((0.86904, 0.49473), abs=1e-5)
     assert (level.alpha, level.sigma) == pytest.approx((alpha, sigma), abs=1e-6)
     assert (level.t, level.scale, level.network_t) == pytest.approx((0.3628, 0.7333, 363), abs=1e-4)

@@ -46,7 +46,8 @@ def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_
 
 
 def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street, tmp_path):
-    recipe, folder = PairRecipe(), tmp_path / "pairs" / "val" / "s"
+    recipe = PairRecipe()
+    folder = tmp_path / "pairs" / "val" / "s"
     cycle = replace(street, degradation=Degradation("cycle", share=0.1))
     assert make_sequence(cycle, folder, recipe, 0, split="val", family="street")
     sequence = PairSequence(folder)

@@ -73,7 +73,8 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path)
         assert local[:, 2].mean() == pytest.approx(4.0)  # no place lies along z
         pixel = (dots - [0.5 if view.name == "1" else -0.5, 0, 0]) @ camera.K.T  # dots stay
         for u, v in pixel[:, :2] / pixel[:, 2:]:
-            left, top = round(u) - 4, round(v) - 4
+            left = round(u) - 4
+            top = round(v) - 4
             if 0 < left < 248 and 0 < top < 184:
                 found = cv2.moments(view.rgb[top : top + 8, left : left + 8, 0])
                 centre = np.array([found["m10"], found["m01"]]) / found["m00"] + 0.5

@@ -19,7 +19,8 @@ def scaled(images):
 def test_streaming_equals_the_rollout_of_the_training(tmp_path, holes):
     bundle = write_bundle(tmp_path / "small.safetensors")
     streamed = pixels(run(session(bundle, "keep_render=false", f"holes={holes}"), FRAMES, MAPS))
-    render, sdmap = scaled(pixels(FRAMES))[None], scaled(np.stack(MAPS))[None]
+    render = scaled(pixels(FRAMES))[None]
+    sdmap = scaled(np.stack(MAPS))[None]
     opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[
         None, ..., None
     ]

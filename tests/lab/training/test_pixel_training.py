@@ -101,7 +101,8 @@ def generator():
 
 
 def test_terms_are_what_they_are_called():
-    net, s = generator(), sample()
+    net = generator()
+    s = sample()
     found = pixel_losses(
         net,
         s,
@@ -109,7 +110,8 @@ def test_terms_are_what_they_are_called():
         PixelObjectives(),
         lambda a, b: (a - b).abs().amax((1, 2, 3)),
     )
-    state, made = net.start(s.render[:, 0]), []
+    state = net.start(s.render[:, 0])
+    made = []
     for i in range(FRAMES):
         if i == 1:  # the flow term: the velocity of the interpolant, on the rollout's history
             z_1 = pixel_source(s.render[:, 1], s.opacity[:, 1], s.eps_flow)
@@ -148,7 +150,8 @@ def test_terms_are_what_they_are_called():
 
 @pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])
 def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
-    net, s = generator(), sample()
+    net = generator()
+    s = sample()
     eps = s.eps.clone().requires_grad_()
     found = pixel_losses(
         net,
@@ -186,7 +189,8 @@ def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path):
     train_per_frame(run_of(), tmp_path / "whole", None)
     train_per_frame(run_of(), tmp_path / "cut", None, stop_at=2)
     bundle = train_per_frame(run_of(), tmp_path / "cut", None)
-    one, other = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    one = weights(tmp_path / "whole")
+    other = weights(tmp_path / "cut")
     assert any(key.startswith("carried.") for key in one)
     assert one.keys() == other.keys()
     assert all(torch.equal(value, other[key]) for key, value in one.items())

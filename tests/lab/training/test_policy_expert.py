@@ -86,7 +86,8 @@ def test_who_comes_from_the_side_is_let_pass_unless_the_car_is_gone_by_then(meet
 
 
 def test_only_bodies_that_reach_into_the_way_are_leaders():
-    line, car = ReferenceLine.along(STRAIGHT, 20.0), Box(4.5, 1.8, 1.5)
+    line = ReferenceLine.along(STRAIGHT, 20.0)
+    car = Box(4.5, 1.8, 1.5)
     there = bodies_from(
         np.array([[40.0, 3.4], [60.0, 0.3]]),
         np.zeros(2),

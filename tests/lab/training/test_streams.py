@@ -46,7 +46,8 @@ def equal(a, b):
 
 
 def test_update_is_a_pure_function_of_its_number_and_the_seed(root):
-    one, other = streams(root), streams(root)
+    one = streams(root)
+    other = streams(root)
     forward = [one.update(i) for i in range(9)]
     for i in (7, 0, 3, 8):  # out of order, by another object
         assert equal(other.update(i), forward[i])
@@ -67,7 +68,8 @@ def test_frames_follow_one_another_across_updates(root):
 
 
 def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root):
-    made, seen = streams(root), set()
+    made = streams(root)
+    seen = set()
     for i in range(24):
         batch = made.update(i)
         for slot, kind in enumerate(batch.kind.tolist()):

@@ -108,7 +108,8 @@ class Two(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.student, self.critic = Linear(), Linear()
+        self.student = Linear()
+        self.critic = Linear()
 
 
 def two_parts(folder, schedule, parts):

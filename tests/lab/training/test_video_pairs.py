@@ -77,7 +77,8 @@ def test_parts_of_a_video_do_not_meet():
 
 
 def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path):
-    source, out = tmp_path / "drive.mp4", tmp_path / "video"
+    source = tmp_path / "drive.mp4"
+    out = tmp_path / "video"
     write_mp4(source, moving(20), 10)
     command = [
         "train",

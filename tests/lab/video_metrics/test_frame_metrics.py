@@ -13,7 +13,8 @@ TRUTH = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
 
 
 def test_ssim_of_black_against_white_and_of_flat_frames():
-    black, white = np.zeros((1, 16, 16, 3), np.uint8), np.full((1, 16, 16, 3), 255, np.uint8)
+    black = np.zeros((1, 16, 16, 3), np.uint8)
+    white = np.full((1, 16, 16, 3), 255, np.uint8)
     assert ssim(black, white)[0] < 1e-3
     assert ssim(black, black)[0] == pytest.approx(1.0, abs=1e-6)
 
@@ -35,7 +36,8 @@ def test_the_range_of_values_does_not_change_psnr(low, peak):
 
 
 def test_ssim_of_floats_equals_that_of_their_eight_bits():
-    a, b = TRUTH[0], TRUTH[1]
+    a = TRUTH[0]
+    b = TRUTH[1]
     assert image_metrics.ssim(a / np.float32(255), b / np.float32(255), peak=1.0) == pytest.approx(
         image_metrics.ssim(a, b), abs=1e-6
     )

@@ -45,7 +45,8 @@ def test_activations_have_the_published_channels_and_sizes(net):
 
 
 def test_identity_symmetry_and_independence_of_the_batch(net):
-    a, b = pictures(0), pictures(1)
+    a = pictures(0)
+    b = pictures(1)
     assert torch.equal(net.distance(a, a), torch.zeros(2))
     there = net.distance(a, b)
     assert torch.isfinite(there).all()
@@ -58,7 +59,8 @@ def write(folder, kind):
     """Write random weights under the published names; their digests are wrong unless a test says
     otherwise.
     """
-    plan, net = TRUNKS[kind], LPIPS(kind)
+    plan = TRUNKS[kind]
+    net = LPIPS(kind)
     layers = [(f"features.{c.index}", net.features[str(c.index)]) for c in plan.convolutions]
     trunk = {
         f"{name}.{part}": getattr(layer, part).detach()

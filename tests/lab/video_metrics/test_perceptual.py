@@ -36,14 +36,16 @@ def net():
 def test_distance_is_zero_for_equal_and_symmetric_for_other_pictures(
     net,
 ):
-    a, b = pictures(), pictures(seed=1)
+    a = pictures()
+    b = pictures(seed=1)
     assert torch.equal(net.distance(a, a), torch.zeros(2))
     torch.testing.assert_close(net.distance(a, b), net.distance(b, a))
     assert torch.all(net.distance(a, b) > 0)
 
 
 def test_distance_is_the_sum_over_stages_written_out(net):
-    a, b = pictures(1), pictures(1, seed=1)
+    a = pictures(1)
+    b = pictures(1, seed=1)
     wanted = 0.0
     for x, y, head in zip(net.trunk(a), net.trunk(b), net.heads, strict=True):
         p, q = (f[0].double() / (f[0].double().square().sum(0) + 1e-4).sqrt() for f in (x, y))

@@ -24,7 +24,8 @@ from alpasim_plugin.lab.training.latent_clips import LatentClips
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.trainer import Loss, PartSchedule
 
-INIT, INIT_BI = "init", "init-bi"
+INIT = "init"
+INIT_BI = "init-bi"
 GIVEN = (INIT, INIT_BI)  # weights that a run receives; all others are made by an earlier stage
 DIT = MappingProxyType({"dit": f"{INIT}.dit"})
 TRAINED_DIT = MappingProxyType({"dit": PartSchedule()})

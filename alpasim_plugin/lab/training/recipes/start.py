@@ -81,7 +81,8 @@ def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]
         InputError: The weights have more channels already.
     """
     old = weights[MAP_KEY]
-    width, have = old.shape[0], old.shape[1] // AREA
+    width = old.shape[0]
+    have = old.shape[1] // AREA
     if have > channels:
         raise InputError(
             f"to {channels} channels: they take {have} channels",
