@@ -192,6 +192,7 @@ class Trainer(Generic[Batch]):
                 "train per-frame in one process; of others make --accumulate a multiple of them",
             )
         self._beside = side_stream(self.device)
+        self._end = schedule.steps * schedule.accumulate
         self._ahead: dict[int, Batch] = {}  # the next batch, made while the device computes
         self._kept: dict[str, Tensor] = {}
         several = (
