@@ -16,6 +16,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix, se2
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import api_version, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
+from tests.cameras import ahead
 
 CAMERA = "camera_front_wide_120fov"
 WIDTH = 48
@@ -24,9 +25,7 @@ STEP_US = 100_000
 SHUTTER_US = 30_000
 START_US = 1_689_697_803_493_732
 # Optical axes in the rig: x right, y down, z forward.
-T_RIG_CAMERA = np.array(
-    [[0.0, 0.0, 1.0, 1.7], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
-)
+T_RIG_CAMERA = ahead(x_m=1.7)
 
 
 def wire_pose(T):

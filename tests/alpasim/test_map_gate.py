@@ -30,8 +30,9 @@ from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.log.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
+from tests.cameras import ahead
 
-AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+AHEAD = ahead()
 SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135], [0, 0, 1]]), AHEAD)
 
 

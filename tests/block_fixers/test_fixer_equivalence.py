@@ -66,7 +66,7 @@ def test_blocks_equal_the_whole_clip(weights, others, overrides):
     )
     exact = load_networks(settings.model_copy(update={"fold": False}))
     whole = refine_clip(exact, settings, clip.rgb, clip.alpha, clip.maps, noise)
-    assert float((streamed - whole).abs().max()) < 1e-5
+    assert (streamed - whole).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("count", [1, 6, 13])

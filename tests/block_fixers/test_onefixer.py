@@ -146,7 +146,7 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy):
         out += sorted(answer, key=lambda f: f.t_us)
     together = torch.cat(seen, dim=2)
     for b, name in enumerate(("left", "right")):
-        assert float((together[b] - videos[name][0]).abs().max()) < 1e-5
+        assert (together[b] - videos[name][0]).abs().max() < 1e-5
         mine = pixels([frame for frame in out if frame.camera == name])
         assert np.abs(mine.astype(int) - images[name]).max() <= 1
 

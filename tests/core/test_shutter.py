@@ -19,12 +19,11 @@ from alpasim_plugin.core.shutter import (
     rolling,
 )
 from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
+from tests.cameras import ahead
 
 WIDTH = 64
 HEIGHT = 32
-FORWARD = np.array(
-    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
-)  # a camera that looks along x of its rig
+FORWARD = ahead()
 SPEC = CameraSpec(
     "front", WIDTH, HEIGHT, np.array([[400.0, 0, 32], [0, 400.0, 16], [0, 0, 1]]), FORWARD
 )

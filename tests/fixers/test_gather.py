@@ -54,8 +54,8 @@ def test_one_pass_mixes_as_the_operations_one_by_one(batch, references, height, 
     for one, other in zip(
         fast, plain, strict=True
     ):  # at the edge of what holds, a rounded offset weighs more than the rounding itself
-        assert float((one - other).abs().quantile(0.99)) < 1e-5
-        assert float((one - other).abs().max()) < 1e-3
+        assert (one - other).abs().quantile(0.99) < 1e-5
+        assert (one - other).abs().max() < 1e-3
     half = BlendHeads(
         heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16()
     )  # read as they are
@@ -85,7 +85,7 @@ def test_bands_enlarge_as_the_operations_one_by_one(references, height, width, s
         heads = heads._replace(finer=torch.randn(cells) if scale == 8 else None)
     one, other = (each.enlarge(rgb, change, images, heads, scale) for each in (CPU, TORCH))
     assert one.shape == rgb.shape
-    assert float(((one.int() - other).abs() > 1).float().mean()) < 1e-3
+    assert ((one.int() - other).abs() > 1).float().mean() < 1e-3
     if not references:  # the change of the render is all there is, here in the middle of squares
         due = rgb[:, 1::3, 1::3] + 127.5 * change[:, : height // 3, : width // 3]
-        assert float((one[:, 1::3, 1::3] - due.clamp(0, 255)).abs().max()) <= 0.51
+        assert (one[:, 1::3, 1::3] - due.clamp(0, 255)).abs().max() <= 0.51

@@ -93,8 +93,8 @@ def test_the_operations_of_a_processor_give_the_same_frame(batch, references):
     # Where a reference ends, an offset that differs by rounding weighs more than the rounding
     # itself.
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
-        assert float((a - b).abs().quantile(0.99)) < 1e-4
-        assert float((a - b).abs().max()) < 1e-2
+        assert (a - b).abs().quantile(0.99) < 1e-4
+        assert (a - b).abs().max() < 1e-2
 
 
 def test_a_large_image_is_not_bent_by_small_offsets_and_takes_more_of_its_references():

@@ -28,13 +28,12 @@ from alpasim_plugin.fixers.warp import (
     WarpTarget,
     warp,
 )
+from tests.cameras import ahead
 
 WIDTH = 64
 HEIGHT = 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
-FORWARD = np.array(
-    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
-)  # a camera that looks along x of its rig
+FORWARD = ahead()
 NOBODY = {}
 
 
@@ -266,15 +265,3 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
             images, references_of(found, replace(asked, T_world_camera=T), frame), strict=True
         ):
             assert_array_equal(image[band.rows], alone[band.rows])
-
-
-def test_a_wall_seen_from_nearer_is_larger():
-    far = at(0.0)
-    near = at(10.0)
-    out = warp(
-        picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {})
-    )
-    # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
-    expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
-    assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
-    assert (out[..., 3] == VALID).all()

@@ -4,9 +4,9 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box, CameraSpec, LaneMap, Marking
+from tests.cameras import ahead
 
-# Camera axes in a rig that looks along x.
-AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+AHEAD = ahead(0.0)
 PIN = CameraSpec("pin", 256, 144, np.array([[128.0, 0, 128], [0, 128, 72], [0, 0, 1]]), AHEAD)
 BIG = CameraSpec("big", 1280, 720, np.array([[640.0, 0, 640], [0, 640, 360], [0, 0, 1]]), AHEAD)
 EMPTY = LaneMap({})

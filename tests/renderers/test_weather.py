@@ -17,11 +17,12 @@ from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
 from alpasim_plugin.world.ground import flat
+from tests.cameras import ahead
 from tests.examples import first_of
 from tests.renderers.recorded_drive import recorded_drive
 
 K = np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]])
-AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+AHEAD = ahead()
 RIG = np.eye(4)
 GREY = np.full((60, 100, 3), 120, np.uint8)
 

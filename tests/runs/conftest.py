@@ -30,6 +30,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.rows import series_by_cell
 from alpasim_plugin.world.ground import flat
 from evaluators.opening import Run, read_run
+from tests.cameras import ahead
 from tests.core.checksum_files import vouch_for
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched
@@ -88,7 +89,7 @@ def straight_road():
         96,
         64,
         np.array([[60.0, 0, 48], [0, 60.0, 32], [0, 0, 1]]),
-        np.array([[0.0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]),
+        ahead(x_m=1.5),
     )
     return Scenario(
         scene_id="straight-road",

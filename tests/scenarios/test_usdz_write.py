@@ -119,7 +119,7 @@ def test_a_lane_with_unequal_edges_keeps_its_area():
     before = lane_polygon(lane)
     after = lane_polygon(view.lanes["a-1"])
     assert shapely.symmetric_difference(before, after).area < 1e-9 * before.area
-    assert float(np.linalg.norm(np.diff(view.lanes["a-1"].centre, axis=0), axis=1).max()) <= 2.0
+    assert np.linalg.norm(np.diff(view.lanes["a-1"].centre, axis=0), axis=1).max() <= 2.0
 
 
 def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight, tmp_path):
