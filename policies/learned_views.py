@@ -26,8 +26,7 @@ def cutter(camera: CameraSpec, view: View, device: torch.device) -> Cut:
     `learned_input.level_view`, on which the network was trained, on a card the same within two grey
     levels.
     """
-    cut: Cut = implementation(device, _host_view, DeviceView)(camera, view, device)
-    return cut
+    return implementation(device, _host_view, DeviceView)(camera, view, device)
 
 
 def _host_view(camera: CameraSpec, view: View, _: torch.device) -> Cut:

@@ -139,5 +139,4 @@ def to_images(video: Tensor, size: ClipSize) -> U8:
     clipped to the range.
     """
     levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
-    images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
-    return images
+    return levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()

@@ -256,7 +256,7 @@ class ReferenceSession:
 
     def _carry_on_host(self, placed: Sequence[Placed]) -> list[Any]:
         threads = max(1, self.threads // max(1, len(placed)))
-        return map_on_threads(self.threads, lambda view: carry(*view, threads), placed)
+        return map_on_threads(self.threads, lambda view: carry(*view, threads=threads), placed)
 
     def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""

@@ -60,8 +60,7 @@ class SsimTarget:
         """Return the mean structural similarity with an image ``(H, W, 3)``, differentiable by the
         image.
         """
-        value: Tensor = _Ssim.apply(image, self)  # type: ignore[no-untyped-call]
-        return value
+        return _Ssim.apply(image, self)  # type: ignore[no-untyped-call]
 
     def blur(self, image: Tensor) -> Tensor:
         """Return local means ``(H, W, C)``."""

@@ -60,7 +60,4 @@ def rasterize(
             f"backend {backend!r}: no such backend", f"choose one of {', '.join(MODULES)}"
         )
     module = import_module(f"{__package__}.{MODULES[backend]}")
-    drawn: RasterOutput = getattr(module, f"rasterize_{backend}")(
-        cloud, camera, background, near_m=near_m
-    )
-    return drawn
+    return getattr(module, f"rasterize_{backend}")(cloud, camera, background, near_m=near_m)

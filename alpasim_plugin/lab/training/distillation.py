@@ -248,12 +248,11 @@ class DistillationTask:
         """
         self.fake(x, sigma, condition, frozen)
         head = self.parts["head"]
-        logits: Tensor = (
+        return (
             functional_call(head, _detached(head), (self.fake.features,))
             if frozen
             else head(self.fake.features)
         )
-        return logits
 
 
 class ScoreNet:
@@ -288,12 +287,11 @@ class ScoreNet:
         """
         args = (x, T_SOURCE * sigma[:, None], no_text(self.net, x), condition)
         attention = {"block_latents": None}
-        v: Tensor = (
+        return (
             functional_call(self.net, _detached(self.net), args, attention)
             if frozen
             else self.net(*args, **attention)
         )
-        return v
 
     def given(self, condition: Tensor) -> Score:
         """Return the score of clips with this condition."""

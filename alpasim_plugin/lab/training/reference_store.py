@@ -84,8 +84,7 @@ class SequenceReferences:
 
     def T_world_rig(self, i: int) -> F64:
         """Return the pose of the rig at frame ``i``."""
-        pose: F64 = self.T_world_camera[i] @ inverse(self.T_rig_camera)
-        return pose
+        return self.T_world_camera[i] @ inverse(self.T_rig_camera)
 
     def picture(self, i: int) -> RecordedImage:
         """Return recorded frame ``i``."""

@@ -491,8 +491,7 @@ def _detailed(frames: F32, sharpness: float, grain: float, rng: np.random.Genera
         [[cv2.GaussianBlur(channel, (0, 0), 1.0) for channel in frame] for frame in frames]
     )
     noise = np.float32(grain) * rng.standard_normal(frames.shape, np.float32)
-    detailed: F32 = np.clip(frames + np.float32(sharpness) * (frames - blurred) + noise, -1, 1)
-    return detailed
+    return np.clip(frames + np.float32(sharpness) * (frames - blurred) + noise, -1, 1)
 
 
 def _in_order(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
