@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -256,7 +257,8 @@ class ReferenceSession:
 
     def _carry_on_host(self, placed: Sequence[Placed]) -> list[Any]:
         threads = max(1, self.threads // max(1, len(placed)))
-        return map_on_threads(self.threads, lambda view: carry(*view, threads=threads), placed)
+        carry_one = partial(carry, threads=threads)
+        return map_on_threads(self.threads, lambda view: carry_one(*view), placed)
 
     def _choose(self, request: RenderRequest) -> tuple[tuple[int, ...], F64]:
         """Return which recorded frames a view receives, and the rig's pose nearest to it."""
