@@ -30,6 +30,8 @@ PARALLEL = 1e-300
 # A recorded surface that is at least this share of a point's distance away does not hide the ground,
 # unless it is a road user's; another point is hidden by all that does not agree with it.
 FREE_SHARE = 0.4
+# Where other pinholes of a lens fill in is looked for in at least so many columns of a view.
+SEARCHED = 100
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
 # Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
 VALID = 255
@@ -136,14 +138,18 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         _coordinates_on_box(depth[part], depth_then, *box, *images)
     rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
+    step = max(1, shape[1] // SEARCHED)
+    some = slice(0, None, step)
     for other in recorded.others:
         hole = out[..., 3] == 0
-        rows, columns = (np.flatnonzero(hole.any(axis=axis)) for axis in (1, 0))
-        if not len(rows):
-            break
-        around = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        filling = warp(other, target.window(*around))
-        cv2.copyTo(filling, hole[around].astype(np.uint8), out[around])  # in place
+        shown = warp(other, target.window(some, some))[..., 3] > 0
+        places = np.argwhere(hole[some, some] & shown)
+        if len(places):
+            top, left = np.maximum(places.min(axis=0) - 1, 0) * step
+            below, right = (places.max(axis=0) + 2) * step
+            around = slice(top, below), slice(left, right)
+            filling = warp(other, target.window(*around))
+            cv2.copyTo(filling, hole[around].astype(np.uint8), out[around])  # in place
     return out
 
 
