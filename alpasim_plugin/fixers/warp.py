@@ -142,8 +142,8 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     some = slice(0, None, step)
     for other in recorded.others:
         hole = out[..., 3] == 0
-        shown = warp(other, target.window(some, some))[..., 3] > 0
-        places = np.argwhere(hole[some, some] & shown)
+        fills = warp(other, target.window(some, some))[..., 3] > 0
+        places = np.argwhere(hole[some, some] & fills)
         if len(places):
             top, left = np.maximum(places.min(axis=0) - 1, 0) * step
             below, right = (places.max(axis=0) + 2) * step
