@@ -95,10 +95,15 @@ def test_studies_that_are_done_are_in_the_commit_that_their_page_names(repo, pag
         study for page in pages for study in OF_COMMIT.findall(page.read_text(encoding="utf-8"))
     }
     assert named
-    for script, commit in named:
-        if run(["git", "cat-file", "-e", commit], cwd=repo, stderr=DEVNULL).returncode:
-            pytest.skip(f"the history of commit {commit} is not here")
-        assert run(["git", "cat-file", "-e", f"{commit}:{script}"], cwd=repo).returncode == 0
+    known = {
+        (script, commit)
+        for script, commit in named
+        if run(["git", "cat-file", "-e", f"{commit}:{script}"], cwd=repo, stderr=DEVNULL).returncode
+        == 0
+    }
+    if not known or (repo / ".git/shallow").exists():
+        pytest.skip("the history of the project is not here")
+    assert named == known
 
 
 def reachable(docs):

@@ -66,10 +66,10 @@ def values(log, chosen, road=TWO_LANES):
 
 
 def test_leaving_the_path_to_the_side_is_a_fault_and_passing_its_end_is_none():
-    aside = values(drift(4.6), LATER)
+    drifted = values(drift(4.6), LATER)
     ahead = values(drift(0.0, 61.0), LATER)
-    assert aside["left_corridor_laterally"] == 1.0
-    assert aside["lateral_dist_to_gt_trajectory"] == pytest.approx(
+    assert drifted["left_corridor_laterally"] == 1.0
+    assert drifted["lateral_dist_to_gt_trajectory"] == pytest.approx(
         4.048, abs=1e-3
     )  # of the first row beyond 4 m; later ones are dropped
     assert ahead["left_corridor_laterally"] == 0.0
@@ -78,8 +78,8 @@ def test_leaving_the_path_to_the_side_is_a_fault_and_passing_its_end_is_none():
     )  # that one ends the rollout's rows under both versions
     assert "left_corridor_laterally" not in values(drift(4.6), NOW)
     settings = SceneScoreSettings()
-    assert scene_score(aside, settings).failure_reason == "left_corridor_laterally"
-    assert (scene_score(aside, settings).score, scene_score(ahead, settings).score) == (0.0, 1.0)
+    assert scene_score(drifted, settings).failure_reason == "left_corridor_laterally"
+    assert (scene_score(drifted, settings).score, scene_score(ahead, settings).score) == (0.0, 1.0)
     assert scene_score(values(drift(4.6), NOW), settings).score > 0.9
 
 

@@ -406,13 +406,13 @@ def rig(model, folders, left, binary=False, turn=1.0):
     frames = []
     for i, pose in enumerate(poses(13)):
         ahead = 100 - i
-        aside = 200 - i
+        side = 200 - i
         T_rig_world = np.linalg.inv(pose)
         images.append(f"{ahead} {numbers(T_rig_world)} 7 {folders[0]}{i}.png")
         data = f"1 CAMERA 7 {ahead}"
         if i in left:
-            images.append(f"{aside} {numbers(SIDE @ T_rig_world)} 9 {folders[1]}{i}.png")
-            data = f"2 CAMERA 9 {aside} CAMERA 7 {ahead}"
+            images.append(f"{side} {numbers(SIDE @ T_rig_world)} 9 {folders[1]}{i}.png")
+            data = f"2 CAMERA 9 {side} CAMERA 7 {ahead}"
         frames.append(f"{50 - i} 3 {numbers(T_rig_world)} {data}")
     mount = SIDE.copy()
     mount[0, 2] *= turn

@@ -105,9 +105,9 @@ def test_nodes_at_poses_in_two_views_at_once_equal_the_processor():
     behind = np.random.default_rng(1).random((60, 90, 3)).astype(np.float32)
     nodes = [DrawnCloud(*pair) for pair in enumerate(poses)]
     placed = list(zip(map(prepare, clouds), poses, strict=True))
-    aside = np.eye(4)
-    aside[0, 3] = 0.7
-    cameras = camera(90, 60), camera(90, 60, T_camera_world=aside)
+    T_shifted = np.eye(4)
+    T_shifted[0, 3] = 0.7
+    cameras = camera(90, 60), camera(90, 60, T_camera_world=T_shifted)
     views = list(zip(cameras, (nodes, nodes[1:]), strict=True))
     both = UploadedClouds(clouds, "cpu").draw(views, torch.tensor(behind))
     for found, cam, mine in zip(both, cameras, (placed, placed[1:]), strict=True):
