@@ -48,9 +48,3 @@ def test_a_view_has_the_same_references_whatever_was_asked_before(file):
     assert len(alone) == 2
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
     assert (alone[0][..., 3] > 0).mean() > 0.5
-
-
-def test_a_served_scene_is_drawn_by_the_pinholes_of_its_lenses(tmp_path):
-    path = tmp_path / "served.yaml"
-    path.write_text(SCENE.replace("width: 64", "width: 64, lens: fisheye, hfov_deg: 150"))
-    assert [camera.lens for camera in served(path, "clean").renderer.scenario.cameras] == [None] * 5

@@ -8,11 +8,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 from alpasim_plugin.alpasim.server import views
+from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
+from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import read_sides, straight_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import joined_image
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import sensorsim_pb2
+from alpasim_plugin.runs.cameras import recorded_requests
+from alpasim_plugin.runs.cell import make_renderer
+from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 
 Spec = sensorsim_pb2.CameraSpec
@@ -69,36 +76,26 @@ def ftheta(backward):
     return Spec(ftheta_param=p, resolution_w=320, resolution_h=180, logical_id="c")
 
 
+def rays_and_matrix(p):
+    """Return RAYS ``(N, 3)`` and the matrix of a lens."""
+    fx, fy = p.focal_length_x, p.focal_length_y
+    K = np.array([[fx, 0, p.principal_point_x], [0, fy, p.principal_point_y], [0, 0, 1]])
+    return np.column_stack([RAYS, np.ones(len(RAYS))]), K
+
+
 def by_opencv(spec):
     p = spec.opencv_pinhole_param
-    rays = np.column_stack([RAYS, np.ones(len(RAYS))])
-    K = np.array(
-        [
-            [p.focal_length_x, 0, p.principal_point_x],
-            [0, p.focal_length_y, p.principal_point_y],
-            [0, 0, 1],
-        ]
-    )
+    rays, K = rays_and_matrix(p)
     k = list(p.radial_coeffs)
-    t = list(p.tangential_coeffs)
-    return cv2.projectPoints(
-        rays, np.zeros(3), np.zeros(3), K, np.array([*k[:2], *t, *k[2:], *p.thin_prism_coeffs])
-    )[0][:, 0]
+    bent = np.array([*k[:2], *p.tangential_coeffs, *k[2:], *p.thin_prism_coeffs])
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, bent)[0][:, 0]
 
 
 def by_opencv_fisheye(spec):
     p = spec.opencv_fisheye_param
-    rays = np.column_stack([RAYS, np.ones(len(RAYS))])
-    K = np.array(
-        [
-            [p.focal_length_x, 0, p.principal_point_x],
-            [0, p.focal_length_y, p.principal_point_y],
-            [0, 0, 1],
-        ]
-    )
-    return cv2.fisheye.projectPoints(
-        rays[:, None], np.zeros(3), np.zeros(3), K, np.array(p.radial_coeffs)
-    )[0][:, 0]
+    rays, K = rays_and_matrix(p)
+    bent = np.array(p.radial_coeffs)
+    return cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), K, bent)[0][:, 0]
 
 
 def by_ftheta(spec):
@@ -235,3 +232,33 @@ def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean
     assert_allclose(
         shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
     )
+
+
+STREET = """
+version: 1
+scene_id: lenses
+road: {segments: [{kind: straight, length_m: 80}]}
+ego: {speed_mps: 10}
+timing: {duration_us: 1_500_000}
+actors: [{kind: idm, id: ahead, s_m: 30, speed_mps: 9}]
+cameras:
+- {name: opencv, width: 96, height: 64, lens: opencv, hfov_deg: 80, coefficients: [-0.2, 0.05]}
+- {name: fisheye, width: 96, height: 64, lens: fisheye, hfov_deg: 150, yaw_deg: 90, y_m: 0.95}
+- {name: ftheta, width: 96, height: 64, lens: ftheta, hfov_deg: 110}
+environment: {buildings: 0.0, trees_per_100m: 0.0, poles_spacing_m: 0}
+degradation: {share: 0.004}
+"""
+
+
+def test_a_server_shows_through_a_foreign_lens_what_a_run_shows(tmp_path):
+    path = tmp_path / "street.yaml"
+    path.write_text(STREET)
+    scenario = load_scenario(path)
+    run = make_renderer("3dgs", scenario)
+    service = assemble(Settings("3dgs", scenes=[str(path)])).service
+    for asked in recorded_requests(scenario, scenario.start_us + 1_000_000):
+        wire = wire_render_request("lenses", asked, "png")
+        seen = decode_image(service.frames.answers([wire], CallTime())[0])
+        assert seen.std() > 20
+        # intrinsics and poses are of single precision on the wire: a pixel may round the other way
+        assert_allclose(seen.astype(int), run.render(asked).rgb, atol=2)
