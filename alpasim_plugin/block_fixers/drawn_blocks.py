@@ -28,16 +28,13 @@ PROMPT_TOKENS = 512  # of OmniDreams' prompt
 @torch.no_grad()
 def drawn_blocks(
     settings: OneFixerSettings, width: int, height: int, device: str
-) -> tuple[int, Callable[[], Tensor]]:
-    """Return a number of weights, and a call that fixes one further block of one camera.
+) -> Callable[[], Tensor]:
+    """Return a call that fixes one further block of one camera: frames ``(1, 3, T, H, W)``.
 
     Args:
         settings: Of a fixer with the autoencoder of Wan and the tiny decoder.
         width, height: Pixels, multiples of 16.
         device: A card, or ``meta``, where nothing is computed.
-
-    Returns:
-        The weights of all networks, and the call, which returns frames ``(1, 3, T, H, W)``.
     """
     sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
     frames = GROUP * settings.block_latents
@@ -51,8 +48,8 @@ def drawn_blocks(
         text = dit.encode_text(torch.ones(1, PROMPT_TOKENS, sizes.text_width))
         image = torch.full((1, 3, frames, height, width), 0.5)
         noise = torch.ones(1, LATENT, latents, height // SIDE, width // SIDE)
-    parts = dit, vae.to(device), decoder.to(device)
-    pipeline = BlockPipeline(Networks(*parts, text, False, "random weights"), settings)
+    parts = Networks(dit, vae.to(device), decoder.to(device), text, False, "random weights")
+    pipeline = BlockPipeline(parts, settings)
     state = pipeline.start(1, height, width)
 
     def fix() -> Tensor:
@@ -63,4 +60,4 @@ def drawn_blocks(
         state = pipeline.keep(after)
         return video
 
-    return sum(weight.numel() for part in parts for weight in part.parameters()), fix
+    return fix

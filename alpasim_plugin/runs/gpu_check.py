@@ -39,16 +39,7 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import (
 )
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.runs.cell import make_renderer
-from alpasim_plugin.runs.gpu_work import (
-    H100,
-    PEAKS,
-    Work,
-    blocks,
-    counted,
-    fixer_work,
-    raster_work,
-    transparent_splats,
-)
+from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, blocks, transparent_splats
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario
@@ -181,16 +172,16 @@ def raster_rate(device: str) -> Facts:
         clouds, behind = UploadedClouds([cloud], device), upload(np.zeros(3, np.float32), device)
         return lambda: clouds.draw([(camera, [DrawnCloud(0)])], behind)[0].arrays
 
-    return {"ok": True} | _rated(device, raster_work(*LARGE), draws)
+    return _rated(device, {"splats": draws})
 
 
 def fixer_rate(device: str) -> Facts:
     """Time a frame of one and of six cameras beside what it costs at least."""
-    facts: Facts = {"ok": True}
-    for count in (1, 6):
-        fixes = partial(_streaming, "onefixer", list(map(str, range(count))), *MIDDLE, device)
-        facts[f"cameras: {count}"] = _rated(device, fixer_work(count, *MIDDLE), fixes)
-    return facts
+
+    def fixes(count: int) -> Call:
+        return _streaming("onefixer", list(map(str, range(count))), *MIDDLE, device)
+
+    return _rated(device, {f"cameras: {count}": partial(fixes, count) for count in (1, 6)})
 
 
 def block_rate(device: str) -> Facts:
@@ -199,14 +190,11 @@ def block_rate(device: str) -> Facts:
     """
 
     def fixes(history: str) -> Call:
-        _, fix = blocks(history, *MIDDLE, device)
+        fix = blocks(history, *MIDDLE, device)
         return lambda: download(fix().mean())
 
-    facts: Facts = {"ok": True}
-    for history in ("finalise", "last-forward"):
-        facts["weights"], fix = blocks(history, *MIDDLE, "meta")
-        facts[history] = _rated(device, counted(fix, "bf16"), partial(fixes, history))
-    return facts
+    kinds = "finalise", "last-forward"
+    return _rated(device, {history: partial(fixes, history) for history in kinds})
 
 
 SECTIONS: dict[str, Callable[[str], Facts]] = {
@@ -233,16 +221,20 @@ AVOIDED_BY = {
 }
 
 
-def _rated(device: str, work: Work, make: Callable[[], Call]) -> Facts:
-    """Return what a call costs at least and, on a card, its time and share of the card's peak."""
-    facts: Facts = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
+def _rated(device: str, calls: dict[str, Callable[[], Call]]) -> Facts:
+    """Return what calls cost at least and, on a card, their times and shares of its peak."""
     name = facts_of(device).get("card")
-    if name is None:
-        return facts
-    ms = _median_ms(make())
-    known = name in PEAKS
-    share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
-    return {**facts, "ms": ms, "roofline_share": share}
+    facts: Facts = {"ok": True}
+    for what, make in calls.items():
+        work = COUNTED[what]
+        facts[what] = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
+        if name is None:
+            continue
+        ms = _median_ms(make())
+        known = name in PEAKS
+        share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
+        facts[what] |= {"ms": ms, "roofline_share": share}
+    return facts
 
 
 def compared(

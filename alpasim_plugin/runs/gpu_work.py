@@ -1,47 +1,25 @@
-"""What a frame costs a card at least: floating-point operations and bytes, counted without one, over
-the card's peak rates (its roofline).
-
-Operations are two a multiply-add, of products, convolutions and attention alone. Bytes are what
-each of them reads and writes where everything between them is fused, and what a frame is made of
-and results in.
+"""What a card does in the rates of `gpu_check`, and its work at least: floating-point operations and
+bytes, over the card's peak rates (its roofline).
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
-from torch.utils.flop_counter import FlopCounterMode
 
 from alpasim_plugin.core.parts import find
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.network.pixel_generator import TORCH
-from alpasim_plugin.fixers.pixel_fixer import GivenFrame, fix_frame, in_range
-from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import TILE
 
 SPLATS = 2_000_000
 OPACITY = 0.02  # so low that no splat hides another: every pair of splat and tile is blended
 DISTANCE_M = 10.0
-PAIRS = 1.58  # of a splat and tiles: (1 + 2 h / 16)^2 for h = 2.06 px, where its alpha is 1/255
-# Operations of `triton_kernels.project` a splat, and of `composite` a splat and pixel.
-PROJECT_FLOP = 420
-BLEND_FLOP = 23
-# Bytes of a splat that is read, projected, and read again; of a pair of splat and tile that is
-# listed, sorted and read; of a pixel.
-SPLAT_BYTES = 260 + 2 * 72
-PAIR_BYTES = 4 * 8
-PIXEL_BYTES = 24
 BLOCKS_BEFORE = 3  # until an attention window of six latents is full
 
 # Dense TFLOP/s of bfloat16 and of float32 without TF32, and GB/s of the memory, by the name that
@@ -61,15 +39,12 @@ PEAKS = {
 }
 
 
-Precision = Literal["fp32", "bf16"]
-
-
 class Work(NamedTuple):
     """What is computed, and what is read and written."""
 
     gflop: float
     gb: float
-    precision: Precision = "fp32"
+    precision: Literal["fp32", "bf16"] = "fp32"
 
     def least_ms(self, card: str) -> float:
         """Return the time that a card of `PEAKS` takes at its peak rates."""
@@ -78,71 +53,28 @@ class Work(NamedTuple):
         return round(max(self.gflop / rate, 1e3 * self.gb / memory), 3)
 
 
-class _Counter(TorchFunctionMode):
-    """Counts products, convolutions and attention; use it inside ``with counter.flop, counter``."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.flop = FlopCounterMode(display=False)
-        self.bytes = 0
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        options = kwargs or {}
-        before = self.flop.get_total_flops()
-        made = func(*args, **options)
-        if self.flop.get_total_flops() > before:
-            self.bytes += bytes_of(*args, *options.values(), made)
-        return made
+# Counted by ``python -m alpasim_plugin.lab.bench.roofline``: a frame of `transparent_splats` at
+# 1920x1080; at 960x544 a frame of ``onefixer`` with two recorded images a camera, and a block of
+# `blocks` by what makes its history.
+COUNTED = {
+    "splats": Work(19.45, 0.959),
+    "cameras: 1": Work(2.06, 0.086),
+    "cameras: 6": Work(12.36, 0.498),
+    "finalise": Work(54830.0, 60.985, "bf16"),
+    "last-forward": Work(29475.85, 41.772, "bf16"),
+}
 
 
-def bytes_of(*parts: Any) -> int:
-    """Return the bytes of the tensors among values."""
-    return sum(part.nbytes for part in parts if isinstance(part, Tensor))
-
-
-def counted(
-    call: Callable[[], Any],
-    precision: Precision = "fp32",
-    given: Sequence[Any] = (),
-) -> Work:
-    """Return the work of a call, with the bytes of what it is given and returns."""
-    counter = _Counter()
-    with counter.flop, counter:
-        made = call()
-    moved = counter.bytes + bytes_of(*given, *made)
-    return Work(round(counter.flop.get_total_flops() / 1e9, 2), round(moved / 1e9, 3), precision)
-
-
-def fixer_work(cameras: int, width: int, height: int) -> Work:
-    """Count a frame of ``onefixer`` with two recorded images a camera."""
-    settings: Any = fixer_settings("onefixer")
-    loaded = load_generator(settings)
-    on_meta = replace(loaded, net=copy.deepcopy(loaded.net).to("meta"), operations=TORCH)
-    image = torch.empty((cameras, height, width, 3), dtype=torch.uint8, device="meta")
-    references = image.new_empty((cameras, 2, height, width, 4))
-    seen = TORCH.smaller(image, settings.scale_of(height, width))
-    given = GivenFrame(image, *on_meta.net.start(in_range(seen)), None, image, references)
-    return counted(lambda: fix_frame(on_meta, settings, given), given=given)
-
-
-def blocks(history: str, width: int, height: int, device: str) -> tuple[int, Callable[[], Tensor]]:
-    """Return the number of weights of ``onefixer-2b``, drawn on a device, and a call that fixes one
-    further block with a full attention window.
+def blocks(history: str, width: int, height: int, device: str) -> Callable[[], Tensor]:
+    """Return a call that fixes one further block by ``onefixer-2b`` with random weights and a full
+    attention window. On the device ``meta`` it computes nothing.
     """
     settings = fixer_settings("onefixer-2b", [f"history={history}"])
     factory = load(find("fixer", settings.name).target, "fixer")
-    weights, fix = load(factory.drawn_blocks, "fixer")(settings, width, height, device)
+    fix: Callable[[], Tensor] = load(factory.drawn_blocks, "fixer")(settings, width, height, device)
     for _ in range(BLOCKS_BEFORE):
         fix()
-    return weights, fix
-
-
-def raster_work(width: int, height: int) -> Work:
-    """Count a frame of `transparent_splats`."""
-    pairs = PAIRS * SPLATS
-    flop = SPLATS * PROJECT_FLOP + pairs * TILE**2 * BLEND_FLOP
-    moved = SPLATS * SPLAT_BYTES + pairs * PAIR_BYTES + width * height * PIXEL_BYTES
-    return Work(round(flop / 1e9, 2), round(moved / 1e9, 3))
+    return fix
 
 
 def transparent_splats(width: int, height: int) -> tuple[GaussianCloud, PinholeCamera]:

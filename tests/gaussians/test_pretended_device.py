@@ -31,7 +31,6 @@ from alpasim_plugin.fixers.references import ReferenceSession
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.rolling import camera_at, draw_requests
-from alpasim_plugin.runs.gpu_work import SPLAT_BYTES
 from tests.examples import first_rows_of
 from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
@@ -39,8 +38,6 @@ from tests.gaussians.test_scene_graph import SKY, blobs, camera, node, se2
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
-from alpasim_plugin.gaussians.raster.triton_kernels import BOX, RECORD
 from tests.pretended_device import pretended_device, traffic
 
 HEIGHT = 64
@@ -177,14 +174,6 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
             made("cuda:0").render([replace(request, camera=one) for one in cameras])
             launches.append(traffic.launches)
         assert launches[1] < 1.2 * launches[0]
-
-
-def test_bytes_of_a_splat():
-    cloud = replace(blobs((8, 3, 1), n=12), sh=np.zeros((12, 16, 3)))
-    drawn = UploadedClouds([cloud], "cpu")
-    parts = drawn.means, drawn.factors, drawn.opacities, drawn.extents, drawn.sh
-    written = 4 * (RECORD + BOX) + 8  # its record and box, depth and count
-    assert sum(part.nbytes for part in parts) + 2 * 12 * written == SPLAT_BYTES * 12
 
 
 @pytest.mark.parametrize("holes", ["render", "noise"])

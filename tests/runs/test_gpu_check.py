@@ -9,7 +9,7 @@ import torch
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.runs import gpu_check, gpu_work
-from alpasim_plugin.runs.gpu_work import H100, PEAKS, blocks, counted, fixer_work, raster_work
+from alpasim_plugin.runs.gpu_work import PEAKS
 from tests.examples import first_rows_of
 from tests.pretended_device import pretended_device
 
@@ -41,22 +41,6 @@ def test_a_section_that_ends_with_an_error_costs_only_itself(monkeypatch):
     assert not facts["unknown"]["ok"]
     assert "unknown" in facts["unknown"]["why"]
     assert facts["card"] == {"ok": True, "torch": torch.__version__}
-
-
-def test_counts_of_a_frame():
-    assert fixer_work(1, 960, 544).gflop == pytest.approx(2.06, rel=0.01)
-    assert raster_work(1920, 1080).least_ms(H100) == pytest.approx(0.29, rel=0.01)
-
-
-@pytest.mark.slow
-def test_counts_of_a_block_of_the_largest_generator():
-    weights, fix = blocks("last-forward", 960, 544, "meta")
-    assert weights == pytest.approx(2.077e9, rel=0.001)
-    # A query, key and channel takes four operations, a weight and token two, in 28 blocks.
-    tokens = 2 * 34 * 60
-    width = 2048
-    least = 28 * 4 * tokens * width * (3 * tokens + 6 * width)
-    assert least / 1e9 < counted(fix).gflop < 1.3 * least / 1e9
 
 
 def test_a_section_that_the_budget_does_not_reach_is_not_begun(monkeypatch):
@@ -102,8 +86,8 @@ def test_a_rate_is_a_share_of_the_peak_of_a_known_card(section, card, monkeypatc
         monkeypatch.setattr(gpu_check, name, value)
     with pretended_device(monkeypatch):
         facts = gpu_check.SECTIONS[section]("cuda:0")
-    rows = [row for row in (facts, *facts.values()) if isinstance(row, dict) and "ms" in row]
-    assert {isinstance(row["roofline_share"], float) for row in rows} == {card in PEAKS}
+    assert facts.pop("ok")
+    assert {isinstance(row["roofline_share"], float) for row in facts.values()} == {card in PEAKS}
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
