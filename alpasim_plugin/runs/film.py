@@ -1,21 +1,63 @@
-"""The film of a rollout whose policy has no camera: rendered afterwards, at its logged poses."""
+"""The film of a rollout: all its cameras beside one another. That of a policy without a camera is
+rendered afterwards, at the logged poses.
+"""
 
 from __future__ import annotations
 
-from itertools import count
+from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.types import U8, Scenario, SensorSpec
-from alpasim_plugin.log import read_asl, write_mp4
+from alpasim_plugin.core.types import U8, Frame, Scenario, SensorSpec
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, VIDEO_NAME
+from alpasim_plugin.log.video import VideoWriter
 from alpasim_plugin.runs.cameras import logged_request
 from alpasim_plugin.runs.guards import checked_frames
 
+SECOND_US = 1_000_000
+WIDTH_PX = 640  # of a camera in a film, at most
+
+
+class Film:
+    """The frames of all cameras, by time."""
+
+    def __init__(self) -> None:
+        self._shots: dict[int, dict[str, U8]] = {}
+
+    def add(self, frame: Frame) -> None:
+        """Keep a frame, no wider than `WIDTH_PX`."""
+        self._shots.setdefault(frame.t_us, {})[frame.camera] = smaller(frame.rgb, WIDTH_PX)
+
+    def save(self, folder: Path) -> None:
+        """Write ``front.mp4``; nothing without frames. A camera without a frame at an instant shows
+        its newest one, or else its first.
+        """
+        times = sorted(self._shots)
+        if not times:
+            return
+        step_us = int(np.diff(times).min(initial=SECOND_US))
+        shown = {name: rgb for t_us in reversed(times) for name, rgb in self._shots[t_us].items()}
+        tick = Fraction(1, SECOND_US)
+        with VideoWriter(folder / VIDEO_NAME, tick, Fraction(SECOND_US, step_us)) as video:
+            for t_us in times:
+                shown |= self._shots[t_us]
+                video.write(beside(list(shown.values())), t_us - times[0], step_us)
+
+
+def beside(images: Sequence[U8]) -> U8:
+    """Return images ``(H, W, 3)`` beside one another, black below those that are lower."""
+    height = max(len(image) for image in images)
+    return np.hstack([np.pad(one, ((0, height - len(one)), (0, 0), (0, 0))) for one in images])
+
 
 def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
-    """Write ``front.mp4`` of a finished rollout: what a renderer shows in the scenario's first
-    camera, at its period and at the logged poses.
+    """Write ``front.mp4`` of a finished rollout: what a renderer shows in the scenario's cameras, at
+    their periods and at the logged poses.
 
     A scenario without a camera has no film, and frames after the last whole block are left out.
 
@@ -27,20 +69,18 @@ def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
     Raises:
         RendererError: The renderer raised, or a frame does not match its request.
     """
-    if not scenario.cameras:
-        return
-    camera = scenario.cameras[0]
-    period_us = scenario.period_us(SensorSpec(camera.name))
     log = read_asl(folder / LOG_NAME)
-    times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
-    requests = [logged_request(log, camera, t_us) for t_us in times]
+    film = Film()
     rule = renderer.block or BlockRule(1, 1)
-    images: list[U8] = []
-    for number in count():
-        end = len(images) + rule.frames(number)
-        if end > len(requests):
-            break
-        frames = checked_frames(renderer, requests[len(images) : end])
-        images += [frame.rgb for frame in frames]
-    if images:
-        write_mp4(folder / VIDEO_NAME, images, 1e6 / period_us)
+    for camera in scenario.cameras:
+        period_us = scenario.period_us(SensorSpec(camera.name))
+        times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
+        requests = [logged_request(log, camera, t_us) for t_us in times]
+        number = 0
+        while requests and rule.frames(number) <= len(requests):
+            end = rule.frames(number)
+            for frame in checked_frames(renderer, requests[:end]):
+                film.add(frame)
+            requests = requests[end:]
+            number += 1
+    film.save(folder)

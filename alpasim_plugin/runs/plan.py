@@ -35,7 +35,9 @@ class RunOptions:
     images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = (
         "jpeg"
     )
-    video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "failures"
+    video: Annotated[
+        Literal["none", "failures", "all"], Flag("Write front.mp4, of all cameras.")
+    ] = "failures"
     device: Annotated[str, Flag("Where renderers compute: cpu, cuda or cuda:N.")] = "cpu"
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")

@@ -23,7 +23,6 @@ from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,
-    U8,
     CameraSpec,
     EgoState,
     Frame,
@@ -31,7 +30,6 @@ from alpasim_plugin.core.types import (
     RenderRequest,
     RolloutLog,
     Scenario,
-    SensorSpec,
     Trajectory,
 )
 from alpasim_plugin.log import (
@@ -39,16 +37,15 @@ from alpasim_plugin.log import (
     RolloutHeader,
     read_asl,
     write_facts,
-    write_mp4,
 )
 from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
     FRAMES_NAME,
     LOG_NAME,
-    VIDEO_NAME,
 )
 from alpasim_plugin.log.schema import session_uuid
+from alpasim_plugin.runs.film import Film
 from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
@@ -99,7 +96,7 @@ class Recorder:
         folder: Folder to write; by default a temporary one that is deleted with the recorder.
         session: Identifies the rollout in the log; equal rollouts have equal ids.
         images: Encoding of camera frames in the log.
-        keep_frames: Keep the first camera's frames for a video.
+        keep_frames: Keep the cameras' frames for a video.
         versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs",
             "egodriver": "lane-camera"}``.
     """
@@ -125,9 +122,7 @@ class Recorder:
         self._times = StageTimes()
         self._frames: list[JsonObject] = []
         self._debug: list[JsonObject] = []
-        self._film: list[U8] = []
-        self._film_camera = ""
-        self._film_period_us = 0
+        self._film = Film()
         self._last_query_us = -1
         self._steps = 0
         self._n_steps = 0
@@ -159,10 +154,6 @@ class Recorder:
 
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
-        if cameras:
-            first = next(iter(cameras))
-            self._film_camera = first if self._keep_frames else ""
-            self._film_period_us = self._scenario.period_us(SensorSpec(first))
         self._n_steps = clock.n_steps
         scenario = self._scenario
         header = RolloutHeader(
@@ -203,8 +194,8 @@ class Recorder:
                 "events": " ".join(frame.events),
             }
             self._frames.append(facts | dict(frame.facts))
-        if frame.camera == self._film_camera:
-            self._film.append(frame.rgb)
+        if self._keep_frames:
+            self._film.add(frame)
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""
@@ -273,8 +264,7 @@ class Recorder:
 
     def save_video(self) -> None:
         """Write the video; nothing for a rollout without frames."""
-        if self._film:
-            write_mp4(self.folder / VIDEO_NAME, self._film, 1e6 / self._film_period_us)
+        self._film.save(self.folder)
 
     @property
     def _log(self) -> AslWriter:

@@ -85,7 +85,8 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog) -> list[Source]:
     video = run.file_of(rollout, VIDEO_NAME)
     if cameras or video is None:
         return [Source(name, tuple(images)) for name, images in cameras.items()]
-    return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us))]
+    filmed = sorted({str(row["camera"]) for row in frame_rows(run, rollout)})
+    return [Source(", ".join(filmed) or "all cameras", video=(video, log.render_start_us))]
 
 
 def encoded(source: Source, zero_us: int) -> dict[str, Any]:

@@ -3,17 +3,19 @@
 import shutil
 from types import SimpleNamespace
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.interfaces import Renderer, complete
-from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.core.types import Frame, SensorSpec
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer, run_cell
+from alpasim_plugin.runs.film import Film
 from alpasim_plugin.runs.fork import SwitchedRenderer
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
@@ -48,8 +50,8 @@ class SeesAfterAll(ConstantVelocity):
         self.sensors = (SensorSpec("front"),)
 
 
-def plan_of(policy="constant-velocity", renderers=(GREY, DARKER), **options):
-    refs = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
+def plan_of(policy="constant-velocity", renderers=(GREY, DARKER), more=(), **options):
+    refs = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT + more)]
     return make_plan(refs, renderers, (policy,), (0,), RunOptions(**options))  # type: ignore[arg-type]
 
 
@@ -105,15 +107,28 @@ def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path):
 
 @pytest.mark.slow
 def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path):
-    plan = plan_of(video="all")
+    plan = plan_of(more=("cameras={rig: surround-6, width: 64}",), video="all")
     drive(plan, tmp_path / "all")
     for cell, level in zip(plan.cells, (Grey.level, Darker.level) * 2, strict=True):
         film = read_mp4(tmp_path / "all" / cell.folder / "front.mp4")
         assert film.fps == 10
-        assert len(film.frames) == 13  # both ends of 1.2 s
+        assert film.frames.shape == (13, 36, 6 * 64, 3)  # both ends of 1.2 s
         assert_allclose(film.frames, level, atol=2)
     drive(plan_of(), tmp_path / "failures")
     assert not list((tmp_path / "failures").rglob("front.mp4"))
+
+
+def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(tmp_path):
+    film = Film()
+    for t_us in (0, 200_000, 400_000):
+        film.add(Frame(t_us, "front", np.full((16, 16, 3), 200, np.uint8)))
+    for t_us in (0, 400_000):
+        film.add(Frame(t_us, "left", np.full((8, 16, 3), 50 + t_us // 4000, np.uint8)))
+    film.save(tmp_path)
+    shown = read_mp4(tmp_path / "front.mp4")
+    assert shown.t_us.tolist() == [0, 200_000, 400_000]
+    assert_allclose(shown.frames[:, :, :14], 200, atol=3)
+    assert_allclose(shown.frames[:, 4, 24], [[50] * 3, [50] * 3, [150] * 3], atol=3)
 
 
 @pytest.mark.slow
