@@ -35,8 +35,9 @@ from alpasim_plugin.lab.training.policy import (
     PolicyTask,
     measure,
     start_from_front,
+    train,
 )
-from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
+from alpasim_plugin.lab.training.trainer import LOG_FILE
 from policies.learned import WEIGHTS
 from policies.learned_net import LearnedNet, load_net, save_net
 from scenarios.load import load_scenario
@@ -47,7 +48,11 @@ DEMONSTRATIONS = "demonstrations"
 WHAT = (
     "Network of the policy learned: a path and speeds from camera frames, speed and route command"
 )
-EPILOG = "Example: `simrun train policy data/scenes --out runs/policy --steps 3600`"
+EPILOG = """Examples:
+
+- `simrun train policy data/scenes --out runs/policy --steps 3600`
+- `simrun train policy data/scenes/three --out runs/three --steps 12000`
+"""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,8 @@ def policy(
     and its card, OUT/learned.json.
 
     The network has the views that all scenes' cameras show: the front one, or also the left and the
-    right one; then it starts from the weights of 'learned'.
+    right one; then it starts from the weights of 'learned' and has three stages, in OUT/front,
+    OUT/sides and OUT/last.
 
     Before the first update, perturbed rollouts off the logged paths are rendered into
     OUT/demonstrations, with the path and speeds of a privileged expert as labels.
@@ -99,14 +105,9 @@ def policy(
         start_from_front(net, load_net(WEIGHTS))
     net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     net = net.to(require_device(device))
-    task = PolicyTask(net, demonstrations, PolicyRecipe(seed=seed))
-    schedule = Schedule(
-        steps, peak_lr=1.5e-3, warmup=min(200, steps // 10 + 1), weight_decay=0.02, ema=0.998
-    )
-    trainer = Trainer(net, out, schedule, task.batch, task.loss, task.facts)
     progress = Progress(steps, every=50)
-    trainer.run(progress.update)
-    net.cpu().load_state_dict(trainer.averaged())
+    stages = train(net, demonstrations, out, steps, PolicyRecipe(seed=seed), progress.update)
+    net.cpu()
     net.eval()
     held_out = (
         measure(PolicyTask(net, read_demonstrations(data, "val"), PolicyRecipe()))
@@ -115,8 +116,15 @@ def policy(
     )
     path = out / WEIGHTS_FILE
     save_net(net, path, {"made_by": "simrun train policy", "steps": str(steps), "seed": str(seed)})
-    rows, hours = curves(out / LOG_FILE)
-    training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
+    logs = [curves(trainer.folder / LOG_FILE) for _, trainer in stages]
+    schedules = [
+        {"schedule": asdict(trainer.schedule), "recipe": asdict(task.recipe)}
+        for task, trainer in stages
+    ]
+    training = schedules[-1] | {"before": schedules[:-1]}
+    task, _ = stages[-1]
+    rows, _ = logs[-1]
+    hours = sum(spent for _, spent in logs)
     parameters = sum(p.numel() for p in net.parameters())
     card = PolicyCard(
         WHAT, demonstration_facts(task), training, rows, hours, steps, seed, parameters, held_out

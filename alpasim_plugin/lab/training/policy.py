@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,7 +18,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstrations_digest
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M
-from alpasim_plugin.lab.training.trainer import Loss
+from alpasim_plugin.lab.training.trainer import Loss, Schedule, Trainer
 from policies.learned_input import FRONT, level_view
 from policies.learned_net import (
     GRID_M,
@@ -245,7 +246,78 @@ def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
     known["plan.0.weight"] = torch.cat([narrow[:, :after], zeros, narrow[:, after:]], dim=1)
     known |= {f"side_encoder.{name}": value for name, value in front.see.state_dict().items()}
     net.load_state_dict(known, strict=False)
-    net.see.requires_grad_(False)
+
+
+@dataclass(frozen=True)
+class PolicyStage:
+    """A stage of a policy's training; it begins at the averaged weights of the one before.
+
+    Attributes:
+        name: Its folder within that of the run; empty: the run's own.
+        updates: Its part of the updates of all stages.
+        peak_lr: Learning rate after the warm-up.
+        keeps_front: Whether the convolutions over the front view stay as they are.
+    """
+
+    name: str
+    updates: int
+    peak_lr: float = 1.5e-3
+    keeps_front: bool = False
+
+
+ONE_CAMERA = (PolicyStage("", 1),)
+# The updates of `learned-three`.
+SEVERAL_CAMERAS = (
+    PolicyStage("front", 7300),
+    PolicyStage("sides", 2800, keeps_front=True),
+    PolicyStage("last", 1900, peak_lr=1e-3, keeps_front=True),
+)
+
+
+def train(
+    net: LearnedNet,
+    demonstrations: Sequence[Demonstrations],
+    out: Path,
+    steps: int,
+    recipe: PolicyRecipe,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
+) -> list[tuple[PolicyTask, Trainer[PolicyBatch]]]:
+    """Train a network in the stages for its views, and leave it with the averaged weights of the
+    last; the same call resumes.
+
+    Args:
+        net: One with several views has the weights of `start_from_front`.
+        demonstrations: With the network's views.
+        out: Folder of the run.
+        steps: Updates of all stages; each has its part, and one at least.
+        recipe: Of the first stage; each later one has the next seed.
+        report: Called after each update with its number within its stage, and what was measured.
+
+    Returns:
+        Task and trainer of each stage.
+
+    Raises:
+        InputError, InfrastructureError: See `Trainer`.
+    """
+    stages = SEVERAL_CAMERAS if len(net.views) > 1 else ONE_CAMERA
+    whole = sum(stage.updates for stage in stages)
+    done = []
+    for index, stage in enumerate(stages):
+        net.see.requires_grad_(not stage.keeps_front)
+        task = PolicyTask(net, demonstrations, replace(recipe, seed=recipe.seed + index))
+        length = max(round(steps * stage.updates / whole), 1)
+        schedule = Schedule(
+            length,
+            peak_lr=stage.peak_lr,
+            warmup=min(200, length // 10 + 1),
+            weight_decay=0.02,
+            ema=0.998,
+        )
+        trainer = Trainer(net, out / stage.name, schedule, task.batch, task.loss, task.facts)
+        trainer.run(report)
+        net.load_state_dict(trainer.averaged())
+        done.append((task, trainer))
+    return done
 
 
 def _jitter_brightness(view: U8, contrast: float, brightness: float) -> U8:

@@ -22,7 +22,7 @@ from alpasim_plugin.lab.training.perturbed_rollouts import (
     perturbed_rollouts,
     turning_lines,
 )
-from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, start_from_front
+from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, start_from_front, train
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from policies.conformance import canned_scenario
 from policies.learned import WEIGHTS
@@ -45,6 +45,16 @@ def root(scenario, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demonstrations")
     assert write_demonstrations(scenario, folder / "train" / "lead_000", QUICK, 0)
     return folder
+
+
+@pytest.fixture(scope="module")
+def three(scenario, root):
+    """Give demonstrations of a scene with cameras to both sides."""
+    sides = canned_scenario().cameras[1:]
+    wide = replace(scenario, cameras=(*scenario.cameras, *sides))
+    write_demonstrations(wide, root / "three" / "lead_000", QUICK, 0)
+    (demonstrations,) = read_demonstrations(root, "three")
+    return demonstrations
 
 
 def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):
@@ -81,24 +91,50 @@ def test_sample_has_a_frame_a_state_and_a_target(root):
 
 
 def test_scene_with_side_cameras_has_three_views_and_the_network_begins_as_the_front_one(
-    scenario, root
+    three, root
 ):
-    sides = canned_scenario().cameras[1:]
-    three = replace(scenario, cameras=(*scenario.cameras, *sides))
-    write_demonstrations(three, root / "three" / "lead_000", QUICK, 0)
-    (demonstrations,) = read_demonstrations(root, "three")
-    assert [view.name for view in demonstrations.views] == ["front", "left", "right"]
-    assert len({len(frames) for frames in demonstrations.frames}) == 1
+    assert [view.name for view in three.views] == ["front", "left", "right"]
+    assert len({len(frames) for frames in three.frames}) == 1
     with pytest.raises(InputError):
-        common_views([demonstrations, *read_demonstrations(root, "train")])
-    net = LearnedNet(0, demonstrations.views)
+        common_views([three, *read_demonstrations(root, "train")])
+    net = LearnedNet(0, three.views)
     front = load_net(WEIGHTS)
     start_from_front(net, front)
-    batch = PolicyTask(net, [demonstrations], PolicyRecipe(batch=4)).batch(0)
+    batch = PolicyTask(net, [three], PolicyRecipe(batch=4)).batch(0)
     with torch.inference_mode():
         heading = net(batch.images, batch.state, batch.command).heading
         wanted = front(batch.images[:1], batch.state, batch.command).heading
     torch.testing.assert_close(heading, wanted, atol=1e-5, rtol=1e-5)
+
+
+def test_several_cameras_are_trained_in_stages_and_a_run_that_was_stopped_ends_alike(
+    three, tmp_path
+):
+    def trained(folder, report=None):
+        net = LearnedNet(0, three.views)
+        start_from_front(net, load_net(WEIGHTS))
+        stages = train(net, [three], folder, 6, PolicyRecipe(batch=2), report)
+        return net.state_dict(), [trainer for _, trainer in stages]
+
+    def stop(step, numbers):
+        if (tmp_path / "stopped" / "sides").exists():
+            raise KeyboardInterrupt
+
+    whole, trainers = trained(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "stopped", stop)
+    again, _ = trained(tmp_path / "stopped")
+    for name, weights in whole.items():
+        assert torch.equal(weights, again[name])
+    assert [(one.folder.name, one.step) for one in trainers] == [
+        ("front", 4),
+        ("sides", 1),
+        ("last", 1),
+    ]
+    first = trainers[0].average
+    assert not torch.equal(first["see.0.weight"], load_net(WEIGHTS).see[0].weight)
+    assert torch.equal(first["see.0.weight"], whole["see.0.weight"])
+    assert not torch.equal(first["side_encoder.0.weight"], whole["side_encoder.0.weight"])
 
 
 def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):
