@@ -53,7 +53,7 @@ class Work(NamedTuple):
         return round(max(self.gflop / rate, 1e3 * self.gb / memory), 3)
 
 
-# Counted by ``python -m alpasim_plugin.lab.bench.roofline``: a frame of `transparent_splats` at
+# As the laboratory counts them (docs/gpu.md): a frame of `transparent_splats` at
 # 1920x1080; at 960x544 a frame of ``onefixer`` with two recorded images a camera, and a block of
 # `blocks` by what makes its history.
 COUNTED = {
