@@ -32,6 +32,10 @@ from alpasim_plugin.fixers.warp import (
 )
 
 HIDING_M = 1e-3
+# Working memory of views that are carried together, and what a pixel of a view takes of it for each
+# recorded frame: coordinates in float64, colours, and the images of both depths.
+WORKING_BYTES = 1 << 30
+PIXEL_BYTES = 240
 ABSENT = np.full((4, 4), np.nan)
 
 
@@ -95,8 +99,15 @@ def size_of(view: CarriedView) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
 
 def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     """Return the recorded frames in views of one `size_of`, ``(V, K, H, W, 4)`` uint8; see
-    `ground.carry`.
+    `ground.carry`. Several views are carried together while `WORKING_BYTES` hold them.
     """
+    (height, width), _, lenses = size_of(views[0])
+    together = max(1, WORKING_BYTES // (PIXEL_BYTES * height * width * sum(lenses)))
+    starts = range(0, len(views), together)
+    return torch.cat([_carry(views[i : i + together]) for i in starts])
+
+
+def _carry(views: Sequence[CarriedView]) -> Tensor:
     depth = torch.stack([view.target.depth for view in views])  # type: ignore[misc]  # tensors here
     (height, width), size, lenses = size_of(views[0])
     rays = _rays(depth[0])

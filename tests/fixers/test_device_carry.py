@@ -1,14 +1,16 @@
 """Recorded frames carried by tensors: the same images as the kernels of the CPU."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.fixers import ground
+from alpasim_plugin.fixers import device_carry, ground
 from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, upload_image
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
@@ -49,3 +51,43 @@ def test_images_equal_those_of_the_processor(count, wall_m, window_rad, monkeypa
         apart = np.abs(one.astype(int) - other)
         # A window at the first row of the ground ends at another row than the processor's.
         assert (apart.max(axis=-1) > 1).mean() <= (0.02 if wall_m < 99 and count > 1 else 0)
+
+
+class Memory(TorchDispatchMode):
+    """Counts the bytes of the storages that operations make, while they live."""
+
+    alive = most = 0
+
+    def __init__(self):
+        super().__init__()
+        self.known = weakref.WeakSet()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        storage = made.untyped_storage() if isinstance(made, torch.Tensor) else None
+        if storage is not None and storage not in self.known:
+            self.known.add(storage)
+            self.alive += storage.nbytes()
+            weakref.finalize(storage, self.freed, storage.nbytes())
+        self.most = max(self.most, self.alive)
+        return made
+
+    def freed(self, size):
+        self.alive -= size
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_views_are_carried_together_while_their_memory_holds_them(count, monkeypatch):
+    T, depth, _ = street(10.013, 30.0)
+    view = WarpTarget(K, T, torch.from_numpy(depth), actors(0.0), BOXES)
+    frames = [
+        with_users(replace(recorded(8.9 - i), actors=actors(-i)), BOXES) for i in range(count)
+    ]
+    images = [upload_image(frame, torch.device("cpu")) for frame in frames]
+    views = [CarriedView(images, view, rig(10.0 + i)) for i in range(5)]
+    together = carry_on_device(views)
+    room = 2.5 * count * depth.size * device_carry.PIXEL_BYTES
+    monkeypatch.setattr(device_carry, "WORKING_BYTES", int(room))
+    with Memory() as memory:
+        assert torch.equal(carry_on_device(views), together)
+    assert 0.4 * room < memory.most < room + 2 * together.nbytes
