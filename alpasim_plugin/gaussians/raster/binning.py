@@ -31,44 +31,57 @@ def _tile_span(centre, radius, n_tiles):
 
 
 @kernel
-def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram):
-    """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
+def tile_boxes(records, tiles_x, tiles_y, boxes):
+    """Write the tiles of each splat's box, four int16: first and one past the last column, the same
+    for rows.
 
-    ``boxes`` takes four int32 per rank, the tiles of the splat's box: first and one past the last
-    column, the same for rows.
+    In the order of the records: that of depth would wait for memory at each of them.
     """
-    while True:
-        chunk = v.fetch_add(cursor, 0, 1)
-        if chunk >= histogram.shape[0]:
-            return
-        counts = histogram[chunk]
-        counts[:] = 0
-        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
-            v.prefetch(records, order[min(rank + 12, count - 1)] * RECORD)
-            at = order[rank] * RECORD
-            left, right = _tile_span(records[at + U], records[at + RADIUS_X], tiles_x)
-            top, bottom = _tile_span(records[at + V], records[at + RADIUS_Y], tiles_y)
-            boxes[rank, 0], boxes[rank, 1] = left, right
-            boxes[rank, 2], boxes[rank, 3] = top, bottom
-            for row in range(top, bottom):
-                for tile in range(row * tiles_x + left, row * tiles_x + right):
-                    counts[tile] += 1
+    for splat in range(boxes.shape[0]):
+        at = splat * RECORD
+        left, right = _tile_span(records[at + U], records[at + RADIUS_X], tiles_x)
+        top, bottom = _tile_span(records[at + V], records[at + RADIUS_Y], tiles_y)
+        boxes[splat, 0] = left
+        boxes[splat, 1] = right
+        boxes[splat, 2] = top
+        boxes[splat, 3] = bottom
 
 
 @kernel
-def fill_tiles(cursor, count, chunk_size, order, boxes, tiles_x, position, lists):
+def count_tiles(cursor, chunk_size, order, boxes, changes):
+    """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
+
+    ``changes`` has a row and a column more than the tiles. Its sums along both are the counts,
+    since a box adds one at its first corner and takes it off past its ends.
+    """
+    while True:
+        chunk = v.fetch_add(cursor, 0, 1)
+        if chunk >= changes.shape[0]:
+            return
+        corners = changes[chunk]
+        corners[:] = 0
+        for splat in order[chunk * chunk_size : (chunk + 1) * chunk_size]:
+            left, right, top, bottom = boxes[splat]
+            corners[top, left] += 1
+            corners[top, right] -= 1
+            corners[bottom, left] -= 1
+            corners[bottom, right] += 1
+
+
+@kernel
+def fill_tiles(cursor, chunk_size, order, boxes, tiles_x, position, lists):
     """Write each tile's list of records; ``position`` says where each chunk's part of it begins.
 
-    Chunks ascend and so do the ranks in a chunk, hence every list is in depth order.
+    Chunks ascend and so does the depth in a chunk, hence every list is in depth order.
     """
     while True:
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= position.shape[0]:
             return
         at = position[chunk]
-        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
-            left, right, top, bottom = boxes[rank]
+        for splat in order[chunk * chunk_size : (chunk + 1) * chunk_size]:
+            left, right, top, bottom = boxes[splat]
             for row in range(top, bottom):
                 for tile in range(row * tiles_x + left, row * tiles_x + right):
-                    lists[at[tile]] = order[rank]
+                    lists[at[tile]] = splat
                     at[tile] += 1

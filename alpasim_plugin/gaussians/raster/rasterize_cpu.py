@@ -34,7 +34,7 @@ from alpasim_plugin.gaussians.constants import (
     TILE,
     Z,
 )
-from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles
+from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, tile_boxes
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import project_part
@@ -153,19 +153,21 @@ def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int)
     count = len(order)
     tiles_x = -(-camera.width // TILE)
     tiles_y = -(-camera.height // TILE)
-    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile
+    # At most 64 chunks of at least 8192 splats: enough to share out, few enough to keep their tile
     # counts small.
-    chunk_size = max(2048, -(-count // 64))
-    histogram = np.empty((-(-count // chunk_size), tiles_x * tiles_y), np.int64)
-    boxes = np.empty((count, 4), np.int32)
-    workers = threads if count > WORTH_THREADS else 1
-    chunks = (np.zeros(1, np.int64), count, chunk_size, order)
-    run_on_threads(workers, count_tiles, *chunks, records, tiles_x, tiles_y, boxes, histogram)
-    starts = np.concatenate([[0], np.cumsum(histogram.sum(axis=0))])
-    before = np.cumsum(histogram, axis=0) - histogram
+    chunk_size = max(8192, -(-count // 64))
+    boxes = np.empty((count, 4), np.int16)
+    tile_boxes(records, tiles_x, tiles_y, boxes)
+    changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), np.int32)
+    workers = min(threads, max(1, len(changes) // 4))  # a millisecond of work for each
+    chunks = (np.zeros(1, np.int64), chunk_size, order, boxes)
+    run_on_threads(workers, count_tiles, *chunks, changes)
+    counts = changes.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1, tiles_x * tiles_y)
+    starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
+    before = np.cumsum(counts, axis=0) - counts
     lists = np.empty(starts[-1], np.int32)
     chunks[0][:] = 0
-    run_on_threads(workers, fill_tiles, *chunks, boxes, tiles_x, starts[:-1] + before, lists)
+    run_on_threads(workers, fill_tiles, *chunks, tiles_x, starts[:-1] + before, lists)
     return TileLists(tiles_x, starts, lists)
 
 
