@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
+from alpasim_plugin.core.geometry import arc_lengths, heading_of, left_of, resample
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
@@ -180,7 +180,7 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
     """
     xy = extended(points, length_m)
     step = np.gradient(xy, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    heading = np.unwrap(heading_of(step))
     half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
     kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
     padded = np.concatenate([np.full(half, heading[0]), heading, np.full(half, heading[-1])])

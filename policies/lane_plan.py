@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, heading_of, left_of, resample
 from alpasim_plugin.core.types import F64
 from policies.base import Path, make_path
 from policies.lane_filter import LaneState
@@ -97,7 +97,7 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     s = arc_lengths(route)
     points = resample(route, np.arange(0.0, max(float(s[-1]), 2.0), 1.0), s)
     step = np.gradient(points, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    heading = np.unwrap(heading_of(step))
     x = points[:, 0]
     y = points[:, 1]
     usable = np.logical_and.accumulate((np.abs(heading) < 1.0) & (step[:, 0] > 0.3) & (x > -5.0))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import wrap_angle
+from alpasim_plugin.core.geometry import heading_of, wrap_angle
 from alpasim_plugin.core.types import F64, U8, CameraSpec, Scenario
 from policies.base import front_camera
 
@@ -42,7 +42,7 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     if len(points) < 4:
         return "keep"
     step = np.diff(points, axis=0)
-    heading = np.arctan2(step[:, 1], step[:, 0])
+    heading = heading_of(step)
     length = np.hypot(step[:, 0], step[:, 1])
     bend = wrap_angle(heading[2:] - heading[:-2]) / np.maximum(
         0.5 * (length[2:] + length[:-2]) + length[1:-1], 1e-6

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import direction_of, interpolate, rectangle_corners
+from alpasim_plugin.core.geometry import direction_of, heading_of, interpolate, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import ROAD_M
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
@@ -197,7 +197,7 @@ def _footprints(track: Trajectory, t_us: I64, box: Box, ahead_m: float = 0.0) ->
     ``ahead_m`` in front of the pose.
     """
     poses = interpolate(track, t_us)
-    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    yaw = heading_of(poses[:, :2, 0])
     xy = poses[:, :2, 3] + ahead_m * direction_of(yaw)
     return shapely.polygons(rectangle_corners(xy, yaw, np.array([[box.length_m, box.width_m]])))
 

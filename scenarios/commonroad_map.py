@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import centre_line
+from alpasim_plugin.core.geometry import centre_line, heading_of
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Signal
@@ -93,7 +93,7 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
                 stop_lines.append(waits)
             centre = centre_line(left, right)
             ahead = centre[-1] - centre[-2]
-            heading = float(np.arctan2(ahead[1], ahead[0]))
+            heading = float(heading_of(ahead))
             refs = [
                 str(ref.get("ref"))
                 for place in ("trafficLightRef", "stopLine/trafficLightRef")

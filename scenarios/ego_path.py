@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, quat_from_yaw
+from alpasim_plugin.core.geometry import arc_lengths, quat_from_yaw, unit
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 from alpasim_plugin.world.roads import Road
@@ -70,7 +70,7 @@ def make_ego_path(road: Road, ego: EgoSpec, segments: Sequence[Part]) -> EgoPath
                 (end - quarter + ramp_m - s) / ramp_m
             )
             d = np.gradient(line[:, :2], s, axis=0)
-            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            d = unit(d)
             out = line.copy()
             out[:, 0] -= segment.shift_m * share * d[:, 1]
             out[:, 1] += segment.shift_m * share * d[:, 0]

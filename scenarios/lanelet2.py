@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, se2, transform_points
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, heading_of, se2, transform_points
 from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
@@ -428,7 +428,7 @@ def _stop(osm: Osm, line: str, name: str, lanes: Sequence[Lane]) -> Signal:
     if line in osm.items["way"]:
         ends = osm.line(osm.nodes(line))[[0, -1]]
     along = lanes[0].centre[-1, :2] - lanes[0].centre[-2, :2]
-    heading_rad = float(np.arctan2(along[1], along[0]))
+    heading_rad = float(heading_of(along))
     return Signal(ends, heading_rad, (), 0, name, tuple(lane.lane_id for lane in lanes))
 
 
@@ -445,7 +445,7 @@ def _sign(osm: Osm, way: str) -> tuple[F64, Box]:
     line = osm.line(osm.nodes(way))
     along = line[-1] - line[0]
     width_m = float(np.hypot(along[0], along[1]))
-    heading_rad = float(np.arctan2(along[1], along[0])) + np.pi / 2
+    heading_rad = float(heading_of(along)) + np.pi / 2
     x, y, z = line.mean(axis=0).tolist()
     pose = se2(x, y, heading_rad, z + SIGN_M + PLATE_M / 2)
     return pose, Box(0.05, max(width_m, PLATE_M), PLATE_M)

@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, densify, left_of, matrix_from_quat
+from alpasim_plugin.core.geometry import arc_lengths, densify, left_of, matrix_from_quat, unit
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.world.ground import flat, from_points, height_at
@@ -73,8 +73,8 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
         line = np.stack([line[0], line[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
     first = line[1] - line[0]
     last = line[-1] - line[-2]
-    before = line[0] - first / np.linalg.norm(first) * BEFORE_M
-    beyond = line[-1] + last / np.linalg.norm(last) * BEYOND_M
+    before = line[0] - unit(first) * BEFORE_M
+    beyond = line[-1] + unit(last) * BEYOND_M
     path = polyline_path(np.concatenate([[before], line, [beyond]]))
     s = np.linspace(0.0, path.length_m, max(2, int(path.length_m / VERTEX_M) + 1))
     centre, left, right = (
@@ -194,7 +194,7 @@ def _beside(centre: F64, left_m: float) -> F64:
     segments.
     """
     along = np.gradient(centre[:, :2], axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    along = unit(along)
     out = centre.copy()
     out[:, :2] += left_m * left_of(along)
     return out

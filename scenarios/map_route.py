@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths, resample, wrap_angle
+from alpasim_plugin.core.geometry import arc_lengths, heading_of, resample, wrap_angle
 from alpasim_plugin.core.types import F64, Lane
 from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 
@@ -170,7 +170,7 @@ class LaneGraph:
 
     def _turn_rad(self, lane_id: str) -> float:
         steps = np.diff(self.lanes[lane_id].centre[:, :2], axis=0)
-        first, last = (np.arctan2(step[1], step[0]) for step in (steps[0], steps[-1]))
+        first, last = (heading_of(step) for step in (steps[0], steps[-1]))
         return abs(float(wrap_angle(last - first)))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import F64, I64, Actor, LaneMap
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
@@ -85,9 +86,9 @@ def _ends(ring: F64, heading_rad: float, height_m: float) -> tuple[F64, F64]:
     corners = shapely.get_coordinates(shapely.oriented_envelope(shapely.Polygon(ring[:, :2])))[:4]
     across = np.array([-np.sin(heading_rad), np.cos(heading_rad)])
     sides = np.roll(corners, -1, axis=0) - corners
-    ways = sides / np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
+    ways = unit(sides)
     walked = sides[int(np.argmax(ways @ across))]
-    half = walked / 2 + MARGIN_M * walked / np.linalg.norm(walked)
+    half = walked / 2 + MARGIN_M * unit(walked)
     middle = corners.mean(axis=0)
     start = middle - half
     goal = middle + half

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import direction_of, se2
+from alpasim_plugin.core.geometry import direction_of, heading_of, se2
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Signal
 from scenarios.opendrive_road import (
     CROSSWALK,
@@ -200,4 +200,4 @@ def _line(s_m: float, held: Sequence[Held]) -> F64:
 def _heading_rad(road: Road, s_m: float, along: bool, T_local_map: F64) -> float:
     heading = float(reference_line(road.records, np.array([s_m]))[0, 2])
     direction = T_local_map[:2, :2] @ direction_of(heading)
-    return float(np.arctan2(direction[1], direction[0])) + (0.0 if along else np.pi)
+    return float(heading_of(direction)) + (0.0 if along else np.pi)

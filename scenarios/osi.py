@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project, unit
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
@@ -294,7 +294,7 @@ def _curve(begin: F64, end: F64) -> F64:
     reach_m = float(np.linalg.norm(last - first))
     out = begin[-1] - begin[-2]
     into = end[1] - end[0]
-    out, into = (reach_m * way / np.linalg.norm(way) for way in (out, into))
+    out, into = (reach_m * unit(way) for way in (out, into))
     t = np.linspace(0.0, 1.0, JOIN_STEPS)[:, None]
     return np.asarray(
         (1 - t) ** 2 * (1 + 2 * t) * first

@@ -32,7 +32,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import quat_from_matrix, transform_points
+from alpasim_plugin.core.geometry import heading_of, quat_from_matrix, transform_points
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.reading.files import parse_xml
@@ -378,7 +378,7 @@ def _without_duplicates(edges: Mapping[str, F64]) -> dict[str, F64]:
     length = shapely.length(lines)
     middle = shapely.get_coordinates(shapely.centroid(lines))
     chord = np.array([edges[k][-1, :2] - edges[k][0, :2] for k in keys]).reshape(-1, 2)
-    bearing = np.arctan2(chord[:, 1], chord[:, 0])
+    bearing = heading_of(chord)
     gone: set[int] = set()
     for a in range(len(keys)):
         if a in gone or length[a] < STEP_M:

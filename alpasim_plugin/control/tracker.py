@@ -29,6 +29,7 @@ from alpasim_plugin.core.geometry import (
     interpolate,
     left_of,
     se2,
+    unit,
     wrap_angle,
     yaw_from_quat,
     yaw_of,
@@ -151,7 +152,7 @@ class ReferencePath:
         and its left normal (P - 1, 2).
         """
         step = self.path_xy[1:] - self.path_xy[:-1]
-        tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
+        tangent = unit(step)
         return (
             self.path_s[1:] - self.path_s[:-1],
             step,
@@ -199,7 +200,7 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     yaw = yaw_from_quat(plan.quat)
     heading = direction_of(yaw)
     mean = heading[:-1] + heading[1:]
-    mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    mean = unit(mean)
     s = np.concatenate([[0.0], np.cumsum(np.sum((xy[1:] - xy[:-1]) * mean, axis=1))])
     # Knots in the order of time while the plan drives one way; the way is the sign of the furthest
     # excursion.

@@ -77,7 +77,7 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
         ]
     )
     quat = candidates[largest, :, np.arange(len(largest))]
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    quat = unit(quat)
     return np.where(quat[:, :1] < 0, -quat, quat).reshape(*batch, 4)
 
 
@@ -115,12 +115,22 @@ def transform_points(transform: F64, points: F64) -> F64:
 
 def yaw_of(transform: F64) -> float:
     """Return the heading of a ``(4, 4)`` transform."""
-    return float(np.arctan2(transform[1, 0], transform[0, 0]))
+    return float(heading_of(transform[:, 0]))
 
 
 def direction_of(yaw_rad: npt.ArrayLike) -> F64:
     """Return the unit vectors ``(..., 2)`` of headings ``(...)``."""
     return np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+
+
+def heading_of(direction: F64) -> F64:
+    """Return the headings ``(...)`` of directions ``(..., 2+)``, of any length but zero."""
+    return np.arctan2(direction[..., 1], direction[..., 0])
+
+
+def unit(vectors: F64) -> F64:
+    """Return vectors ``(..., D)`` at length 1; those of length 0 stay so."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def left_of(along: F64) -> F64:
@@ -142,7 +152,7 @@ def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
     w0 = np.where(small, 1 - f, np.sin((1 - f) * angle) / safe)
     w1 = np.where(small, f, np.sin(f * angle) / safe)
     out = w0 * q0 + w1 * q1
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    return unit(out)
 
 
 def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:

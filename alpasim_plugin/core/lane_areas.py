@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.geometry import heading_of
 from alpasim_plugin.core.types import F64, Lane
 
 HALF_WIDTH_M = 1.85
@@ -63,9 +64,7 @@ def ring_area(ring: F64, even_odd: bool = False) -> Any:
     )
     inside = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
     to_ring = shapely.get_coordinates(polygon)[None] - inside[:, None]  # (F, N, 2)
-    turn = np.diff(np.unwrap(np.arctan2(to_ring[..., 1], to_ring[..., 0]), axis=1)[:, [0, -1]])[
-        :, 0
-    ]
+    turn = np.diff(np.unwrap(heading_of(to_ring), axis=1)[:, [0, -1]])[:, 0]
     return areal_parts(shapely.union_all(faces[np.abs(turn) > np.pi]))
 
 

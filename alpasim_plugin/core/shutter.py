@@ -18,7 +18,14 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.devices import upload
-from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp, transform_points
+from alpasim_plugin.core.geometry import (
+    inverse,
+    quat_from_matrix,
+    se3,
+    slerp,
+    transform_points,
+    unit,
+)
 from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Exposure, RenderRequest
 
 Along = Literal["rows", "columns"]
@@ -183,7 +190,7 @@ def motion_px(request: RenderRequest) -> float:
     height = request.camera.height
     u, v = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(rays)
     to_start = inverse(start) @ end
     turned = rays @ to_start[:3, :3].T
     moved = to_start[:3, 3] / NEAR_M

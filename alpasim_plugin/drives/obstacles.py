@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import left_of, matrix_from_quat
+from alpasim_plugin.core.geometry import heading_of, left_of, matrix_from_quat
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -164,7 +164,7 @@ def _boxes(
         uncertainty = round(float(np.hypot(CELL_M / 2, spread)), 2)
         box = Box(float(np.ptp(u)) + CELL_M, float(np.ptp(v)) + CELL_M, top)
         name = f"{STANDING_ID}{len(out) + 1:03d}-within-{uncertainty:g}m"
-        heading_rad = float(np.arctan2(along[1], along[0]))
+        heading_rad = float(heading_of(along))
         xyz = np.array([*middle, base + top / 2])
         out.append(Obstacle(name, box, xyz, heading_rad, uncertainty))
     return out

@@ -17,6 +17,7 @@ from alpasim_plugin.core.geometry import (
     left_of,
     se3,
     trajectory_from_poses,
+    unit,
 )
 from alpasim_plugin.core.types import F64, Actor, HeightField, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
@@ -176,7 +177,7 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
         A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
         slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
         normal = np.array([-slope[0], -slope[1], 1.0])
-        T = _upright((normal / np.linalg.norm(normal)) @ T[:3, :3], front)
+        T = _upright(unit(normal) @ T[:3, :3], front)
     if strip is None:
         return T, None, "up from the camera, which is taken to stand upright on the mean"
     return T, strip, "up from the ground: the road's mean plane is taken as level"
@@ -186,12 +187,12 @@ def _upright(up: F64, front: F64) -> F64:
     """Return a rotation ``(4, 4)`` that puts ``up`` along z and the first heading of cameras ``(N,
     4, 4)`` along x.
     """
-    z = up / np.linalg.norm(up)
+    z = unit(up)
     forward = front[min(len(front) - 1, 3), :3, 3] - front[0, :3, 3]
     if np.linalg.norm(np.cross(z, forward)) < 1e-9 or float(forward @ front[0, :3, 2]) < 0:
         forward = front[0, :3, 2]
     x = forward - z * float(forward @ z)
-    x /= np.linalg.norm(x)
+    x = unit(x)
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z])
     return T
@@ -251,7 +252,7 @@ def _rig(
     )
     turns = []
     for pose, along in zip(front[moving], step[moving], strict=True):
-        heading = along[:2] / np.linalg.norm(along[:2])
+        heading = unit(along[:2])
         if (
             heading @ pose[:2, 2] < 0
         ):  # it looks back, or the drive goes backwards: the camera's own direction counts
@@ -265,7 +266,7 @@ def _rig(
         )
         x = np.array([*heading, ahead]) / np.sqrt(1 + ahead**2)
         y = np.cross([0.0, 0.0, 1.0], x)
-        y /= np.linalg.norm(y)
+        y = unit(y)
         turns.append(np.stack([x, y, np.cross(x, y)]) @ pose[:3, :3])
     u, _, vt = np.linalg.svd(np.median(turns, axis=0))
     mount = np.eye(4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.geometry import interpolate, wrap_angle
+from alpasim_plugin.core.geometry import heading_of, interpolate, wrap_angle
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
 DIFFERENCE_US = (
@@ -43,7 +43,7 @@ def ego_states_from_log(
         np.where(us > 0, us, 1) * 1e-6 for us in (after - before, t - before, after - t)
     )
     speed = _along(xyz[:, 2] - xyz[:, 0], forward) / span_s
-    yaw = np.arctan2(poses[:, :, 1, 0], poses[:, :, 0, 0])
+    yaw = heading_of(poses[:, :, :2, 0])
     yaw_rate = wrap_angle(yaw[:, 2] - yaw[:, 0]) / span_s
     v0 = _along(xyz[:, 1] - xyz[:, 0], forward) / first_s
     v1 = _along(xyz[:, 2] - xyz[:, 1], forward) / second_s

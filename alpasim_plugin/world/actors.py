@@ -15,6 +15,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import (
     direction_of,
+    heading_of,
     interpolate,
     se2,
     se3,
@@ -121,7 +122,7 @@ class Actors:
         if self._lines is not None and self.t_us is not None and t_us > self.closed_us:
             bodies = bodies_from(
                 poses[:, :2, 3],
-                np.arctan2(poses[:, 1, 0], poses[:, 0, 0]),
+                heading_of(poses[:, :2, 0]),
                 [actor.box for actor in replayed],
                 velocity,
             )

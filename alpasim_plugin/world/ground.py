@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import F64, HeightField
 
 MAX_NODES = 30_000_000  # 240 MB of heights
@@ -109,7 +110,7 @@ def ground_poses(field: HeightField, xy: F64, yaw: F64) -> F64:
     across = (z[3] - z[4]) / (2 * h)
     ex = np.column_stack([c, s, along]) / np.sqrt(1 + along * along)[:, None]
     ez = np.cross(ex, np.column_stack([-s, c, across]))
-    ez /= np.linalg.norm(ez, axis=1, keepdims=True)
+    ez = unit(ez)
     poses = np.zeros((len(yaw), 4, 4))
     poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = ex, np.cross(ez, ex), ez
     poses[:, :2, 3], poses[:, 2, 3], poses[:, 3, 3] = xy, z[0], 1.0

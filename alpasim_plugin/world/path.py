@@ -12,7 +12,7 @@ import numpy.typing as npt
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, direction_of
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, heading_of
 from alpasim_plugin.core.types import F64, I64, Bool
 
 CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
@@ -97,7 +97,7 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
         peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
         if peak < least_peak - 1e-9:
             best, d_best, least_peak = curve, d, peak
-    yaw = np.unwrap(np.arctan2(d_best[:, 1], d_best[:, 0]))
+    yaw = np.unwrap(heading_of(d_best))
     yaw[0], yaw[-1] = yaw0, yaw0 + (yaw1 - yaw0 + np.pi) % (2 * np.pi) - np.pi
     turn = np.column_stack([best(t), yaw])
     head = _straight(p0, q0, yaw0)[:-1]
@@ -305,7 +305,7 @@ def polyline_path(xyz: F64) -> Path:
         )
     s = arc_lengths(line)
     d = np.gradient(line[:, :2], s, axis=0)
-    yaw = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+    yaw = np.unwrap(heading_of(d))
     return Path(s, line, yaw, np.gradient(yaw, s))
 
 
@@ -323,6 +323,6 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     return Path(
         arc_lengths(line),
         line,
-        np.unwrap(np.arctan2(d[:, 1], d[:, 0])),
+        np.unwrap(heading_of(d)),
         (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5,
     )

@@ -16,6 +16,7 @@ import shapely
 from alpasim_plugin.core.geometry import (
     arc_lengths,
     densify,
+    heading_of,
     inverse,
     project,
     resample,
@@ -91,7 +92,7 @@ class LaneIndex:
         """
         step, _, offset = _on_segments(self.lane_map.lanes[lane_id].centre, point[:2])
         i = int(np.argmin(np.sum(offset * offset, axis=1)))
-        return float(np.arctan2(step[i, 1], step[i, 0]))
+        return float(heading_of(step[i]))
 
     def successors(self, lane_id: str) -> tuple[str, ...]:
         """Return the lanes that follow; links that leave the map are left out."""
@@ -234,7 +235,7 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
         points = resample(path, at)
         behind = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
         ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - behind
-        headings = np.arctan2(ahead[:, 1], ahead[:, 0])
+        headings = heading_of(ahead)
     inside = index.containing_many(points)
     layers: list[dict[str, tuple[float, str | None]]] = []
     for point, heading, lanes in zip(points, headings, inside, strict=True):
@@ -302,7 +303,7 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     # those of its points.
     step, share, offset = _on_segments(line, T_world_rig[:2, 3])
     distance = np.linalg.norm(offset, axis=1)
-    error = np.abs(wrap_angle(np.arctan2(step[:, 1], step[:, 0]) - yaw_of(T_world_rig)))
+    error = np.abs(wrap_angle(heading_of(step) - yaw_of(T_world_rig)))
     i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
     begin = float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
     at = begin + spacing_m * np.arange(n)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, matrix_from_quat
+from alpasim_plugin.core.geometry import heading_of, interpolate, matrix_from_quat
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -75,7 +75,7 @@ def trajectory_table(
         [np.zeros(0, np.int64), *(trajectory.t_us for trajectory in trajectories)]
     )
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return TrajectoryTable(t_us, centre, np.arctan2(forward[:, 1], forward[:, 0]), start)
+    return TrajectoryTable(t_us, centre, heading_of(forward), start)
 
 
 def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:

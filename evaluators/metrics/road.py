@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 import shapely
 
+from alpasim_plugin.core.geometry import heading_of
 from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.metrics.footprint import Geometries
@@ -223,7 +224,7 @@ class Road:
         )
         after = shapely.get_coordinates(shapely.line_interpolate_point(lines, s + 0.01))
         delta = after - before
-        return np.arctan2(delta[:, 1], delta[:, 0])
+        return heading_of(delta)
 
 
 def join(areas: Geometries, seam_m: float) -> Any:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import heading_of
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64
 
@@ -17,7 +17,7 @@ def chord_angle(log: F64) -> float:
     are hardly apart.
     """
     chord = log[-1] - log[0]
-    return math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+    return float(heading_of(chord)) if float(np.hypot(*chord)) > 1.0 else 0.0
 
 
 def drawn_map(content: JsonView) -> dict[str, list[F64]]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, inverse, rectangle_corners, speeds
+from alpasim_plugin.core.geometry import heading_of, interpolate, inverse, rectangle_corners, speeds
 from alpasim_plugin.core.types import F64, Actor, Box, LoggedPlan, RolloutLog, Trajectory
 from evaluators.metrics.footprint import Geometries
 
@@ -86,7 +86,7 @@ def _leads_into(log: RolloutLog, plan: Trajectory, actor: Actor) -> bool:
 def _boxes(poses: F64, box: Box) -> Geometries:
     """Return the boxes at poses ``(N, 4, 4)`` of their centres as polygons ``(N,)``."""
     size = np.broadcast_to([box.length_m, box.width_m], (len(poses), 2))
-    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    yaw = heading_of(poses[:, :2, 0])
     return shapely.polygons(rectangle_corners(poses[:, :2, 3], yaw, size))
 
 

@@ -10,14 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import grpc
 import pytest
 import yaml
 
 from alpasim_plugin.alpasim.bridge import build as building
-from alpasim_plugin.alpasim.bridge.client import RendererClient
-from alpasim_plugin.log.wire import sensorsim_pb2
-from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
+from alpasim_plugin.alpasim.bridge.client import main
+from tests.alpasim.service_cases import CAMERA
 from tests.alpasim.test_wire_generated import environment
 
 # AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio
@@ -123,47 +121,14 @@ def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
         assert all(one["address"].startswith("localhost:") for one in service["endpoints"])
 
 
-def test_the_client_asks_again_only_after_what_may_pass(upstream, renderer, monkeypatch):
-    monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
-    frame = drive(1)[0]
-    seen = []
-
-    def fault(code, text, times):
-        def answer(asked, context, data):
-            seen.append(code)
-            return data if len(seen) > times else context.abort(code, text)
-
-        seen.clear()
-        return answer
-
-    with RendererClient(upstream.address) as client:
-        renderer.fault = fault(grpc.StatusCode.UNAVAILABLE, "away", 2)
-        assert list(client.render([frame])) == [CAMERA]
-        renderer.fault = fault(grpc.StatusCode.DEADLINE_EXCEEDED, "Stopped waiting for backend", 2)
-        assert list(client.render([frame])) == [CAMERA]
-        for code, text, times, calls in (
-            (grpc.StatusCode.UNAVAILABLE, "away", 9, 3),
-            (grpc.StatusCode.UNKNOWN, "broken", 9, 1),
-        ):
-            renderer.fault = fault(code, text, times)
-            with pytest.raises(grpc.RpcError, match=text):
-                client.render([frame])
-            assert len(seen) == calls
-
-
-@pytest.mark.parametrize("items", [0, 1])
-def test_the_client_refuses_what_the_runtime_refuses(items):
-    """No item for a camera, or one without success."""
-
-    class Refused(StandInRenderer):
-        def batch_render_rgb(self, asked, context):
-            item = sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=CAMERA)
-            return sensorsim_pb2.BatchRGBRenderReturn(items=[item][:items])
-
-    with hosted({"SensorsimService": Refused()}) as host, RendererClient(host.address) as client:
-        frames = drive(1)
-        with pytest.raises(ValueError, match="answered"):
-            client.render(frames)
+def test_the_command_says_what_a_service_is(upstream, capsys, monkeypatch):
+    assert main([upstream.address]) == 0
+    shown = capsys.readouterr().out
+    assert "version stand-in" in shown
+    assert CAMERA in shown
+    monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.WAIT_S", 0.2)
+    assert main(["127.0.0.1:1"]) == 4
+    assert main([]) == 2
 
 
 @pytest.mark.slow

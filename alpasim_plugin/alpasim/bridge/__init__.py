@@ -2,6 +2,5 @@
 without torch, numba or PyAV.
 
 The distribution is put together by `build.py`, under the name ``alpasim_onefixer_bridge``: the wire
-messages, Hydra presets, a client, and ``onefixer-bridge``, which asks a renderer service what it
-is. Nothing here imports the rest of the project.
+messages, Hydra presets, and ``onefixer-bridge``, which asks a renderer service what it is. Nothing here imports the rest of the project.
 """

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 import scipy
 
+from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -147,7 +148,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         "nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.at, np.ones(len(tracks.at))]
     )
     ray = np.einsum("nji,nj->ni", R[tracks.view], local)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray = unit(ray)
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
     A, b = (
         summed(values, tracks.point, tracks.count)

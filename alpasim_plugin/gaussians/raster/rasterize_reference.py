@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -112,7 +113,7 @@ def project_gaussians(
     uv = np.column_stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
     order = np.argsort(z.astype(np.float32), kind="stable")
-    direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)
+    direction = unit(relative[order])
     return Projection(
         index[order],
         uv[order],

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.detail import halvings
-from alpasim_plugin.core.geometry import direction_of, left_of
+from alpasim_plugin.core.geometry import direction_of, left_of, unit
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, FloatArray
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.markings import WHITE, YELLOW, Strokes
@@ -33,7 +33,6 @@ from alpasim_plugin.gaussians.scene.site import (
     cells_at,
     distance_m,
     to_pixels,
-    unit,
 )
 from alpasim_plugin.gaussians.scene.surfels import (
     SPREAD,
@@ -409,7 +408,7 @@ def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
     dx = site.height_at(xy + east) - site.height_at(xy - east)
     dy = site.height_at(xy + north) - site.height_at(xy - north)
     normals = np.column_stack([-dx / 2, -dy / 2, np.ones_like(z)])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
     return np.column_stack([xy, z + above_m]), normals
 
 

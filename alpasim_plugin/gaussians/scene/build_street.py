@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from alpasim_plugin.core.detail import halvings
-from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
+from alpasim_plugin.core.geometry import arc_lengths, left_of, resample, unit
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
@@ -187,7 +187,7 @@ def _crowns(
     m = len(foot)
     owner = np.repeat(np.arange(m), count)
     direction = rng.standard_normal((m * count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(direction)
     radius = rng.random(m * count) ** 0.4
     local = direction * radius[:, None] * np.array([1.0, 1.0, 0.95])
     size = crown[owner]
@@ -199,7 +199,7 @@ def _crowns(
     blob = size * {520: 0.095, 170: 0.16, 48: 0.25, 14: 0.42}[count]
     scales = np.column_stack([blob, blob, 0.8 * blob]) * rng.uniform(0.7, 1.25, (m * count, 1))
     quats = rng.standard_normal((m * count, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = unit(quats)
     return cloud_of(means, quats, scales, rgb, 0.92), owner
 
 

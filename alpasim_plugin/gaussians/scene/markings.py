@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample, unit
 from alpasim_plugin.core.types import F64, I64, LaneMarkType
-from alpasim_plugin.gaussians.scene.site import CELL_M, Site, unit
+from alpasim_plugin.gaussians.scene.site import CELL_M, Site
 from alpasim_plugin.world.markings import marking_lines
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern

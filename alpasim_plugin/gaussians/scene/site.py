@@ -20,7 +20,7 @@ import numpy.typing as npt
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, left_of, resample
+from alpasim_plugin.core.geometry import arc_lengths, left_of, resample, unit
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, Bool, Lane, Scenario
@@ -383,8 +383,3 @@ def places(line: F64, spacing_m: float, first_m: float = 0.0) -> Roadside:
     xy = resample(line, s)
     along = unit(resample(line, s + 0.5) - resample(line, s - 0.5))
     return Roadside(xy, along, -left_of(along))
-
-
-def unit(vectors: F64) -> F64:
-    """Return rows ``(N, D)`` of length one; a row of zeros stays."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.devices import upload
-from alpasim_plugin.core.geometry import se2, wrap_angle
+from alpasim_plugin.core.geometry import heading_of, se2, wrap_angle
 from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
@@ -140,8 +140,8 @@ class Sky:
         elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
         forward = camera.T_camera_world[2, :3]
-        ahead = np.arctan2(forward[1], forward[0])
-        azimuth = ahead + wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
+        ahead = heading_of(forward)
+        azimuth = ahead + wrap_angle(heading_of(ray) - ahead)
         rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
         return azimuth * (WIDTH / (2 * np.pi)), rows
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw
+from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw, unit
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, quat_multiply
 from alpasim_plugin.gaussians.sh import C1, dc_from_rgb
@@ -81,7 +81,7 @@ def upright_quats(normals: F64, yaw_rad: npt.ArrayLike) -> F64:
     """
     nx, ny, nz = normals.T
     tilt = np.column_stack([1 + nz, -ny, nx, np.zeros_like(nz)])
-    tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
+    tilt = unit(tilt)
     return quat_multiply(tilt, np.broadcast_to(quat_from_yaw(yaw_rad), tilt.shape))
 
 
@@ -89,11 +89,11 @@ def quats_along(direction: F64, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> F64:
     """Return ``(N, 4)`` rotations whose x axis is ``direction (N, 3)`` and whose z axis is as near
     to ``up`` as can be.
     """
-    x = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    x = unit(direction)
     ups = np.broadcast_to(up, x.shape)
     steep = np.abs(np.sum(x * ups, axis=1, keepdims=True)) > 0.99
     y = np.cross(np.where(steep, np.array([1.0, 0.0, 0.0]), ups), x)
-    y /= np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-12)
+    y = unit(y)
     return quat_from_matrix(np.stack([x, y, np.cross(x, y)], axis=-1))
 
 
@@ -147,7 +147,7 @@ def quad_surfels(
     n_v = cell_counts(len_v, cell_m)
     x = edge_u / np.maximum(len_u, 1e-9)[:, None]
     normal = np.cross(edge_u, edge_v)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = unit(normal)
     quats = quat_from_matrix(np.stack([x, np.cross(normal, x), normal], axis=-1))
     size_u = len_u / n_u
     size_v = len_v / n_v
