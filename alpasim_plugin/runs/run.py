@@ -15,7 +15,7 @@ from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.reading import real
+from alpasim_plugin.core.reading import real, some_of
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
 from alpasim_plugin.log.run_folder.checksums import state_files
@@ -23,8 +23,13 @@ from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_jso
 from alpasim_plugin.log.run_folder.reader import REMADE
 from alpasim_plugin.log.run_folder.schema import (
     DECISION,
+    FILES,
+    LOCK,
+    REPORTS,
+    ROLLOUTS_FOLDER,
     RUN_INFO,
     SCENES,
+    STAGES,
     TABLES,
     slug,
 )
@@ -44,6 +49,7 @@ from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
+OF_A_RUN = {LOCK, ROLLOUTS_FOLDER, SCENES, STAGES, FILES, DECISION, *TABLES, *REPORTS}
 SHORT_KEY = 4  # letters in the name of a run folder
 
 
@@ -291,13 +297,21 @@ def claim(
 
     Returns:
         What ``run.json`` said before; empty for a new folder, or where it was damaged.
+
+    Raises:
+        InputError: The folder holds another run, or other files.
     """
     held: JsonObject = {}
+    foreign = sorted(set(os.listdir(root)) - OF_A_RUN)
     if os.path.exists(root / RUN_INFO):
         try:
             held = read_run_json(root)
         except InputError as error:
             noticed(f"damaged: {error.message}; writing it again")
+    elif foreign:
+        raise InputError(
+            f"The folder {root} holds no run but {some_of(foreign)}.", "Name a new or empty folder."
+        )
     if held and held.get("key") != plan.command_key and not resume:
         raise InputError(
             f"The folder {root} holds another run: its key is {held.get('key')}, this command's "

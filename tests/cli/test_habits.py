@@ -106,6 +106,7 @@ def test_what_asks_for_help_ends_well(line):
         ("--seeds 5, absent.yaml", "absent.yaml"),
         ("--workers two smoke/curve", "'two', wanted an integer"),
         ("--out notes.txt --renderer clean smoke/curve", "notes.txt"),
+        ("--out . --renderer clean smoke/curve", "no run but"),
         ("tabs.yml", "tabs.yaml"),
         ("empty.yaml", "empty.yaml:1"),
         ("--seeds 0..3 smoke/curve", "0..3"),
