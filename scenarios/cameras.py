@@ -16,6 +16,7 @@ from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import check_lens, resized
+from alpasim_plugin.core.reading.files import contents
 from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
 from scenarios.schema import CameraModel, CameraSet, Rigs
 from scenarios.variation import Drawn
@@ -131,7 +132,7 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
                 "correct the path; it is relative to the scenario file",
             )
         with drawn.at("cameras", "from"):
-            if os.path.isdir(path):
+            if os.path.isdir(path / "calibration"):
                 from scenarios.argoverse import read_calibration
 
                 cameras = read_calibration(path)
@@ -145,8 +146,8 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
                 cameras = read_transforms(path)
             else:
                 raise InputError(
-                    f"{path}: no calibration that is known here",
-                    "give an Argoverse 2 log folder, a .usdz of AlpaSim, or a transforms.json",
+                    f"{path}: {contents(path)}, no calibration that is known here",
+                    "give an Argoverse 2 log, which has a folder calibration, a .usdz of AlpaSim, or a transforms.json",
                 )
         if given.names:
             known = {camera.name: camera for camera in cameras}

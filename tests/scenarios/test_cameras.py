@@ -138,6 +138,7 @@ def test_a_transforms_json_that_is_no_calibration_is_refused(tmp_path, axes, nam
         ("{rig: front, from: x.usdz}", "rig and from"),
         ("{from: none.usdz}", "none.usdz"),
         ("{from: scene.yaml}", "calibration"),
+        ("{from: .}", "a folder with scene.yaml"),
     ],
 )
 def test_cameras_that_cannot_be_drawn_are_refused_before_the_road_is_built(
