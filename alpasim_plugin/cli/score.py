@@ -95,12 +95,12 @@ def score(
         facts = documents[names[0]]
     lines = []
     for result in results.values():
-        if len(names) == 1:
-            lines += first_screen(read_run(result.root))
+        run = read_run(result.root)
+        if len(names) == 1 and any(rollout.ok for rollout in run.rollouts):
+            lines += first_screen(run)
         lines += report_lines(result.root)
     if len(names) > 1 or any(one.protocol for one in chosen.values()):
         lines.append(render_presets({name: one.summary for name, one in results.items()}))
-    show(as_json, facts, *lines)
     for result in () if as_json else results.values():
         for cell in result.summary["failures"]["cells"][:SHOWN_FAILURES]:
             warn(*error_lines(cell["error"]))
@@ -109,6 +109,7 @@ def score(
             warn(f"AlpaSim's aggregation was not written: {aggregation['skipped']}")
         if aggregation.get("error"):
             warn(*error_lines(aggregation["error"]))
+    show(as_json, facts, *lines)
     raise typer.Exit(code)
 
 

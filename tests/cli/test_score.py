@@ -314,3 +314,13 @@ def test_bad_commands_say_what_to_do(our_run, tmp_path, capsys):
         assert run_command(command) == 2, situation
         printed = capsys.readouterr().err
         assert printed.startswith("error: "), situation
+
+
+def test_a_file_that_is_no_log_is_an_error_without_a_table(tmp_path, capsys):
+    path = tmp_path / "notes.txt"
+    path.write_text("notes")
+    command = ["score", str(path), "--scene", "smoke/straight", "--out", str(tmp_path / "out")]
+    assert run_command(command) == 2
+    out, err = capsys.readouterr()
+    assert "primary rate" not in out
+    assert "error: " in err
