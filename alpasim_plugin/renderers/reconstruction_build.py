@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.stage import announce
-from alpasim_plugin.core.types import Box, Scenario
+from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -26,7 +27,7 @@ from alpasim_plugin.gaussians.fit.views import PosedView, logged_views
 from alpasim_plugin.gaussians.scene.log_views import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, write_model
-from alpasim_plugin.renderers.recorded import pose_error
+from alpasim_plugin.renderers.recorded import believed_pose
 
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
 
@@ -102,9 +103,12 @@ def misplaced(
     if spread_m == 0:
         return list(views)
     moved = []
+    firsts: dict[tuple[str, int], F64] = {}
     for view in views:
-        error = pose_error(scene_id, seed, spread_m, view.camera_name, view.t_us)
-        camera = replace(view.camera, T_camera_world=error @ view.camera.T_camera_world)
+        T = view.camera.T_camera_world
+        first = firsts.setdefault((lens_camera(view.camera_name), view.t_us), T)
+        key = scene_id, seed, spread_m, view.camera_name, view.t_us
+        camera = replace(view.camera, T_camera_world=believed_pose(T, first, *key))
         moved.append(replace(view, camera=camera))
     return moved
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Photograph, RecordedFrame, Scenario
@@ -75,15 +76,15 @@ def built_recording(
     frames = []
     for t_us in times:
         actors = log_actors(scenario, t_us)
+        firsts: dict[str, F64] = {}
         for spec in scenario.cameras:
             T_world_camera = interpolate(log, t_us) @ T_rig_offset @ spec.T_rig_camera
             true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
-            error = np.eye(4)
+            T_world_believed = T_world_camera
             if recipe:
-                error = pose_error(
-                    scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, spec.name, t_us
-                )
-            T_world_believed = inverse(error @ true.T_camera_world)
+                first = firsts.setdefault(lens_camera(spec.name), true.T_camera_world)
+                key = scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, spec.name, t_us
+                T_world_believed = inverse(believed_pose(true.T_camera_world, first, *key))
             believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
             once = partial(read, len(shots))
             shots.append((true, believed, actors))
@@ -91,27 +92,37 @@ def built_recording(
     return tuple(frames)
 
 
-def pose_error(scene_id: str, seed: int, spread_m: float, camera: str, t_us: int) -> F64:
-    """Return by what registration misplaces a view: ``(4, 4)``, from the true camera to the
-    believed one.
+def believed_pose(
+    T_camera_world: F64,
+    first: F64,
+    scene_id: str,
+    seed: int,
+    spread_m: float,
+    camera: str,
+    t_us: int,
+) -> F64:
+    """Return where registration believes a view ``(4, 4)``; the pinholes of a lens move as one.
 
     Args:
+        T_camera_world: Its true pose.
+        first: That of the first pinhole of its lens at that time; of a camera without a lens its
+            own.
         scene_id, seed: Key of the random streams, with the camera's name and the time.
         spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about
             each axis.
-        camera: Its name.
+        camera: Its name; that of a lens, or of a pinhole of it.
         t_us: When it was taken.
     """
     knot, after_us = divmod(t_us, POSE_KNOT_US)
     before, after = (
-        stream(scene_id, seed, f"reconstruction.poses.{camera}", at).standard_normal(6)
+        stream(scene_id, seed, f"reconstruction.poses.{lens_camera(camera)}", at).standard_normal(6)
         for at in (knot, knot + 1)
     )
     error = spread_m * (before + (after - before) * after_us / POSE_KNOT_US)
-    out = np.eye(4)
-    out[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
-    out[:3, 3] = error[:3]
-    return out
+    moved = np.eye(4)
+    moved[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
+    moved[:3, 3] = error[:3]
+    return T_camera_world @ inverse(first) @ moved @ first
 
 
 def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:

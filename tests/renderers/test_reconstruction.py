@@ -335,6 +335,19 @@ def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none()
     )
 
 
+def test_the_pinholes_of_a_lens_are_misplaced_as_one():
+    view = logged_views(street(), scene_of(street()), 8, 32)[3]
+    turn = se2(0.0, 0.0, 0.7)
+    turned = replace(view.camera, T_camera_world=turn @ view.camera.T_camera_world)
+    ahead = replace(view, name="lens.ahead-3")
+    first, second = misplaced(
+        [ahead, replace(ahead, name="lens.left-3", camera=turned)], 0.1, "s", 0
+    )
+    assert_allclose(
+        second.camera.T_camera_world, turn @ first.camera.T_camera_world, rtol=0, atol=1e-9
+    )
+
+
 def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(
     fitted,
 ):
