@@ -48,6 +48,7 @@ class UploadedImage:
         rgb: ``(3, H, W)`` float32 levels.
         depth: ``(H, W)`` metres.
         hidden: Depth, `HIDING_M` where a road user stands: it hides all ground behind it.
+        project: ``(3, 4)`` of the host, from the world to its pixels times depth.
         others: See `RecordedImage`.
     """
 
@@ -55,6 +56,7 @@ class UploadedImage:
     rgb: Tensor
     depth: Tensor
     hidden: Tensor
+    project: F64
     others: tuple[UploadedImage, ...] = ()
 
 
@@ -64,7 +66,8 @@ def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage
     hidden = depth
     if recorded.users is not None:
         hidden = torch.where(upload(recorded.users, device), HIDING_M, depth)
-    return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden)
+    project = recorded.K @ inverse(recorded.T_world_camera)[:3]
+    return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden, project)
 
 
 class CarriedView(NamedTuple):
@@ -113,12 +116,15 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     rays = _rays(depth[0])
     flat = depth.flatten(1)
     users = _users(views, depth.device)
-    on_ground = _ground_depth(views, rays, flat, users)
+    lifted = [_lifted(view) for view in views]
+    project = [np.concatenate([image.project for image in view.pinholes]) for view in views]
+    from_view = upload(np.array(project) @ np.array(lifted), depth.device)
+    on_ground = _ground_depth(views, lifted, rays, flat, users)
     by_depth, by_ground = (
         _filled(part, lenses).reshape(len(views), -1, height, width, 4)
         for part in (
-            _warp(views, "depth", rays, flat, users, np.inf),
-            _warp(views, "hidden", rays, on_ground, None, FREE_SHARE),
+            _warp(views, from_view, "depth", rays, flat, users, np.inf),
+            _warp(views, from_view, "hidden", rays, on_ground, None, FREE_SHARE),
         )
     )
     chosen = on_ground.view_as(depth) > 0
@@ -158,14 +164,6 @@ def _rays(depth: Tensor) -> Tensor:
     return torch.stack([u, v, torch.ones_like(u)]).flatten(1)
 
 
-def _projections(view: CarriedView) -> F64:
-    """Return the matrices from the world to the pixels of a view's recorded frames times depth,
-    ``(N, 3, 4)``.
-    """
-    recorded = [image.recorded for image in view.pinholes]
-    return np.array([one.K @ inverse(one.T_world_camera)[:3] for one in recorded])
-
-
 def _lifted(view: CarriedView) -> F64:
     """Return the matrix ``(4, 4)`` from a view's pixels times depth to the world."""
     T = view.target.T_world_camera.copy()
@@ -183,7 +181,7 @@ def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
     for v, view in enumerate(views):
         names, seen = view.target.placed
         count = len(names)
-        project = _projections(view)
+        project = np.array([image.project for image in view.pinholes])
         ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
         for i, name in enumerate(names):
             T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
@@ -199,6 +197,7 @@ def _turned(matrices: Tensor, points: Tensor) -> Tensor:
 
 def _warp(
     views: Sequence[CarriedView],
+    from_view: Tensor,
     seen: str,
     rays: Tensor,
     depth: Tensor,
@@ -209,15 +208,15 @@ def _warp(
 
     Args:
         views: Their images are carried.
+        from_view: ``(V, 3 N, 4)`` from a view's pixels times depth to those of each recorded frame.
         seen: Which depth of a recorded frame counts.
         rays: Of the views.
         depth: ``(V, P)`` by which the frames are carried.
         users: Move with their boxes; None: nobody does.
         free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
-    from_view = np.array([(_projections(view) @ _lifted(view)).reshape(-1, 4) for view in views])
     points = rays * torch.where(depth > 0, depth, INFINITY_M)[:, None]
-    there = _turned(upload(from_view, depth.device), points)
+    there = _turned(from_view, points)
     for i in reversed(range(0 if users is None else users.ray.shape[1])):  # of two the first counts
         assert users is not None
         local = users.ray[:, i] @ points + users.eye[:, i]
@@ -265,14 +264,19 @@ def _stacked(images: Sequence[Tensor]) -> Tensor:
 
 
 def _ground_depth(
-    views: Sequence[CarriedView], rays: Tensor, depth: Tensor, users: Users
+    views: Sequence[CarriedView],
+    lifted: Sequence[F64],
+    rays: Tensor,
+    depth: Tensor,
+    users: Users,
 ) -> Tensor:
     """Return the depth of the ground ``(V, P)`` where a pixel may show it; see
     `ground.ground_hypothesis`.
     """
     # Of each view how steeply a ray falls, and the height above the ground.
-    planes = [(inverse(view.T_world_rig) @ _lifted(view))[2] for view in views]
-    numbers = upload(np.array(planes), rays.device)
+    T_world_rig = np.array([view.T_world_rig for view in views])
+    planes = (inverse(T_world_rig) @ np.array(lifted))[:, 2]
+    numbers = upload(planes, rays.device)
     slope = numbers[:, :3] @ rays
     z = -numbers[:, 3:] / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
