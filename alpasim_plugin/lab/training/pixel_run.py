@@ -28,6 +28,7 @@ from alpasim_plugin.lab.training.model_card import ModelCard, curves
 from alpasim_plugin.lab.training.pixel_rollout import Distance
 from alpasim_plugin.lab.training.pixel_task import FrameStreams, PixelTask
 from alpasim_plugin.lab.training.pixel_variants import DEPLOYED, PixelVariant
+from alpasim_plugin.lab.training.processes import join_ranks
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
 BLOCK = re.compile(r"(encode|decode|middle)\w*\.\d+\.")  # a residual block of a stage
@@ -70,7 +71,7 @@ def train_per_frame(
     report: Callable[[int, Mapping[str, float]], None] | None = None,
 ) -> Path:
     """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write
-    OUT/fixer.safetensors and its card.
+    OUT/fixer.safetensors and its card. Processes of torchrun share the streams.
 
     Args:
         run: Definition of the run.
@@ -83,8 +84,10 @@ def train_per_frame(
         InputError: Weights of other sizes, or a folder of another run.
         InfrastructureError: The loss is not finite, or there is no such device.
     """
-    net = initial_generator(run).to(require_device(run.device))
-    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed)
+    device = torch.device(require_device(run.device))
+    net = initial_generator(run).to(device)
+    whole = net, run.streams, run.variant, run.schedule.steps, distance, run.seed
+    task = PixelTask(*whole, *join_ranks(device))
     facts = {
         **task.facts,
         "init": file_sha256(run.init) if run.init else None,
@@ -101,6 +104,8 @@ def train_per_frame(
             report(step, numbers)
 
     trainer.run(reported, stop_at)
+    if trainer.rank:
+        return out / BUNDLE_FILE
     path = write_bundle(run, out / BUNDLE_FILE, trainer.averaged(), trainer.step)
     rows, hours = curves(out / LOG_FILE)
     training = {"schedule": asdict(run.schedule), "updates": trainer.step, **facts}

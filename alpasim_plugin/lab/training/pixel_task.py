@@ -4,13 +4,14 @@ state that goes on between updates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelGenerator, PixelState
 from alpasim_plugin.lab.training.pixel_rollout import (
@@ -68,8 +69,8 @@ class FrameBatch(Protocol):
 class FrameStreams(Protocol):
     """Batches by number of update."""
 
-    def update(self, i: int) -> FrameBatch:
-        """Return the frames of update ``i``, a function of ``i`` only."""
+    def update(self, i: int, slots: Sequence[int]) -> FrameBatch:
+        """Return the frames of some streams at update ``i``, a function of these alone."""
         ...
 
     @property
@@ -100,6 +101,11 @@ class PixelTask:
         steps: Updates of the run, which a variant of several stages divides.
         distance: Name and function of the perceptual term, or None.
         seed: Of the noise.
+        rank, ranks: Number of this process, and of all that share every batch: each has as many
+            streams.
+
+    Raises:
+        InputError: The streams cannot be shared so.
     """
 
     def __init__(
@@ -110,7 +116,16 @@ class PixelTask:
         steps: int,
         distance: tuple[str, Distance] | None,
         seed: int = 0,
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
+        if streams.batch % ranks:
+            raise InputError(
+                f"{ranks} processes cannot share {streams.batch} streams",
+                "make --streams a multiple of the processes",
+            )
+        count = streams.batch // ranks
+        self._own = slice(rank * count, (rank + 1) * count)
         self.net, self.streams, self.variant, self.steps, self.distance, self.seed = (
             net,
             streams,
@@ -134,8 +149,10 @@ class PixelTask:
         }
 
     def batch(self, index: int) -> NoisyBatch:
-        """Return the frames and noise of update ``index``."""
-        got = self.streams.update(index)
+        """Return the frames and noise of update ``index``, of this process's streams."""
+        streams = self.streams.batch
+        own = self._own
+        got = self.streams.update(index, range(streams)[own])
         render, truth, sdmap, opacity = (
             x.permute(0, 1, 3, 4, 2).contiguous()
             for x in (got.render, got.target, got.map, got.opacity)
@@ -143,13 +160,14 @@ class PixelTask:
         source = torch.Generator().manual_seed(
             derive_seed("training", self.seed, "pixel.noise", index) % 2**63
         )
-        batch, frames = render.shape[:2]
-        eps = torch.randn(render.shape, generator=source)
-        eps_flow = torch.randn((batch, *render.shape[2:]), generator=source)
-        t = torch.rand(batch, generator=source)
+        frames, *shape = render.shape[1:]
+        # Drawn for all streams: the noise of one does not depend on the number of processes.
+        eps = torch.randn((streams, frames, *shape), generator=source)[own]
+        eps_flow = torch.randn((streams, *shape), generator=source)[own]
+        t = torch.rand(streams, generator=source)[own]
         rng = stream("training", self.seed, "pixel.frames", index)
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
-        t_history = torch.rand(batch, frames, generator=source)
+        t_history = torch.rand(streams, frames, generator=source)[own]
         flow_frame, top, left = (
             int(rng.integers(frames)),
             *(int(rng.integers(_corners(side))) for side in render.shape[2:4]),
@@ -203,8 +221,9 @@ class PixelTask:
         return {} if self._state is None else self._state._asdict()
 
     def carry(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take a checkpoint's state."""
-        self._state = PixelState(**tensors) if tensors else None
+        """Take a checkpoint's state, of all streams."""
+        own = {name: part[self._own] for name, part in tensors.items()}
+        self._state = PixelState(**own) if own else None
 
 
 def _corners(side: int) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
-from torch import distributed
+from torch import Tensor, distributed
 
 from alpasim_plugin.core.devices import implementation
 
@@ -23,6 +23,13 @@ def join_ranks(place: torch.device) -> tuple[int, int]:
         own: torch.device | None = implementation(place, None, place)
         distributed.init_process_group(backend, device_id=own)
     return distributed.get_rank(), distributed.get_world_size()
+
+
+def rows_of_all(own: Tensor, ranks: int) -> Tensor:
+    """Return the rows of all processes, as many each, in the order of their numbers."""
+    parts = [torch.empty_like(own) for _ in range(ranks)]
+    distributed.all_gather(parts, own.contiguous())
+    return torch.cat(parts)
 
 
 def side_stream(place: torch.device) -> Callable[[], AbstractContextManager[None]]:

@@ -245,21 +245,22 @@ class TrainingStreams:
                     "crop less",
                 )
 
-    def update(self, i: int) -> StreamBatch:
-        """Return the batch of update ``i``, counted from 0."""
-        slots = [self.episode_of(slot, i) for slot in range(self.batch)]
-        shown = [self._show(episode, at) for episode, at in slots]
+    def update(self, i: int, slots: Sequence[int] | None = None) -> StreamBatch:
+        """Return the batch of update ``i``, counted from 0; of some slots, or of all."""
+        chosen = range(self.batch) if slots is None else slots
+        episodes = [self.episode_of(slot, i) for slot in chosen]
+        shown = [self._show(episode, at) for episode, at in episodes]
         render, opacity, sdmap, target, references, users = (
             torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True)
         )
-        fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])
+        fresh = torch.tensor([at == 0 or i == 0 for _, at in episodes])
         return StreamBatch(
             render,
             opacity,
             sdmap,
             target,
             fresh,
-            torch.tensor([episode.kind for episode, _ in slots]),
+            torch.tensor([episode.kind for episode, _ in episodes]),
             references,
             users,
         )

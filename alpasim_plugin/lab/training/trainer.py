@@ -25,7 +25,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.reading import parse_json, parsing, read_text
 from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.fixers.network.checkpoints import listed, load_weights
-from alpasim_plugin.lab.training.processes import join_ranks, side_stream
+from alpasim_plugin.lab.training.processes import join_ranks, rows_of_all, side_stream
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, Tensor | float]]  # loss, and values for the log
@@ -123,21 +123,24 @@ WHOLE: Mapping[str, PartSchedule] = MappingProxyType({"": PartSchedule()})
 
 
 class Carried(Protocol):
-    """What a task carries from one batch to the next, such as the state of a recurrent network."""
+    """What a task carries from one batch to the next, such as the state of a recurrent network. Each
+    of several processes has its own rows of every batch.
+    """
 
     def carried(self) -> Mapping[str, Tensor]:
-        """Return it as named tensors; empty before the first batch."""
+        """Return it as named tensors, whose rows are this process's; empty before the first batch."""
         ...
 
     def carry(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `carried` returned at a checkpoint."""
+        """Take what `carried` returned at a checkpoint, with the rows of all processes."""
         ...
 
 
 class Trainer(Generic[Batch]):
     """Train one module in one run folder; the same folder resumes.
 
-    Processes of torchrun share the batches of an update, and end with the weights of one process.
+    Processes of torchrun share the batches of an update, or the rows of each batch where a task
+    carries something from batch to batch, and end with the weights of one process.
 
     Args:
         module: Its parameters that require a gradient are trained.
@@ -186,10 +189,11 @@ class Trainer(Generic[Batch]):
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
         self.rank, self.ranks = join_ranks(self.device)
-        if schedule.accumulate % self.ranks or (carried and self.ranks > 1):
+        self._stride = self.ranks if carried is None else 1
+        if schedule.accumulate % self._stride:
             raise InputError(
                 f"{folder}: {self.ranks} processes cannot share the batches of an update",
-                "train per-frame in one process; of others make --accumulate a multiple of them",
+                "make --accumulate a multiple of them",
             )
         self._beside = side_stream(self.device)
         self._end = schedule.steps * schedule.accumulate
@@ -267,12 +271,15 @@ class Trainer(Generic[Batch]):
 
     def save(self) -> None:
         """Write the checkpoint, in the first process; the others wait for it."""
+        carried = self._kept
+        if self.ranks > 1:
+            carried = {name: rows_of_all(own, self.ranks) for name, own in carried.items()}
         if self.rank == 0:
-            self._write()
+            self._write(carried)
         if self.ranks > 1:
             distributed.barrier()
 
-    def _write(self) -> None:
+    def _write(self, carried: Mapping[str, Tensor]) -> None:
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
         for (
@@ -283,7 +290,7 @@ class Trainer(Generic[Batch]):
                 f"moment.{key}.{name}": value
                 for key, value in self.optimiser.state.get(p, {}).items()
             }
-        tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self._kept.items()}
+        tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in carried.items()}
         meta = {
             "step": str(self.step),
             "facts": self._facts,
@@ -297,17 +304,20 @@ class Trainer(Generic[Batch]):
         self.optimiser.zero_grad(set_to_none=True)
         sums: dict[str, Tensor | float] = {}
         n = self.schedule.accumulate
+        first = self.step * n + self.rank % self._stride
+        own = range(first, (self.step + 1) * n, self._stride)
+        parts = len(own) * self.ranks  # whose mean is the update's
         held = []  # until the host has waited for the device
-        for index in range(self.step * n + self.rank, (self.step + 1) * n, self.ranks):
+        for index in own:
             held.append(self._ahead.pop(index) if index in self._ahead else self._sent(index))
             with autocast(self.device, self._autocast):
                 loss, numbers = self._loss(held[-1], index)
-            (loss / n).backward()  # type: ignore[no-untyped-call]
-            following = index + self.ranks
+            (loss / parts).backward()  # type: ignore[no-untyped-call]
+            following = index + self._stride
             if following < self._end:
                 self._ahead[following] = self._sent(following)
             for name, value in {"loss": loss.detach(), **numbers}.items():
-                sums[name] = sums.get(name, 0.0) + value / n
+                sums[name] = sums.get(name, 0.0) + value / parts
         totals = stacked(sums, self.device)
         if self.ranks > 1:
             gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
@@ -395,13 +405,14 @@ class Trainer(Generic[Batch]):
                 "give the same steps and decay, or begin a run from its weights",
             )
         with parsing(path, START_ANEW, "not a whole checkpoint"):
-            self._kept = {
-                key.removeprefix(CARRIED): value
-                for key, value in tensors.items()
-                if key.startswith(CARRIED)
-            }
             if self._carried is not None:
-                self._carried.carry(moved(self._kept, self.device))
+                carried = {
+                    key.removeprefix(CARRIED): value
+                    for key, value in tensors.items()
+                    if key.startswith(CARRIED)
+                }
+                self._carried.carry(moved(carried, self.device))
+                self._kept = dict(self._carried.carried())
             self._take(tensors)
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:

@@ -17,11 +17,14 @@ from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training import vae
 from alpasim_plugin.lab.training.clips import CropSize
 from alpasim_plugin.lab.training.fixer_run import train_fixer
+from alpasim_plugin.lab.training.pixel_run import train_per_frame
 from alpasim_plugin.lab.training.processes import join_ranks
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
 from tests.examples import first_of
 from tests.lab.training.test_generator import brightness, data, run_of  # noqa: F401 - data is a fixture
+from tests.lab.training.test_pixel_training import Streams
+from tests.lab.training.test_pixel_training import run_of as per_frame_run
 from tests.lab.training.test_trainer import batch, trainer
 from tests.pretended_device import pretended_device, traffic
 
@@ -89,23 +92,37 @@ def test_a_run_goes_on_on_another_device_and_makes_batches_ahead(tmp_path, monke
     assert_same_weights(host, both)
 
 
-def train_in_a_rank(rank, folder, port):
+def batches_in_a_rank(folder):
+    trainer(folder, Schedule(steps=3, accumulate=4, save_every=1)).run()
+
+
+def streams_in_a_rank(folder):
+    train_per_frame(per_frame_run(), folder, None, stop_at=2)
+    train_per_frame(per_frame_run(), folder, None, stop_at=3)
+
+
+def in_a_rank(rank, job, folder, port):
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2"}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    trainer(folder, Schedule(steps=3, accumulate=4, save_every=1)).run()
+    job(folder)
     with pytest.raises(InputError):
         trainer(folder / "odd", Schedule(steps=3, accumulate=3))
+    streams = Streams()
+    streams.batch = 3
+    with pytest.raises(InputError):
+        train_per_frame(replace(per_frame_run(), streams=streams), folder / "odd", None)
 
 
 @pytest.mark.slow
-def test_two_processes_train_to_the_weights_and_the_log_of_one(tmp_path):
+@pytest.mark.parametrize("job", [batches_in_a_rank, streams_in_a_rank])
+def test_two_processes_train_to_the_weights_and_the_log_of_one(job, tmp_path):
     one = tmp_path / "one"
     two = tmp_path / "two"
-    trainer(one, Schedule(steps=3, accumulate=4, save_every=1)).run()
+    job(one)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    torch.multiprocessing.spawn(train_in_a_rank, (two, port), nprocs=2)
+    torch.multiprocessing.spawn(in_a_rank, (job, two, port), nprocs=2)
     assert_same_weights(one, two)
     assert len((two / "log.jsonl").read_text().splitlines()) == 3
 

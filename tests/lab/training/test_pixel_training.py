@@ -56,19 +56,14 @@ class Streams:
 
     batch = 2
 
-    def update(self, i):
+    def update(self, i, slots=(0, 1)):
         source = torch.Generator().manual_seed(i)
         target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
         opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
         users = torch.rand(opacity.shape, generator=source) < 0.1
-        return Batch(
-            target * 0.5 - 0.4,
-            opacity,
-            target.roll(1, 2),
-            target,
-            torch.tensor([i % 3 == 0, i == 0]),
-            users,
-        )
+        fresh = torch.tensor([i % 3 == 0, i == 0])
+        whole = target * 0.5 - 0.4, opacity, target.roll(1, 2), target, fresh, users
+        return Batch(*(part[list(slots)] for part in whole))
 
     def facts(self):
         return {"streams": "dark"}
