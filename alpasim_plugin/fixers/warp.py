@@ -33,6 +33,10 @@ FREE_SHARE = 0.4
 # Where other pinholes of a lens fill in is looked for in at least so many columns of a view.
 SEARCHED = 100
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
+TAPS = 2  # bicubic look-ups reach so many pixels beyond an image
+# Added to a place in pixels: OpenCV counts from the first pixel's middle, here of such a margin.
+FIRST_PX = TAPS - 0.5
+NOWHERE_PX = np.float32(-1e4)
 # Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
 VALID = 255
 INCONSISTENT = 128
@@ -136,7 +140,11 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
-    rgb = cv2.remap(recorded.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    # What lies outside is not looked up; the margin gives all that is inside its neighbours.
+    margin = (TAPS,) * 4
+    then = cv2.copyMakeBorder(recorded.rgb, *margin, cv2.BORDER_REPLICATE)
+    rgb = np.zeros((*shape, 3), np.uint8)
+    cv2.remap(then, x, y, cv2.INTER_CUBIC, dst=rgb, borderMode=cv2.BORDER_TRANSPARENT)
     out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
     step = max(1, shape[1] // SEARCHED)
     some = slice(0, None, step)
@@ -221,7 +229,8 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
             v = (z * (A[1, 0] * u0 + ay) + b[1]) / rz
             there = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
             u, v = u if there else 0.5, v if there else 0.5
-            x[row, column], y[row, column] = np.float32(u - 0.5), np.float32(v - 0.5)
+            x[row, column] = np.float32(u + FIRST_PX) if there else NOWHERE_PX
+            y[row, column] = np.float32(v + FIRST_PX) if there else NOWHERE_PX
             place[column], distance[column], seen[column] = (
                 np.uint32(np.int32(v) * columns_then + np.int32(u)),
                 rz,
@@ -270,14 +279,14 @@ def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, x, 
             pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
             if not (low[0] < px < high[0] and low[1] < py < high[1] and low[2] <= pz < high[2]):
                 continue
-            x[row, column], y[row, column], held[row, column] = 0, 0, 0
+            x[row, column], y[row, column], held[row, column] = NOWHERE_PX, NOWHERE_PX, 0
             rz = project[2, 0] * px + project[2, 1] * py + project[2, 2] * pz + project[2, 3]
             if not rz > NEAREST_M:
                 continue
             u = (project[0, 0] * px + project[0, 1] * py + project[0, 2] * pz + project[0, 3]) / rz
             v = (project[1, 0] * px + project[1, 1] * py + project[1, 2] * pz + project[1, 3]) / rz
             if 0 <= u < columns_then and 0 <= v < rows_then:
-                x[row, column], y[row, column] = u - 0.5, v - 0.5
+                x[row, column], y[row, column] = u + FIRST_PX, v + FIRST_PX
                 held[row, column] = _held(depth_then[int(v), int(u)], rz, np.inf)
 
 
