@@ -110,6 +110,16 @@ def upload(array: npt.ArrayLike | Tensor, place: device | str) -> Tensor:
     return tensor.to(place, non_blocking=True)
 
 
+def upload_together(arrays: Sequence[npt.NDArray[Any]], place: device | str) -> list[Tensor]:
+    """Return copies of arrays of one type as tensors of a device, sent in one copy; see `upload`."""
+    import numpy as np
+    import torch
+
+    sent = upload(np.concatenate([array.ravel() for array in arrays]), place)
+    pieces = torch.split(sent, [array.size for array in arrays])
+    return [piece.view(array.shape) for piece, array in zip(pieces, arrays, strict=True)]
+
+
 def download(*parts: Tensor) -> list[Any]:
     """Return tensors as arrays, brought to the host in one copy: each copy waits for the device."""
     import torch

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.core.devices import upload
+from alpasim_plugin.core.devices import upload, upload_together
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.fixers import ground
@@ -94,6 +94,14 @@ class Users(NamedTuple):
     then: Tensor  # (V, B, 3 N, 4) from a box to the pixels of each recorded frame times depth
 
 
+class Shown(NamedTuple):
+    """The recorded frames of V views."""
+
+    rgb: Tensor  # (V N, 3, h, w) levels, see `_stacked`
+    sizes_px: Tensor  # (V N, 2) height and width of each
+    from_view: Tensor  # (V, 3 N, 4) from a view's pixels times depth to those of each frame
+
+
 def size_of(view: CarriedView) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
     """Return what views share that are carried together."""
     lenses = tuple(1 + len(image.others) for image in view.images)
@@ -115,16 +123,32 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     (height, width), size, lenses = size_of(views[0])
     rays = _rays(depth[0])
     flat = depth.flatten(1)
-    users = _users(views, depth.device)
-    lifted = [_lifted(view) for view in views]
-    project = [np.concatenate([image.project for image in view.pinholes]) for view in views]
-    from_view = upload(np.array(project) @ np.array(lifted), depth.device)
-    on_ground = _ground_depth(views, lifted, rays, flat, users)
+    images = [image for view in views for image in view.pinholes]
+    lifted = np.array([_lifted(view) for view in views])
+    project = np.array([image.project for image in images])
+    T_world_rig = np.array([view.T_world_rig for view in views])
+    sizes = np.array([image.depth.shape for image in images], np.float64)
+    from_view, planes, sizes_px, *boxes = upload_together(
+        [
+            project.reshape(len(views), -1, 4) @ lifted,
+            (inverse(T_world_rig) @ lifted)[:, 2],
+            sizes,
+            *_boxes(views),
+        ],
+        depth.device,
+    )
+    users = Users(*boxes)
+    on_ground = _ground_depth(planes, rays, flat, users)
+    shown = Shown(_stacked([image.rgb for image in images]), sizes_px, from_view)
+    surfaces, hidden = (
+        _stacked([part[None] for part in parts])[:, 0]
+        for parts in zip(*((image.depth, image.hidden) for image in images), strict=True)
+    )
     by_depth, by_ground = (
         _filled(part, lenses).reshape(len(views), -1, height, width, 4)
         for part in (
-            _warp(views, from_view, "depth", rays, flat, users, np.inf),
-            _warp(views, from_view, "hidden", rays, on_ground, None, FREE_SHARE),
+            _warp(shown, surfaces, rays, flat, users, np.inf),
+            _warp(shown, hidden, rays, on_ground, None, FREE_SHARE),
         )
     )
     chosen = on_ground.view_as(depth) > 0
@@ -171,7 +195,8 @@ def _lifted(view: CarriedView) -> F64:
     return T
 
 
-def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
+def _boxes(views: Sequence[CarriedView]) -> tuple[F64, F64, F64, F64]:
+    """Return the arrays of `Users`."""
     most = max(len(view.target.placed.names) for view in views)
     shape = len(views), most
     ray = np.tile(np.eye(3), (*shape, 1, 1))
@@ -186,8 +211,7 @@ def _users(views: Sequence[CarriedView], device: torch.device) -> Users:
         for i, name in enumerate(names):
             T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
             then[v, i] = (project @ np.array(T_world_box)).reshape(-1, 4)
-    parts = ray, eye[..., None], walls[..., None], then
-    return Users(*(upload(part, device) for part in parts))
+    return ray, eye[..., None], walls[..., None], then
 
 
 def _turned(matrices: Tensor, points: Tensor) -> Tensor:
@@ -196,9 +220,8 @@ def _turned(matrices: Tensor, points: Tensor) -> Tensor:
 
 
 def _warp(
-    views: Sequence[CarriedView],
-    from_view: Tensor,
-    seen: str,
+    recorded: Shown,
+    surfaces: Tensor,
     rays: Tensor,
     depth: Tensor,
     users: Users | None,
@@ -207,16 +230,15 @@ def _warp(
     """Return the recorded frames in the views ``(V, N, P, 4)``; see `warp.warp`.
 
     Args:
-        views: Their images are carried.
-        from_view: ``(V, 3 N, 4)`` from a view's pixels times depth to those of each recorded frame.
-        seen: Which depth of a recorded frame counts.
+        recorded: Their frames.
+        surfaces: ``(V N, h, w)`` depth of these.
         rays: Of the views.
         depth: ``(V, P)`` by which the frames are carried.
         users: Move with their boxes; None: nobody does.
         free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
     points = rays * torch.where(depth > 0, depth, INFINITY_M)[:, None]
-    there = _turned(from_view, points)
+    there = _turned(recorded.from_view, points)
     for i in reversed(range(0 if users is None else users.ray.shape[1])):  # of two the first counts
         assert users is not None
         local = users.ray[:, i] @ points + users.eye[:, i]
@@ -226,10 +248,7 @@ def _warp(
     u, v, w = there.reshape(-1, 3, there.shape[2]).unbind(1)
     u = u / w
     v = v / w
-    images = [image for view in views for image in view.pinholes]
-    surfaces = _stacked([getattr(image, seen)[None] for image in images])[:, 0]
-    sizes = upload(np.array([image.depth.shape for image in images]), depth.device)
-    height, width = sizes[..., None].unbind(1)
+    height, width = recorded.sizes_px[..., None].unbind(1)
     shown = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u = torch.where(shown, u, 0.5)
     v = torch.where(shown, v, 0.5)
@@ -239,15 +258,14 @@ def _warp(
     far = (surface > INFINITY_M / 2) & (w > INFINITY_M / 2)
     agrees = far | (surface >= free_share * w) | ((surface - w).abs() < SLACK * w + SLACK_M)
     held = torch.where(agrees, VALID, INCONSISTENT) * shown
-    rgb = _stacked([image.rgb for image in images])
-    rows, columns = rgb.shape[2:]
+    rows, columns = recorded.rgb.shape[2:]
     grid = torch.stack([(2 * u - 1) / (columns - 1) - 1, (2 * v - 1) / (rows - 1) - 1], dim=-1)
     found = F.grid_sample(
-        rgb, grid[:, None].float(), "bicubic", padding_mode="border", align_corners=True
+        recorded.rgb, grid[:, None].float(), "bicubic", padding_mode="border", align_corners=True
     )
     levels = (found[:, :, 0].mT + 0.5).clamp(0, 255)
     out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
-    return out.view(len(views), -1, *out.shape[1:])
+    return out.view(len(depth), -1, *out.shape[1:])
 
 
 def _stacked(images: Sequence[Tensor]) -> Tensor:
@@ -263,22 +281,12 @@ def _stacked(images: Sequence[Tensor]) -> Tensor:
     return torch.stack(padded)
 
 
-def _ground_depth(
-    views: Sequence[CarriedView],
-    lifted: Sequence[F64],
-    rays: Tensor,
-    depth: Tensor,
-    users: Users,
-) -> Tensor:
-    """Return the depth of the ground ``(V, P)`` where a pixel may show it; see
-    `ground.ground_hypothesis`.
+def _ground_depth(planes: Tensor, rays: Tensor, depth: Tensor, users: Users) -> Tensor:
+    """Return the depth of the ground ``(V, P)`` where a pixel may show it, of planes ``(V, 4)``: how
+    steeply a ray falls, and the height above the ground; see `ground.ground_hypothesis`.
     """
-    # Of each view how steeply a ray falls, and the height above the ground.
-    T_world_rig = np.array([view.T_world_rig for view in views])
-    planes = (inverse(T_world_rig) @ np.array(lifted))[:, 2]
-    numbers = upload(planes, rays.device)
-    slope = numbers[:, :3] @ rays
-    z = -numbers[:, 3:] / slope
+    slope = planes[:, :3] @ rays
+    z = -planes[:, 3:] / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
     free &= (depth <= ground.FLOATING_M) | (depth >= FREE_SHARE * z)
     for i in range(users.ray.shape[1]):

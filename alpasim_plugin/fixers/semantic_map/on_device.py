@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.devices import upload
+from alpasim_plugin.core.devices import upload, upload_together
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.fixers.semantic_map import kernels, tile_kernel
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, Segments, Triangles
@@ -55,10 +55,11 @@ def draw_tiles(scene: PreparedMap, device: torch.device | str, views: Sequence[M
     numbers = [
         [*pose.ravel(), *view, 1.0, width / height, band.start] for view, pose, *_, band in views
     ]
-    cameras = upload(np.array(numbers), device)
+    moving_faces = _padded([_rows(view[2]) for view in views])
+    moving_edges = _padded([_rows(view[3]) for view in views])
+    sent = upload_together([np.array(numbers), moving_faces, moving_edges], device)
+    cameras, faces, edges = sent
     segments, triangles, samples = _uploaded(scene, device)
-    faces = upload(_padded([_rows(view[2]) for view in views]), device)
-    edges = upload(_padded([_rows(view[3]) for view in views]), device)
     strokes = _strokes(_beside(segments, edges), cameras)
     shapes = _shapes(_beside(triangles, faces), cameras)
     lines, users = torch.split(strokes, [len(segments), edges.shape[1]], dim=1)

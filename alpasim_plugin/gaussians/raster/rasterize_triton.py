@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.devices import implementation, require_device, upload
+from alpasim_plugin.core.devices import implementation, require_device, upload, upload_together
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -293,6 +293,7 @@ class UploadedClouds(TileCompositor):
             [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
             for camera, _ in views
         ]
+        sent = upload_together([poses, np.array(numbers)], self.device)
         spans = self._spans(views)
         total = len(spans) * BLOCK
         records = self._empty((total, kernels.RECORD), torch.float32)
@@ -302,8 +303,7 @@ class UploadedClouds(TileCompositor):
         if total:
             kernels.project[(len(spans),)](
                 self._upload(spans, np.int32),
-                self._upload(poses, np.float64),
-                self._upload(np.array(numbers), np.float64),
+                *sent,
                 self.means,
                 self.factors,
                 self.opacities,
