@@ -42,9 +42,9 @@ def request(entry, t_us):
 @pytest.mark.slow
 def test_a_view_has_the_same_references_whatever_was_asked_before(file):
     entry = served(file, "onefixer")
-    alone = entry.render(request(entry, 820_000)).references
-    entry.render(request(entry, 1_500_000))
-    again = entry.render(request(entry, 820_000)).references
+    alone = entry.render([request(entry, 820_000)])[0].references
+    entry.render([request(entry, 1_500_000)])
+    again = entry.render([request(entry, 820_000)])[0].references
     assert len(alone) == 2
     assert all(np.array_equal(a, b) for a, b in zip(alone, again, strict=True))
     assert (alone[0][..., 3] > 0).mean() > 0.5

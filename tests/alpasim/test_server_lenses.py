@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from alpasim_plugin.alpasim.server import views
+from alpasim_plugin.alpasim.server import caches, views
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
 from alpasim_plugin.alpasim.server.status import CallTime
@@ -250,7 +250,15 @@ degradation: {share: 0.004}
 """
 
 
-def test_a_server_shows_through_a_foreign_lens_what_a_run_shows(tmp_path):
+def test_a_server_shows_through_a_foreign_lens_what_a_run_shows(tmp_path, monkeypatch):
+    drawn = []
+    draw = caches.checked_frames
+
+    def counted(renderer, requests, on_device):
+        drawn.append(len(requests))
+        return draw(renderer, requests, on_device)
+
+    monkeypatch.setattr(caches, "checked_frames", counted)
     path = tmp_path / "street.yaml"
     path.write_text(STREET)
     scenario = load_scenario(path)
@@ -262,3 +270,5 @@ def test_a_server_shows_through_a_foreign_lens_what_a_run_shows(tmp_path):
         assert seen.std() > 20
         # intrinsics and poses are of single precision on the wire: a pixel may round the other way
         assert_allclose(seen.astype(int), run.render(asked).rgb, atol=2)
+    assert len(drawn) == 3  # all pinholes of a lens at once
+    assert max(drawn) > 1

@@ -163,7 +163,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         renderer = SimpleNamespace(render_batch=rendered)
         served = SceneEntry(None, None, renderer, ReferenceSession(recorded, (), path, 2), True)
         traffic.reset()
-        assert len(served.render(request, True).pending.references) == 2
+        assert len(served.render([request], True)[0].pending.references) == 2
         assert not traffic.waits
         assert np.abs(found.alpha - wanted.alpha).max() <= LSB
         launches = []

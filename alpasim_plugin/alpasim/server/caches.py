@@ -118,15 +118,15 @@ class SceneEntry:
     references: ReferenceSession | None = None
     reads_device: bool = False  # whether its fixer takes frames from a device
 
-    def render(self, request: RenderRequest, on_device: bool = False) -> Frame:
-        """Render a frame with its references, which depend on the request alone; what a device
-        drew may stay there.
+    def render(self, requests: Sequence[RenderRequest], on_device: bool = False) -> list[Frame]:
+        """Render the frames of an instant with their references, which depend on the requests
+        alone; what a device drew may stay there.
         """
         assert self.renderer is not None, "scenes without a renderer are for maps only"
-        frames = checked_frames(self.renderer, [request], on_device)
+        frames = checked_frames(self.renderer, requests, on_device)
         if self.references is not None:
-            frames = self.references.added([request], frames, on_device)
-        return frames[0]
+            frames = self.references.added(requests, frames, on_device)
+        return frames
 
 
 class SceneCache:

@@ -245,12 +245,8 @@ class LocalSource:
         sides = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
         asked = asked_of(entry, request, view, mount_of(entry, view), sides)
-        frames = []
-        for part in asked:
-            with left.holding(self._busy):
-                frames.append(entry.render(part, entry.reads_device))
-            left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
         with left.holding(self._busy):
+            frames = entry.render(asked, entry.reads_device)
             place = frames[0].device if entry.reads_device else "cpu"
             sdmap = drawn_map(entry, asked, sides, place)
         rendered = Rendered(joined(view.camera, sides, frames), sdmap, blind_of(sides))
@@ -273,18 +269,12 @@ class LocalSource:
         """
         entry = self._scenes.get(view.scene_id, left)
         boxes = boxes_at(entry, view)
-        out = []
-        for camera in cameras:
-            with left.holding(self._busy):
-                out.append(
-                    entry.render(
-                        RenderRequest(
-                            view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes
-                        )
-                    )
-                )
-            left.left_s()
-        return out
+        asked = [
+            RenderRequest(view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes)
+            for camera in cameras
+        ]
+        with left.holding(self._busy):
+            return entry.render(asked)
 
 
 class UpstreamSource:
