@@ -7,12 +7,13 @@ from pathlib import Path
 from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.core.types import U8, RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, REPORTS
+from alpasim_plugin.runs.film import beside
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
@@ -136,15 +137,23 @@ def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
 
 
 def _image(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
-    """Save the first camera's newest frame at a query and return its path; None where the log has
+    """Save the cameras' newest frames at a query and return their path; None where the log has
     none.
     """
-    if not log.images:
+    shown = shown_at(log, t_us)
+    if shown is None:
         return None
-    camera = log.images[0].camera
-    shown = [image for image in log.images if image.camera == camera and image.end_us <= t_us]
-    if not shown:
-        return None
-    rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
-    write_bytes(root / name, encode_image(smaller(rgb, IMAGE_WIDTH), "jpeg", 85))
+    write_bytes(root / name, encode_image(shown, "jpeg", 85))
     return name
+
+
+def shown_at(log: RolloutLog, t_us: int) -> U8 | None:
+    """Return the newest frame of each camera at an instant ``(H, W, 3)``, beside one another; None
+    where a log has none.
+    """
+    newest = {image.camera: image for image in log.images if image.end_us <= t_us}
+    images = [
+        smaller(decode_image(one.data, f"camera {one.camera!r} at {one.end_us} us"), IMAGE_WIDTH)
+        for one in newest.values()
+    ]
+    return beside(images) if images else None

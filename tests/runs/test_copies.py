@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.types import Frame, SensorSpec
+from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
@@ -18,6 +19,7 @@ from alpasim_plugin.runs.cell import make_renderer, run_cell
 from alpasim_plugin.runs.film import Film
 from alpasim_plugin.runs.fork import SwitchedRenderer
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.reports import shown_at
 from alpasim_plugin.runs.run import execute_run
 from policies.simple import ConstantVelocity
 from scenarios.suite import expand
@@ -116,6 +118,14 @@ def test_films_show_each_renderer_and_only_those_of_failures_are_made(tmp_path):
         assert_allclose(film.frames, level, atol=2)
     drive(plan_of(), tmp_path / "failures")
     assert not list((tmp_path / "failures").rglob("front.mp4"))
+
+
+def test_a_flip_shows_all_cameras(watched):
+    log = watched.log("clean")
+    one, other = (decode_image(image.data) for image in log.images[:2])
+    shown = shown_at(log, log.images[0].end_us)
+    assert_array_equal(shown, np.hstack([one, other]))
+    assert shown_at(log, log.images[0].end_us - 1) is None
 
 
 def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(tmp_path):
