@@ -29,7 +29,6 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
-SEED_BITS = 64
 DIGEST_BITS = 58
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
