@@ -9,9 +9,11 @@ from contextlib import AbstractContextManager
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import F64
 
 if TYPE_CHECKING:
     from torch import Tensor, device, dtype
@@ -110,14 +112,17 @@ def upload(array: npt.ArrayLike | Tensor, place: device | str) -> Tensor:
     return tensor.to(place, non_blocking=True)
 
 
-def upload_together(arrays: Sequence[npt.NDArray[Any]], place: device | str) -> list[Tensor]:
-    """Return copies of arrays of one type as tensors of a device, sent in one copy; see `upload`."""
-    import numpy as np
+def upload_together(arrays: Sequence[F64], place: device | str) -> list[Tensor]:
+    """Return copies of arrays as tensors of a device, sent in one copy; see `upload`. Each begins at
+    a multiple of 16 bytes: Triton compiles a kernel once more for a tensor that does not.
+    """
     import torch
 
-    sent = upload(np.concatenate([array.ravel() for array in arrays]), place)
-    pieces = torch.split(sent, [array.size for array in arrays])
-    return [piece.view(array.shape) for piece, array in zip(pieces, arrays, strict=True)]
+    flat = [np.append(array, np.zeros(array.size % 2)) for array in arrays]
+    pieces = torch.split(upload(np.concatenate(flat), place), [part.size for part in flat])
+    return [
+        piece[: array.size].view(array.shape) for piece, array in zip(pieces, arrays, strict=True)
+    ]
 
 
 def download(*parts: Tensor) -> list[Any]:

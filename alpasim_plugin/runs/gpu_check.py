@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from alpasim_plugin.core.devices import download, facts_of, require_device, upload
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.lens import resized
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, Frame, RenderRequest, Scenario
@@ -37,7 +37,7 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import (
     UploadedClouds,
     compositor_of,
 )
-from alpasim_plugin.gaussians.scene.log_views import log_actors
+from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, blocks, transparent_splats
 from alpasim_plugin.runs.rollout import run_rollout
@@ -287,14 +287,9 @@ def _median_ms(make: Call) -> float:
 
 def frame_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
     """Return a frame of the recorded drive at another size."""
-    camera = scenario.cameras[0]
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
     t_us = int(scenario.ego_log.t_us[0]) + 1_000_000
-    pose = interpolate(scenario.ego_log, t_us) @ camera.T_rig_camera
-    larger = replace(camera, width=width, height=height, K=K)
-    return RenderRequest(t_us, larger, np.stack([pose, pose]), log_actors(scenario, t_us))
+    request = recorded_requests(scenario, t_us)[0]
+    return replace(request, camera=resized(request.camera, width, height))
 
 
 def _gradients(

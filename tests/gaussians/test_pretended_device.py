@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from alpasim_plugin.alpasim.server.caches import SceneEntry
-from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of
+from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of, upload_together
 from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.shutter import rolling
 from alpasim_plugin.core.types import (
@@ -202,6 +202,16 @@ def test_workers_share_the_memory_of_a_card(monkeypatch):
     share_card("cuda:1", 1)
     share_card("cuda:1", 4)
     assert shares == [(0.25, "cuda:1")]
+
+
+def test_arrays_sent_together_begin_where_kernels_expect_them(monkeypatch):
+    arrays = [np.arange(3.0), np.ones((2, 2)), np.zeros((0, 4)), np.arange(5.0)]
+    with pretended_device(monkeypatch) as traffic:
+        sent = upload_together(arrays, "cuda:0")
+        assert traffic.bytes_up == traffic.bytes_pinned == 8 * (4 + 4 + 6)
+        assert not any(tensor.storage_offset() % 2 for tensor in sent)
+        for tensor, array in zip(sent, arrays, strict=True):
+            assert np.array_equal(tensor.cpu().numpy(), array)
 
 
 def test_tensors_of_two_devices_do_not_mix(monkeypatch):
