@@ -5,8 +5,6 @@ format. ``--check`` compares the core with the record in ``tests/budget.json`` a
 has grown. A change that needs more raises the record in the same commit and says why there.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json

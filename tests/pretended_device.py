@@ -5,8 +5,6 @@ may neither wait nor copy from or to the host, and is computed again at every re
 What cannot be pretended: speed, memory, rounding, and kernels that run at the same time.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections import Counter
 from contextlib import contextmanager, nullcontext

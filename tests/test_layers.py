@@ -2,8 +2,6 @@
 what stands after it.
 """
 
-from __future__ import annotations
-
 import ast
 import gc
 import re

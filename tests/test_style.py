@@ -1,7 +1,5 @@
 """Private names of other libraries, and names bound twice: docs/architecture.md has the rule."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

@@ -2,8 +2,6 @@
 driver service, a score.
 """
 
-from __future__ import annotations
-
 from concurrent import futures
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Small fixers and clips shared by the tests of the streaming fixer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from alpasim_plugin.block_fixers.onefixer import OneFixer

@@ -5,8 +5,6 @@ Every block sees all blocks before it in one forward pass under the block-causal
 grows with the square of the clip.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

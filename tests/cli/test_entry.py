@@ -2,8 +2,6 @@
 signals during imports, a Tab.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

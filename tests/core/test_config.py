@@ -1,7 +1,5 @@
 """YAML with positions: merging, overrides, bounds, and errors that say where."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import pytest

@@ -107,32 +107,6 @@ def ran(folder):
     return (folder / "ran").read_text() if (folder / "ran").exists() else ""
 
 
-QUICK = (["list", "runs", "."], ["report", "one"], ["list", "policies"])
-MORE = (
-    ["compare", "one"],
-    ["check", "run", "one"],
-    ["gate", "one"],
-    ["view", "one"],
-    ["view", "smoke/straight"],
-    [*DRIVE, "--dry-run", "smoke/straight"],
-    ["list", "metrics"],
-    ["score", "one"],
-)
-
-
-@pytest.mark.slow  # `test_ways_to_run_code` tries the same folder in a few seconds
-@pytest.mark.parametrize("commands", [QUICK, MORE], ids=["quick", "more"])
-def test_no_command_runs_what_lies_in_the_working_directory(hostile, commands):
-    first = simrun(hostile, *DRIVE, "--workers", "2", "--out", "one", "smoke/straight")
-    assert first.returncode == 0, first.stderr
-    assert ran(hostile) == ""
-    for command in commands:
-        done = simrun(hostile, *command)
-        assert "Traceback" not in done.stderr, command
-        assert ran(hostile) == "", command
-        assert "evil" not in done.stdout, command
-
-
 NAMES = (
     "pack.inner.policy:Mine",
     "my_policy.py:Mine",

@@ -1,7 +1,5 @@
 """The street as a log of py123d: its files, columns and metadata as its writers make them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

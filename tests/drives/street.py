@@ -2,8 +2,6 @@
 path, drawn by casting rays.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from contextlib import contextmanager

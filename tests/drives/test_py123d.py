@@ -1,7 +1,5 @@
 """Logs of py123d give the same street as every other form, with its road users."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

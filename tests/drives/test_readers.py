@@ -33,25 +33,10 @@ def assert_is_the_street(placed):
     assert mount[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=0.05)  # it looks ahead
 
 
-@pytest.mark.parametrize("axes", ["opencv", "opengl"])
-@pytest.mark.slow
-def test_transforms_of_both_conventions(tmp_path, axes):
-    drive, placed = opened(write_transforms(tmp_path / "a", axes=axes))
-    assert drive.metric is None
-    assert_is_the_street(placed)
-
-
 def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path):
     for axes in ("opencv", "opengl"):
         drive, _ = opened(write_transforms(tmp_path / axes, axes=axes, say_axes=False))
         assert any(f"axes recognised as {axes}" in note for note in drive.notes)
-
-
-@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
-def test_a_colmap_model(tmp_path, binary):
-    drive, placed = opened(write_colmap(tmp_path / "a", binary))
-    assert (drive.kind, len(drive.photographs)) == ("colmap", COUNT)
-    assert_is_the_street(placed)
 
 
 @pytest.mark.parametrize(

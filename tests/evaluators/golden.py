@@ -3,8 +3,6 @@
 ``python -m tests.evaluators.golden DATA/alpasim-golden`` prints the parity table over all its logs.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import defaultdict

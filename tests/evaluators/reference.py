@@ -2,8 +2,6 @@
 time, no filters, no caches.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

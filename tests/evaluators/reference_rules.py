@@ -6,8 +6,6 @@ so at touching edges and corners both must agree without any tolerance. Distance
 floating point here as well.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from fractions import Fraction

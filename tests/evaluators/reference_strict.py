@@ -7,8 +7,6 @@ for its bottom, and the first crossing is halved down. Margin: distances to ever
 the footprint, no union, no index.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import Context, Decimal, localcontext

@@ -33,7 +33,7 @@ def test_counting_non_events_instead_of_events_mirrors_the_bounds(means):
     assert (one.low, one.high) == pytest.approx((1 - other.high, 1 - other.low), abs=1e-7)
 
 
-@pytest.mark.parametrize("n", [10, 14, 20, 42])
+@pytest.mark.parametrize("n", [10, 42])
 def test_a_rate_and_its_difference_are_covered_where_a_tenth_of_scenes_always_has_the_event(n):
     """10 seeds; 5 % in the other scenes, so that the truth is 14.5 %; the baseline has none."""
     rng = np.random.Generator(np.random.Philox(n))

@@ -89,13 +89,6 @@ def test_one_rollout_has_a_mean_and_no_interval_and_says_why():
     assert found["ci95_clustered_reason"] == "needs at least two scenes, found 1"
 
 
-def test_many_seeds_of_one_scene_have_the_papers_interval_but_no_clustered_one():
-    found = entry([[1.0, 2.0, 3.0]])
-    assert found["ci95"] == pytest.approx(1.96 / np.sqrt(3))
-    assert found["ci95_clustered"] is None
-    assert found["ci95_clustered_reason"] == "needs at least two scenes, found 1"
-
-
 def test_a_rate_of_zero_gets_exact_bounds_over_scenes():
     found = entry([[0.0, 0.0]] * 10, "collision_at_fault")
     assert (found["mean"], found["ci95"], found["n_events"]) == (0.0, 0.0, 0)
@@ -113,7 +106,7 @@ def test_no_interval_of_a_sample_is_without_width():
         assert high - low > 0.7, metric
 
 
-@pytest.mark.parametrize("scenes", [3, 6, 12, 20, 60])
+@pytest.mark.parametrize("scenes", [3, 12, 60])
 def test_means_whose_rare_scenes_were_not_drawn_are_covered(scenes):
     """One drive in ten stops early; one in fifty is 3 m beside the path."""
     rng = np.random.Generator(np.random.Philox(scenes))
@@ -211,12 +204,6 @@ def test_no_difference_at_all_has_p_one_and_is_non_inferior_once_the_scenes_coul
         )
 
 
-def test_equal_differences_have_no_spread_and_take_the_sign_test():
-    found = pair([[0.0]] * 4, [[0.5]] * 4)
-    assert found["p_value"] == pytest.approx(2 * 0.5**4)
-    assert found["verdict"] == "undecided"
-
-
 def test_cells_that_one_side_lacks_are_left_out_and_counted():
     found = pair([[1.0, 2.0], [3.0, None]], [[2.0, None], [4.0, 9.0]])
     assert (found["diff"], found["n_cells"], found["n_missing"]) == (1.0, 2, 2)
@@ -306,14 +293,14 @@ def test_exact_bounds_agree_with_scipy():
         assert exact_rate(k, n) == pytest.approx((want.low, want.high))
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_coverage_of_the_clustered_interval_and_under_coverage_of_the_papers(correlation):
     """60 scenes x 5 seeds, probit scene effect, true rate 10 %."""
     rng = np.random.Generator(np.random.Philox(int(correlation * 10)))
     scenes = [f"s{i:02d}" for i in range(60) for _ in range(5)]
     threshold = stats.norm.ppf(0.1)
     naive = by_scene = 0
-    repeats = 600
+    repeats = 300
     for _ in range(repeats):
         effect = np.repeat(rng.normal(0, np.sqrt(correlation), 60), 5)
         hits = (effect + rng.normal(0, np.sqrt(1 - correlation), 300) < threshold).astype(float)

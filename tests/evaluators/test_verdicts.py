@@ -202,7 +202,7 @@ def test_what_differs_on_these_scenes_is_shown_by_their_signs_whatever_others_ma
     assert rounded["p_value"] == 1.0
 
 
-@pytest.mark.parametrize("scenes", [7, 20, 60])
+@pytest.mark.parametrize("scenes", [7, 60])
 def test_variants_that_are_alike_differ_in_one_run_of_twenty_whatever_their_tails(scenes):
     rng = np.random.Generator(np.random.Philox(scenes))
     draws = [rng.standard_cauchy(scenes) for _ in range(300)]

@@ -233,17 +233,6 @@ def test_a_pose_of_kitti_belongs_to_the_number_of_a_photograph(tmp_path):
         read_source(folder)
 
 
-def test_a_part_of_kitti_keeps_the_numbers_of_the_whole(tmp_path):
-    folder = kitti(tmp_path / "a", row("P2", 180))
-    for path in (folder / "image_2").iterdir():
-        path.rename(path.with_stem(f"{100 + int(path.stem):06d}"))
-    (folder / "image_2/000103.png").unlink()
-    assert along(read_source(folder)) == [round(STEP_M * i, 3) for i in (0, 1, 2, 4, 5, 6, 7)]
-    (folder / "image_2/000107.png").unlink()
-    with pytest.raises(InputError, match="6 photographs and 8 poses"):
-        read_source(folder)
-
-
 def two_cameras(folder, names, form):
     """Write a drive of two cameras at one place, without times; the side one's names by number."""
     photographs = [

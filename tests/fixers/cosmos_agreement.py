@@ -9,8 +9,6 @@ one colour, so that ours are drawn solid for the comparison.
 The clip is of Cosmos-Drive-Dreams (CC-BY-4.0, (c) NVIDIA).
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass, replace

@@ -103,21 +103,6 @@ def test_every_degree_survives_a_round_trip(tmp_path, k):
     assert_allclose(back.opacities, cloud.opacities, rtol=5e-7)
 
 
-def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path):
-    cloud = make_cloud(n=1)
-    sh = np.zeros((1, 16, 3), np.float32)
-    sh[0, 3, 0] = 0.75  # third coefficient beyond the constant, red
-    rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
-    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == [
-        "f_rest_2"
-    ]
-    sh[0, 3] = 0, 0.75, 0
-    rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
-    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == [
-        "f_rest_17"
-    ]
-
-
 def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path):
     names = [*NAMES, *(f"f_rest_{i}" for i in range(9))]
     row = np.zeros((1, len(names)))

@@ -56,18 +56,22 @@ def moved(cloud, offset):
 
 
 # The kernels are interpreted: of cases that take the same branches one is tried in every run.
-LONG = {
-    (name, 0.0) for name in ("constant colours", "harmonics of degree 1", "needle of 10 pixels")
-}
-LONG |= {(name, MIP_PX2) for name in HARD} - {
-    (name, MIP_PX2) for name in ("all shapes", "zero scale", "needle of 1,000 pixels")
-}
+QUICK = {
+    (name, 0.0)
+    for name in (
+        "no Gaussian",
+        "saturated layers",
+        "kilometre splats",
+        "centre behind",
+        "far off axis",
+    )
+} | {(name, MIP_PX2) for name in ("all shapes", "zero scale", "needle of 1,000 pixels")}
 
 
 @pytest.mark.parametrize(
     ("name", "antialias_px2"),
     [
-        pytest.param(*case, marks=[pytest.mark.slow] if case in LONG else [])
+        pytest.param(*case, marks=[] if case in QUICK else [pytest.mark.slow])
         for case in product(HARD, (0.0, MIP_PX2))
     ],
 )

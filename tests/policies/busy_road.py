@@ -1,7 +1,5 @@
 """A painted road with flat patches and with cuboids on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

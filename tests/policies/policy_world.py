@@ -1,7 +1,5 @@
 """Scenes and closed loops on painted roads, for tests of policies."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -34,7 +34,7 @@ from policies.learned_net import (
     save_net,
 )
 from policies.learned_views import DeviceView
-from policies.painted_road import Line, PaintedRoad, pinhole_camera
+from policies.painted_road import PaintedRoad, pinhole_camera
 from scenarios.load import load_scenario
 from tests.policies.policy_world import CAMERA, observe, scenario_with
 
@@ -61,19 +61,6 @@ def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera():
                 FRONT.horizon_row - FRONT.focal_px * ahead[2] / ahead[0],
             ]
             np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
-
-
-def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view():
-    road = PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0))
-    pose = ROAD.pose(0.0, 0.4)
-    views = []
-    sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
-    for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
-        views.append(level_view(road.image(camera, pose), camera)[24:60, 10:-10].astype(float))
-        assert level_view(road.image(camera, pose), camera).shape == (80, 192, 3)
-    for other in views[1:]:
-        assert np.abs(other - views[0]).mean() < 6.0
-        assert np.corrcoef(other.ravel(), views[0].ravel())[0, 1] > 0.95
 
 
 def test_views_meet_at_their_edges_and_a_missing_camera_is_named():
@@ -162,20 +149,6 @@ def seen():
 
 def policy_route():
     return scenario_with().route
-
-
-def test_shipped_weights_drive_as_they_did():
-    """The plans of the front camera's network, as recorded before it could have other views."""
-    policy = Learned(scenario_with())
-    policy.reset(3, policy_route())
-    plans = [policy.act(observation) for observation in seen()]
-    recorded = [
-        [16.1451, -0.2369, -0.0322],
-        [16.5639, -0.2533, -0.0336],
-        [17.2359, -0.3544, -0.0361],
-    ]
-    for plan, (x, y, yaw) in zip((plans[0], plans[6], plans[13]), recorded, strict=True):
-        np.testing.assert_allclose([*plan.xy[20], plan.yaw[20]], [x, y, yaw], atol=2e-3)
 
 
 def test_seeds_drive_differently_and_a_seed_alike():

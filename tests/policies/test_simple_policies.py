@@ -1,7 +1,5 @@
 """The policies that see nothing: exact poses, straight lines, routes; and names that are wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

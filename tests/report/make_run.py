@@ -2,8 +2,6 @@
 that the report can be tested alone.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Policies that fail in the ways a third party's might."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

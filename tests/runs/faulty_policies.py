@@ -1,7 +1,5 @@
 """Twenty policies with one fault each, for the page of a failure: what must stand first on it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -187,12 +187,6 @@ def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
-def test_one_and_two_workers_reach_the_same_decision(decided_run, tmp_path):
-    decide(tmp_path / "two", SAME, plan_of(), workers=2)
-    assert read_decision(tmp_path / "two") == read_decision(decided_run[0])
-
-
 @pytest.mark.parametrize(
     ("renderers", "policies", "baseline", "variants"),
     [

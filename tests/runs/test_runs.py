@@ -73,15 +73,9 @@ def comparable(root):
     return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
 
 
-@pytest.mark.parametrize(
-    "scenes",
-    [
-        ("smoke/straight",),
-        pytest.param(("smoke/straight", "smoke/lead_car"), marks=pytest.mark.slow),
-    ],
-)
 @pytest.mark.slow
-def test_one_and_two_workers_give_the_same_run(tmp_path, scenes):
+def test_one_and_two_workers_give_the_same_run(tmp_path):
+    scenes = ("smoke/straight", "smoke/lead_car")
     _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
     _, two = run(plan_of(scenes=scenes), tmp_path / "two", workers=2)
     assert one.results.count(("ok", False)) == two.results.count(("ok", False)) == 2 * len(scenes)

@@ -1,7 +1,5 @@
 """``simrun why``: the page that shows why a drive failed."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

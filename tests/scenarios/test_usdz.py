@@ -142,9 +142,7 @@ def test_map_data_comes_before_clipgt(tmp_path):
             )
         ),
         changed(metadata_dot_yaml=b"scene_id: [1"),
-        changed(metadata_dot_yaml=b"version: 1"),
         changed(metadata_dot_yaml=b"!!python/object/apply:os.system ['true']"),
-        changed(rig_trajectories_dot_json=b"{"),
         changed(rig_trajectories_dot_json=json.dumps(rig() | {"rig_trajectories": []}).encode()),
         changed(rig_trajectories_dot_json=json.dumps(rig(1)).encode()),
         changed(sequence_tracks_dot_json=json.dumps(sequence() | {"t": {}}).encode()),

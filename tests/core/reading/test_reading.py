@@ -2,8 +2,6 @@
 internals.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

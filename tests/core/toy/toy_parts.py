@@ -1,7 +1,5 @@
 """One part of every kind, as another package would bring them."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

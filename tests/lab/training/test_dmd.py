@@ -13,10 +13,8 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.distillation import ScoreNet
 from alpasim_plugin.lab.training.dmd import (
-    critic_loss,
     direction,
     generator_loss,
-    noised,
 )
 
 N = 4
@@ -87,27 +85,6 @@ def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the
     mean = torch.tensor(fake.mean, dtype=torch.float64, requires_grad=True)
     generator_loss(mean + fake.std * a, g).backward()
     assert float(mean.grad) == pytest.approx(float(g.mean()), rel=1e-9)
-
-
-def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student():
-    seen = []
-
-    def score(x, sigma):
-        seen.append(x)
-        return torch.zeros_like(x)
-
-    z = noise("z", 2, 2, 4, 2, 2).requires_grad_(True)
-    n = noise("n", 2, 2, 4, 2, 2)
-    sigma = torch.tensor([0.3, 0.6])
-    direction(score, score, z, n, sigma)
-    assert torch.equal(seen[0], seen[1])
-    assert_close(seen[0], noised(z, n, sigma))
-    weight = torch.tensor(0.5, requires_grad=True)
-    loss = critic_loss(lambda x, s: weight * x, z, n, sigma)
-    assert_close(loss, (0.5 * noised(z, n, sigma) - (n - z)).square().mean())
-    loss.backward()
-    assert z.grad is None
-    assert weight.grad is not None
 
 
 def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(
