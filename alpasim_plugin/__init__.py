@@ -5,8 +5,6 @@ The public functions are imported on first use, so that reading a log or a type 
 rasteriser.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -7,8 +7,6 @@ Example:
     ``metrics = aggregate(rows)``.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.lazy import lazy_names

@@ -2,8 +2,6 @@
 meet `evaluators.metrics`.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 its newest frame, and the way from a path and a wish for speed to a plan that a car can drive.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Drive from the pixels of one front camera: lane markings and obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -7,8 +7,6 @@ their covariance: the ego's own motion predicts them, every point of a marking n
 corrects them, and a frame with many points therefore counts for more than a frame with little.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From the estimated lane, route and obstacle to a plan: path, speed, and sampled alternatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 command in, trajectory out.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path

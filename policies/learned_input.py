@@ -2,8 +2,6 @@
 commands, computed from the shape of the route ahead.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

@@ -2,8 +2,6 @@
 heteroscedastic sigma.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

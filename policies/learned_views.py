@@ -1,7 +1,5 @@
 """What the learned policy's network receives, made of images as tensors where they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -7,8 +7,6 @@ it up to ``d h / (h - H)``. On the ground grid it is therefore a long patch that
 distance by the ground plane.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

@@ -3,8 +3,6 @@
 It needs no renderer, so a policy can be checked without a scene.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

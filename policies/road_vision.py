@@ -2,8 +2,6 @@
 mapping), and points of lane markings on it.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

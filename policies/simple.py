@@ -2,8 +2,6 @@
 pure pursuit of the route.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

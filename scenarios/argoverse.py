@@ -4,8 +4,6 @@ Formats and facts: the Argoverse 2 sensor data set (Wilson et al. 2021) and its 
 documentation. The data are licensed CC BY-NC-SA 4.0 and do not ship with this package.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path

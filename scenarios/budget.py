@@ -7,8 +7,6 @@ The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km
 sharp cameras lane markings, kerbs and road users once more for every halving of their cells.
 """
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np

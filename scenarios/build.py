@@ -2,8 +2,6 @@
 is on the road and clear of all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

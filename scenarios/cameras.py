@@ -2,8 +2,6 @@
 to `CameraSpec`, checked before anything is built.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ commonroad.in.tum.de). A file names no recorded ego: its planning problem asks f
 recorded vehicle takes that role, so that there is a human drive to compare with.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path

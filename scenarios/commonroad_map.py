@@ -1,7 +1,5 @@
 """Lanelets of a CommonRoad file (versions 2018b and 2020a) as a lane map."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter
 from dataclasses import replace

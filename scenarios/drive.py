@@ -6,8 +6,6 @@ OpenCV's. Photographs are the frames of the folder's ``transforms.json``: pinhol
 distortion, each with its time, camera and use.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 made once when a scene is loaded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ will enter the corridor within the next seconds (`yielding_acceleration`) and yi
 smoothly. Bends limit the speed; acceleration and jerk are bounded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ What is written to the calibration table of an AlpaSim scene are the pinholes th
 the f-theta lenses that AlpaSim's renderers expect.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 Only the part of the map around the route enters the scene.
 """
 
-from __future__ import annotations
-
 import difflib
 import itertools
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ segments, which leaves the lane's area as it is. The view so made is the form in
 exported and in which preset ``alpasim`` scores.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Ways along the lanes of a map: the shortest one between two places, or one that is drawn."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

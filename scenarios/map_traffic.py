@@ -6,8 +6,6 @@ a line to give way on one of them. Without a rule the vehicle is not placed; tho
 one another share their way.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

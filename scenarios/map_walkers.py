@@ -4,8 +4,6 @@ Behind a traffic light of the route they cross while it is red. Crosswalks near 
 empty: nobody knows when people there have green.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import shapely
 

@@ -7,8 +7,6 @@ scene's local frame by its geographic origin and the scene's pose on the earth.
 Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.usdz` reads the same roads by AlpaSim's rule instead.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections import Counter

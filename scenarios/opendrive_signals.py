@@ -4,8 +4,6 @@ lights. The lights of one controller (without one: of one road) are one group.
 Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

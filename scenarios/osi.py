@@ -6,8 +6,6 @@ the first message that has any; a lane of the type intersection is an area, thro
 of lanes that it joins gets a lane.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -7,8 +7,6 @@ Source: ASAM OSI 3.7, osi_groundtruth, osi_sensorview, osi_object, osi_lane, osi
 have a length of four bytes, little-endian, before each message.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path

@@ -4,8 +4,6 @@
 Every failure names the file, and every byte read enters one hash.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ together, the groups of a junction one after the other, and people cross a road 
 has red.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -2,8 +2,6 @@
 scenarios with seeds and overrides.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import os

@@ -1,7 +1,5 @@
 """Traffic of a built road: actors placed in lanes, scripted tracks, IDM followers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

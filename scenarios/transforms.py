@@ -5,8 +5,6 @@ Keys are those of Instant-NGP and nerfstudio, as in `gaussians.fit.photographs`,
 for all frames.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal, NotRequired
 

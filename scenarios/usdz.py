@@ -21,8 +21,6 @@ Where it departs from OpenDRIVE:
   with nearly the same middle the shorter one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

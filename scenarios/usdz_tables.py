@@ -11,8 +11,6 @@ that it indexes by column has no row. So a table without content gets one row th
 a link of a lane to no sign, a sign without an id, a stop line marked implicit.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

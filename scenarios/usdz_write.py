@@ -6,8 +6,6 @@ There is no reconstruction in it: AlpaSim's closed renderer cannot render it; ou
 service that needs only map, rig and tracks, can use it.
 """
 
-from __future__ import annotations
-
 import json
 import uuid
 import zipfile

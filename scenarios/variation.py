@@ -4,8 +4,6 @@ Every drawn number has its own stream, keyed by scene, seed and the number's key
 actor does not change the others.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Sequence

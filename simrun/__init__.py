@@ -2,8 +2,6 @@
 no rasteriser and no torch.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from alpasim_plugin import __version__

@@ -19,8 +19,6 @@ first ``sink`` latents of the rollout (attention sink); the own block is always 
 the window is smaller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

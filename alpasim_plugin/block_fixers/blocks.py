@@ -4,8 +4,6 @@ A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(
 + shift)`` where ``(shift, scale, gate) = B A SiLU(e) + lora`` depends on time only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch.nn.functional as F

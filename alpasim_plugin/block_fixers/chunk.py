@@ -2,8 +2,6 @@
 end of each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ Padding is explicit: `pad_clip` repeats the last frame and the right and bottom 
 the size to crop to after decoding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ values are published with that autoencoder; LightVAE and the tiny decoders share
 and therefore its statistics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

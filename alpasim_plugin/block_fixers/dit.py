@@ -12,8 +12,6 @@ operations are those of OmniDreams single view (the causal student of Cosmos-Pre
 checkpoints load; docs/fixers.md lists them.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Blocks through random networks of a fixer's sizes: to be counted, or timed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -11,8 +11,6 @@ A block is a series of forwards at one position: `begin` opens or reopens it, `a
 layer, `commit` keeps the keys and values of the last forward and advances.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import torch

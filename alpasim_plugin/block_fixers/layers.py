@@ -13,8 +13,6 @@ feeds the modulation layers directly, while the two-layer map of the raw sinusoi
 term that all modulation layers share.
 """
 
-from __future__ import annotations
-
 import math
 from typing import cast
 

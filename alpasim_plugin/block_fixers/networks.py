@@ -4,8 +4,6 @@ In bf16 the token stream and the linear layers have that type; the time embeddin
 modulation, the rotary angles and the arithmetic inside norms stay float32.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -6,8 +6,6 @@ and returned as frames. The session holds the history: the pipeline's state, and
 every camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

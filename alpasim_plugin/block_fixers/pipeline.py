@@ -5,8 +5,6 @@ A run leaves the history unchanged: it may be repeated from the same state, with
 number of times. `BlockPipeline.keep` adds the last run's result to the history.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ differentiable. The cache write at t = 128 is after the shift of the schedule: i
 that of the nearest entry in the table (0.12993; OmniDreams' self-forcing sampler).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Sizes of the causal transformer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

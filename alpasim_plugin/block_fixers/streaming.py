@@ -15,8 +15,6 @@ Whole-clip and streaming interface of the video codecs, over their pure step fun
 and `decode_next`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Any

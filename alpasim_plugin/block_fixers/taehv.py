@@ -11,8 +11,6 @@ choice gives a washed-out image, so the caller must state it.
 Source: madebyollin/taehv ``taehv.py``; ModelTC/LightX2V ``vae_tiny.py`` for the scaling.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Self
 

@@ -22,8 +22,6 @@ Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times
     one frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Self

@@ -5,8 +5,6 @@ latents belong together. An encoder stream takes the first frame, alone or with 
 it, and groups of 4 afterwards; a decoder stream takes any number of latents.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Self
 

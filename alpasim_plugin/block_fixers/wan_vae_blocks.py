@@ -7,8 +7,6 @@ processed in groups.
 Source: Wan 2.1 ``wan/modules/vae.py`` (graph, keys, cache rules).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

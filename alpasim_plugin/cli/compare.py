@@ -1,7 +1,5 @@
 """``simrun compare``: means and paired differences within a run, between two runs, or over shards."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``simrun docs``: the pages of the documentation, which travel with the program."""
 
-from __future__ import annotations
-
 import difflib
 import os
 import sys

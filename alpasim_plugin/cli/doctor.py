@@ -1,7 +1,5 @@
 """``simrun doctor``: check that this machine can run each part."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """``simrun export``: runs and rollouts for AlpaSim's evaluation, Foxglove and Rerun."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``simrun fork``: continue a logged rollout with another part."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

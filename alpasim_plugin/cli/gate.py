@@ -1,7 +1,5 @@
 """``simrun gate``: test a run against margins and limits; the exit code is the verdict."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

@@ -1,7 +1,5 @@
 """``simrun import``: make a scenario of a recorded drive, or of a trained model."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

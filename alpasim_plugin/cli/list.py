@@ -3,8 +3,6 @@
 What a kind needs is imported where it is listed, so that a short list loads no numerical library.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 

@@ -1,7 +1,5 @@
 """``simrun list runs``: run folders with their verdicts, filtered."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path

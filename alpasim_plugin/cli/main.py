@@ -5,8 +5,6 @@ Only light modules are imported here. A verb's module is imported when the verb 
 torch, which takes seconds to load.
 """
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import errno

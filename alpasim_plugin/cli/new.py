@@ -1,7 +1,5 @@
 """``simrun new``: write a part or a scenario that works, with its test, to begin from."""
 
-from __future__ import annotations
-
 import keyword
 import os
 import re

@@ -2,8 +2,6 @@
 as an annotated parameter of a verb.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

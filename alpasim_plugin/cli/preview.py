@@ -2,8 +2,6 @@
 the recorded path.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path

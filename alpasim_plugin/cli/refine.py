@@ -1,7 +1,5 @@
 """``simrun refine``: apply a fixer to a video file or a folder of images."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

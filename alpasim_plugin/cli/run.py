@@ -1,7 +1,5 @@
 """``simrun [run]``: drive scenarios behind renderers and tabulate the results."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """``simrun score``: score rollout logs again without rendering."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

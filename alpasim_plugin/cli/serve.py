@@ -1,7 +1,5 @@
 """``simrun serve``: AlpaSim's renderer endpoint, or a policy as an AlpaSim driver."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Sequence

@@ -2,8 +2,6 @@
 the exit code names the signal.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

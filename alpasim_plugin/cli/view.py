@@ -2,8 +2,6 @@
 run's report again from its tables.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Sequence

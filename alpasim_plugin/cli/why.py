@@ -1,7 +1,5 @@
 """``simrun why``: the page of evidence for a rollout that failed, made of what its run stored."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Annotated

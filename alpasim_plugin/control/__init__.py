@@ -1,7 +1,5 @@
 """Vehicle and controllers: from a plan to motion."""
 
-from __future__ import annotations
-
 from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Vehicle

@@ -13,8 +13,6 @@ longer and follows a wider curve, but does not spin. Otherwise tyre slip is left
 keeps its commands where that is fair (`tracker.MAX_LATERAL_MPS2`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ Which message and signal of a database carries which quantity stands in a map, o
 a DBC. Nothing of a frame is trusted before all checks have passed.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ unit's commands come in, and a kinematic bicycle moves on by one bus period. The
 motion, continued under the last commands, and the ego follows it exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

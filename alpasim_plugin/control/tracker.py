@@ -14,8 +14,6 @@ Control, 1990, section 6.1): no oscillation at any speed.
 Speed is the constant acceleration that best meets the planned progress over the next 0.8 s.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Errors of parts: the part that they are blamed on, and the line of the user's code."""
 
-from __future__ import annotations
-
 import os
 import re
 import sysconfig

@@ -4,8 +4,6 @@ CACHE / KIND / KEY/        what was made; it appears atomically
              / KEY.lock     held by the process that makes it
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

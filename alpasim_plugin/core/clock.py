@@ -1,7 +1,5 @@
 """The integer-microsecond clock of a rollout."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

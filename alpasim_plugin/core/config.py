@@ -7,8 +7,6 @@ integers. Duplicate keys, merge keys, tags, recursive aliases and numbers that a
 refused.
 """
 
-from __future__ import annotations
-
 import copy
 import difflib
 import json

@@ -1,7 +1,5 @@
 """How fine a street is built for cameras with many pixels per radian."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.types import Scenario

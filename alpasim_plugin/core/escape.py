@@ -4,8 +4,6 @@ Markdown, XML.
 HTML is escaped by the report's template engine. None of these functions changes plain words.
 """
 
-from __future__ import annotations
-
 import re
 
 MAX_PART = 600  # characters of the message of an error, and of its hint

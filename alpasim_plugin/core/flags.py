@@ -2,8 +2,6 @@
 which the options are made.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

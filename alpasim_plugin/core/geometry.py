@@ -5,8 +5,6 @@ Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; a
 lengths metres.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

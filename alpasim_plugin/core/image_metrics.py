@@ -6,8 +6,6 @@ window 11x11 with sigma 1.5, biased moments, zeros beyond the border, per channe
 over pixels and channels. Other conventions differ by up to 0.005 on one pair of images.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

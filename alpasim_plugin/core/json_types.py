@@ -1,7 +1,5 @@
 """The type of what is read from and written to JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

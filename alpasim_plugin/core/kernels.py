@@ -2,8 +2,6 @@
 other threads.
 """
 
-from __future__ import annotations
-
 from numba import njit
 
 kernel = njit(cache=True, nogil=True)

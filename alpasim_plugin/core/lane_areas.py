@@ -2,8 +2,6 @@
 policy needs no shapely.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

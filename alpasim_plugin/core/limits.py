@@ -5,8 +5,6 @@ What a scene may cost as a whole
 is in `scenarios.budget`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 ends, however it ends.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import stat

@@ -1,7 +1,5 @@
 """The vector map of a scene; see `alpasim_plugin.core.types` for the conventions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """What a metric is, in one object."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal

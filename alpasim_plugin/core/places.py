@@ -7,8 +7,6 @@ Kernels are pickles, which run code when they are read. So a folder that nobody 
 user's own: ``sudo`` leaves the home of another user in the environment.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import shutil

@@ -4,8 +4,6 @@ and a scenario that says nothing.
 A policy may return anything; nothing here assumes more than an object.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

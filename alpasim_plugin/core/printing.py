@@ -2,8 +2,6 @@
 act or looks like a line of its own.
 """
 
-from __future__ import annotations
-
 import sys
 
 from alpasim_plugin.core.escape import terminal

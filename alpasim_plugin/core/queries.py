@@ -1,7 +1,5 @@
 """Options behind a question mark, as in ``HOST:PORT?timeout_s=5``."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from urllib.parse import parse_qsl
 

@@ -7,8 +7,6 @@ differences. A scene at several values of a parameter keeps its streams: the val
 part of the key.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 

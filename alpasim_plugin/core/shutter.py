@@ -9,8 +9,6 @@ open needs as many bands, a vehicle that stands needs one. Who draws bands draws
 bands as rows each row has its own pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -5,8 +5,6 @@ Standard output belongs to the command: what parts print goes to standard error,
 stays one document. In a run it also goes to a file beside the rollout's log.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import multiprocessing

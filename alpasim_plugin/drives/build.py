@@ -2,8 +2,6 @@
 Read `import_drive` downwards.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -5,8 +5,6 @@ Lengths are in units of the camera's height above the ground, which the points t
 first, so that the fit needs no metre.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ axes of OpenCV; a row of ``calib.txt`` is the projection K [I | t] of a camera, 
 one.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

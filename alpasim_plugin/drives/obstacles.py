@@ -6,8 +6,6 @@ the recorded car drove through is free by that fact; opaque Gaussians there are 
 are left out, and are counted.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From a folder or file to the drive in it: which of the known forms it has."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace

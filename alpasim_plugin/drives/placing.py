@@ -1,7 +1,5 @@
 """Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

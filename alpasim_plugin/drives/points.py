@@ -6,8 +6,6 @@ the plane of the road ahead; what is left is a shift of a few pixels, which opti
 asphalt too; undoing the warp gives rays, and the rays give points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

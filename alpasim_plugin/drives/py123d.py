@@ -8,8 +8,6 @@ the film beside the file. Read are the ego's poses, pinhole cameras and boxes of
 Source: the writers of py123d 0.7.0 (github.com/kesai-labs/py123d).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Make a scenario of a trained model of Gaussians, and of the poses of a drive through it."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

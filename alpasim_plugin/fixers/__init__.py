@@ -1,7 +1,5 @@
 """Fixers, by name: what repairs a rendered frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

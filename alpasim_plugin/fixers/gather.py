@@ -7,8 +7,6 @@ Equal to `network.pixel_generator.TORCH` to rounding, on float32 tensors without
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 from itertools import product
 
 import cv2

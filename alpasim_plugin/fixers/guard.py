@@ -7,8 +7,6 @@ something (a lane line, a road user), or where the last output already showed ne
 generator draws now. Elsewhere an opaque render is better evidence than a guess.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The frames of a lens, joined of those of its pinholes where these were drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

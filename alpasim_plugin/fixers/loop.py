@@ -5,8 +5,6 @@ A fixer of single frames fixes each frame as it is rendered. How the loop calls 
 a mode, which the package that holds it registers in the entry-point group ``simrun.fixer_modes``.
 """
 
-from __future__ import annotations
-
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence

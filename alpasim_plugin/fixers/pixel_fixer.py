@@ -6,8 +6,6 @@ camera, every frame guarded.
 cameras are a batch. On a GPU it waits for nothing, and is recorded as a graph.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

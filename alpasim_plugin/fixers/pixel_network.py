@@ -1,7 +1,5 @@
 """The generator in pixels from its weights, or untrained; loaded once per process."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

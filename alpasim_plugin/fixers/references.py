@@ -11,8 +11,6 @@ time are references as well, unless ``past`` asks for earlier ones alone. Nothin
 own future is looked at.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

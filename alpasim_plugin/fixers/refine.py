@@ -1,7 +1,5 @@
 """Run a fixer over a stream of frames of one camera: any length, constant memory, timed."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """3D Gaussians: clouds, files, cameras and rasterisers."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.lazy import lazy_names

@@ -6,8 +6,6 @@ their decimal value, also in float64 code: whether a second saturated layer is d
 0.99)**2 <= 1e-4``, which is true in float32 and false in float64.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

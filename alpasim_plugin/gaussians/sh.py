@@ -5,8 +5,6 @@ The basis (order k = 0 | -1, 0, 1 | -2..2 | -3..3) is orthonormal over the unit 
 constants are square roots of rationals over pi.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -4,8 +4,6 @@
 Needs the extra ``gym``. See docs/policies.md.
 """
 
-from __future__ import annotations
-
 from alpasim_plugin.core.errors import InputError
 
 try:

@@ -1,7 +1,5 @@
 """Reward and termination of a step, from the evaluators that score runs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Rollout logs: AlpaSim's ASL format, camera images, videos and our own side facts."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.lazy import lazy_names

@@ -2,8 +2,6 @@
 maps, boxes and lines.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Encode and decode the camera images of a log."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import cv2

@@ -4,8 +4,6 @@ Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpi
 unstructured debug bytes stay unread.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ Poses are float32 on the wire: metres keep 1 mm up to about 8 km from the local 
 must use a local origin. Times are integer microseconds in 64 bits and exact.
 """
 
-from __future__ import annotations
-
 import hashlib
 import uuid
 from collections.abc import Iterable, Mapping, Sequence

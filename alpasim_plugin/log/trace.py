@@ -1,7 +1,5 @@
 """Digests of a rollout by component and time, and the first difference of two rollouts."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Mapping

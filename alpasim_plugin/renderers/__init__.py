@@ -1,7 +1,5 @@
 """From a scene and a camera pose to a frame."""
 
-from __future__ import annotations
-
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Scenario

@@ -5,8 +5,6 @@ the drive.
 path near it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Each renders the clean scene and corrupts the frame, or renders it from a wrong 
 frame carries (time, alpha, depth) stays as a fault in a real pipeline would leave it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace

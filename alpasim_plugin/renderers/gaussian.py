@@ -4,8 +4,6 @@ A frame is drawn at the shutter's end, unless its request says when its pixels a
 (`renderers.rolling`).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial

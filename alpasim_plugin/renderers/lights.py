@@ -4,8 +4,6 @@ A lamp lights what is around it by its intensity over the square of the distance
 shadow. What is seen of it is a spot of one colour, which depth hides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

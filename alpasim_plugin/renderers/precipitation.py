@@ -2,8 +2,6 @@
 wet.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -10,8 +10,6 @@ it shows the sky and no hole, and its depth is 0, because the sky has none. Colo
 that the recording's camera had near by: frames look as the drive's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ The fit starts from poses that drift and from the depth of a few views, wrong by
 matching images gives both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path

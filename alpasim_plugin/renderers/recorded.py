@@ -7,8 +7,6 @@ scene itself, twice a second. The poses are those that the reconstruction believ
 of its registration, so a recorded frame is no better placed than a user's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path

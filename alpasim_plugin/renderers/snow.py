@@ -1,7 +1,5 @@
 """Snow that lies on the ground: thick beside the road, thin on lanes, least in the tracks of wheels."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """An image's depth as directions and distances from the camera, and what of it is ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

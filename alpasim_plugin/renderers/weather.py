@@ -9,8 +9,6 @@ the pixel's ray. Of fog ``beta = 3.912 / visibility``: at the visibility, 2 % of
 is seen (`alpasim_plugin.renderers.snow`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """When the policy is queried, and which frames are rendered for it: only those that it uses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice

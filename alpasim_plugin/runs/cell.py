@@ -1,7 +1,5 @@
 """One cell of a run: build its parts, drive, score, write. Runs in a worker process."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

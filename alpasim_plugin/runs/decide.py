@@ -5,8 +5,6 @@ alone (`evaluators.statistics.decision`), and so does what is driven next: never
 interruptions. The same command therefore reaches the same decision after any kill.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path

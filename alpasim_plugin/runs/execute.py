@@ -6,8 +6,6 @@ seed, component, step) and the rasteriser is bit-equal for any number of threads
 therefore run rollouts in any order.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence

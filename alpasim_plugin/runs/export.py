@@ -9,8 +9,6 @@ The logs are copied entry by entry. What differs: the main camera is called as A
 expects it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

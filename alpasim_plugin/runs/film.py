@@ -2,8 +2,6 @@
 rendered afterwards, at the logged poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path

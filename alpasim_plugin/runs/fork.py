@@ -11,8 +11,6 @@ renders every request, unless it has none, and a policy gets every query. Their 
 instant are discarded.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

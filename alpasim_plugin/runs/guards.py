@@ -1,7 +1,5 @@
 """Checks of what renderers and policies return; an error names the part that broke its contract."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -2,8 +2,6 @@
 the loop see the lens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

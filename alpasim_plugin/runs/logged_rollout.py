@@ -1,7 +1,5 @@
 """Find a finished rollout of an earlier run by name, with everything needed to replay it."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace

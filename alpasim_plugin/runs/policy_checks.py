@@ -1,7 +1,5 @@
 """Check the user's policies before a run drives, for the pages of its failures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial

@@ -1,7 +1,5 @@
 """What a run folder says of its making: versions, machine and source."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

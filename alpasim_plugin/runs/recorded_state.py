@@ -1,7 +1,5 @@
 """The ego's state at any time of a recorded drive: motion read off its poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -5,8 +5,6 @@ The messages have Foxglove's schemas (https://docs.foxglove.dev/docs/sdk/schemas
 without generated classes. Positions are world metres, times are microseconds of the log.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -6,8 +6,6 @@ complete. A folder of PNG images may stand in the place of a video: no codec bet
 what is made of it.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping

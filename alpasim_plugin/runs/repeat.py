@@ -1,7 +1,5 @@
 """Drive a rollout of each policy a second time, to see whether it is repeatable."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The reports of a run folder, written together, and what they show of outcomes that flipped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from alpasim_plugin.core.atomic import write_bytes, write_json

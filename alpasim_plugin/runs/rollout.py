@@ -2,8 +2,6 @@
 tick.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Generator, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """A whole run: execute, tabulate, report. The same command continues an interrupted run."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Sequence

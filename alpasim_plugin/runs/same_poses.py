@@ -1,7 +1,5 @@
 """Store what the other renderers of a run show at the last poses of its first failures."""
 
-from __future__ import annotations
-
 import base64
 import os
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Score logs into a run folder: run.json, the tables, the reports, and AlpaSim's aggregation."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Score one rollout from its log and flatten the result for the tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

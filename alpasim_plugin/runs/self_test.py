@@ -1,7 +1,5 @@
 """The self-test of a gate: drive renderers with a known fault and see whether the gate catches each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -2,8 +2,6 @@
 manifests and tables.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Make the tables of a run folder again from its rollouts, for a command that reads them."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Callable, Mapping

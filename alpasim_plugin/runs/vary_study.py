@@ -2,8 +2,6 @@
 of `evaluators.statistics.boundary_area` asks for next.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import optuna

@@ -2,8 +2,6 @@
 border.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy
 

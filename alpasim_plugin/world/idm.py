@@ -5,8 +5,6 @@ Source: M. Treiber, A. Hennecke, D. Helbing, "Congested traffic states in empiri
 Physical Review E 62 (2000), equations 2 and 3.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ it knows. A line that nobody has seen is not drawn. Where the road itself is bui
 markings are a choice, and `with_default_markings` makes it before anything is drawn.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

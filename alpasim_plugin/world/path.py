@@ -2,8 +2,6 @@
 curvature and fast projection onto them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

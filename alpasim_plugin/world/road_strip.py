@@ -5,8 +5,6 @@ The cross-section and the elements follow one another along the ego's way. A tap
 which the rightmost forward lane ends or a new one opens.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Literal
 

@@ -5,8 +5,6 @@ carried on past its end.
 made with it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

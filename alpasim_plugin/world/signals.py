@@ -2,8 +2,6 @@
 one that is red, or at which others come.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

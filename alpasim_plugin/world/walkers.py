@@ -1,7 +1,5 @@
 """Road users on a track who wait for the ego where they would walk into its way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ over sweeps. That spread is neither a scene-to-scene spread nor a confidence int
 recorded path was driven.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

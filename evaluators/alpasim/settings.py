@@ -1,7 +1,5 @@
 """AlpaSim's evaluation settings (``eval-config.yaml``) and the preset that they stand for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

@@ -6,8 +6,6 @@ At fault is front or lateral, or what nuPlan calls so. By the paper's protocol o
 (`evaluators.metrics.contact`), and a row then says what happened since the row before.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -15,8 +15,6 @@ before lateral. Contact that is there from the start, or from an actor's first l
 first touch; its normal is the shortest way out of the overlap.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

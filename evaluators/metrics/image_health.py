@@ -4,8 +4,6 @@ Both are the renderer's failure. They are counted; only some presets drop the ro
 image.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.image_metrics import is_black

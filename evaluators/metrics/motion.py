@@ -6,8 +6,6 @@ responsibility-sensitive safety: Shalev-Shwartz et al., "On a formal model of sa
 self-driving cars", definition 1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene

@@ -13,8 +13,6 @@ Preset ``strict`` measures by how much the footprint leaves the drivable surface
 (`evaluators.metrics.surface`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Plans are rig poses; for the metrics they are moved to the box centre. All error
 One row per policy query, at its time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ quirks, and `strict` is what we hold to be right. A preset only selects; the eva
 code of each choice.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any, Literal

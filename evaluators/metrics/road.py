@@ -3,8 +3,6 @@
 Areas and unions are built where a rollout comes, and kept for the next rollout.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from functools import cached_property

@@ -11,8 +11,6 @@ to the box centre with the log's rig-to-box pose. All distances are in plan view
 distance is the mean over the scored steps of the distance to that path.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What every view from above draws of a scene: its map, and the direction of the logged drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Files for a CI service: summary.md and junit.xml of a run, and the same of a gate."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

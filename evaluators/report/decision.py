@@ -2,8 +2,6 @@
 the report.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.json_types import JsonObject

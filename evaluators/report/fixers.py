@@ -1,7 +1,5 @@
 """What a reader must know of the fixers of a run, and how fast the run was."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from alpasim_plugin.core.json_types import JsonView

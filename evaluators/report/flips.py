@@ -1,7 +1,5 @@
 """The rollouts whose outcome differs from the baseline's, with both images when the plans part."""
 
-from __future__ import annotations
-
 import base64
 import os
 from collections.abc import Sequence

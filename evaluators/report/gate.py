@@ -2,8 +2,6 @@
 report: baseline, every check, the worst scenes first.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

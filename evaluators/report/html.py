@@ -1,7 +1,5 @@
 """Write ``report.html``: one file that opens from disk without a network."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -6,8 +6,6 @@ A difference is called what the paired comparison says and its correction for se
 (`evaluators.statistics.verdicts`) leaves; nothing is tested here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal

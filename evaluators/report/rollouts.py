@@ -6,8 +6,6 @@ one compressed block of columns; a row of HTML each would take ten times the roo
 rounded to four digits, which the tables of the run are not.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

@@ -2,8 +2,6 @@
 found below a folder.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping, Sequence

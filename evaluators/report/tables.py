@@ -1,7 +1,5 @@
 """Turn a run into table rows: text, order and hover text, without markup."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 worth trying.
 """
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from textwrap import wrap

@@ -6,8 +6,6 @@ nuplan-devkit. All angles are radians, all lengths metres; what the devkit calls
 road user.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

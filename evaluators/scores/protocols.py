@@ -6,8 +6,6 @@ decide it; its least and its greatest possible value are always given. What each
 and how far our logs go is in docs/metrics.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 direction, comfort.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

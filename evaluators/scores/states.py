@@ -5,8 +5,6 @@ A log holds poses. Velocity is their central difference, acceleration its differ
 axes of the vehicle; whoever has measured ones gives them instead.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -2,8 +2,6 @@
 `evaluators.scores.protocols`.
 """
 
-from __future__ import annotations
-
 from alpasim_plugin.core.metric_types import MetricInfo
 
 _FAULT = "no contact at fault; one with an object costs a half"

@@ -1,7 +1,5 @@
 """Paired differences within a run, or between two runs on the rollouts that both have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from alpasim_plugin.core.errors import InputError

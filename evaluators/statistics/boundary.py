@@ -7,8 +7,6 @@ reaches from the first change to the last. Over seeds the boundary is the mean o
 Student's interval widened by half a bracket.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

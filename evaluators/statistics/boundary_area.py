@@ -9,8 +9,6 @@ Points behind the staircases test the rule. Where outcomes contradict each other
 so many steps beyond its point that it contradicts no claim and no outcome.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

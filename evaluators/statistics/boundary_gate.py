@@ -1,7 +1,5 @@
 """A gate on boundaries: how much more of a parameter's range may fail than with the baseline."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError

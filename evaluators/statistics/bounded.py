@@ -15,8 +15,6 @@ of Statistics 14, 2005; Learned-Miller and Thomas, A new confidence interval for
 bounded random variable, arXiv:1905.06208.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

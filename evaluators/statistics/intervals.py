@@ -6,8 +6,6 @@ does not exist is None and comes with a reason. The measured coverage of each is
 docs/experiments/verdict-error.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """How the rollouts of a run ended, counted by variant, with where and when."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -7,8 +7,6 @@ collision event are dropped, the event's own step stays; flags are reduced by th
 metrics as they say themselves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 report and the terminal.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from alpasim_plugin.core.json_types import JsonView

@@ -9,8 +9,6 @@ Resampling-based multiple testing, 1993), and so are all other metrics; the two 
 that six new events and none gone are just enough.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

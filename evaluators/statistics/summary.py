@@ -2,8 +2,6 @@
 with the bounds that this allows.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

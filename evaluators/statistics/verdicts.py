@@ -2,8 +2,6 @@
 of a run with its exit code.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

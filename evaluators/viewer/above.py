@@ -2,8 +2,6 @@
 draws as the replay draws its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@ it ended, what the policy saw, planned and said of itself, what other renderers 
 poses, where plans part, and what to ask next.
 """
 
-from __future__ import annotations
-
 import base64
 import shlex
 from bisect import bisect_right

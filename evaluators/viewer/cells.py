@@ -4,8 +4,6 @@ and one document for each cell.
 Changed outcomes come first, then events, then a few quiet ones, the most different drives first.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections import Counter

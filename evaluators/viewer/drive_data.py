@@ -2,8 +2,6 @@
 what moves and happens in a rollout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 failed, and a variant that repairs it, side by side.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ The wire messages, the client and the presets are copied under the distribution'
 so that it can be installed where this project is not, beside AlpaSim's packages.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

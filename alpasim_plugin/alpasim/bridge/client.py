@@ -2,8 +2,6 @@
 environment, before a long run.
 """
 
-from __future__ import annotations
-
 import sys
 
 import grpc

@@ -9,8 +9,6 @@ The first egomotion message carries the whole recorded context, with true speeds
 own runtime sends zeros until it hands over.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import uuid

@@ -5,8 +5,6 @@ Each check gives a line: passed, failed, or not visible from outside. The sessio
 a real rollout of ours.
 """
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections.abc import Callable

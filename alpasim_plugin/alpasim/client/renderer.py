@@ -4,8 +4,6 @@
 The wire has no opacity and no depth, so a fixer takes every pixel as seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

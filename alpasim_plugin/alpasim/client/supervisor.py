@@ -7,8 +7,6 @@ on to its container), and SIGKILL after the grace time. The exit code is the com
 where signal N ended it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import select

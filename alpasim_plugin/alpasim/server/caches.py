@@ -3,8 +3,6 @@
 A fixer behind a service is a pure step from a past and a render to a frame and the next past.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections import OrderedDict

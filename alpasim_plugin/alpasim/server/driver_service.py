@@ -10,8 +10,6 @@ packages numpy, grpc, protobuf and OpenCV: the environment needs neither torch n
 holds it to that.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import threading

@@ -1,7 +1,5 @@
 """Answer render requests: find the frame or its past, render, fix, remember, encode."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Sequence

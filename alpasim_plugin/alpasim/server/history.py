@@ -19,8 +19,6 @@ Memory is bounded: what nobody used for `expiry_s` goes; beyond `max_bytes`, fir
 a successor, the longest unused first, then the ends of branches, the longest unused first.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from bisect import bisect_left, insort

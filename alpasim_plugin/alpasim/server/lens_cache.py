@@ -1,7 +1,5 @@
 """Keep what is computed of the lenses that callers name, up to a number of bytes."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable

@@ -16,8 +16,6 @@ markings. A blurred reconstruction keeps lane markings at their recorded pixels 
 moves sideways; a shift within `UNMOVED_M` of the camera's own lateral offset is therefore ignored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ NVIDIA's renderers do it. The row is that of the lens, so its pixels lie on a cu
 that covers the lens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from alpasim_plugin.alpasim.server.lens_cache import lenses

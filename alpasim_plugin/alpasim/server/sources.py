@@ -10,8 +10,6 @@ saw), and a mask lowers it further where it is dark:
     opacity(pixel) = min(path(distance), mask(pixel) / 255)
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ size is not that of the calibration, a pinhole scales per axis; an f-theta lens 
 point per axis and its polynomial by the mean of both factors, as AlpaSim's own overlay does.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

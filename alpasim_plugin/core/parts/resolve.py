@@ -2,8 +2,6 @@
 resolved part.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -5,8 +5,6 @@ A folder that is not installed is never on Python's path: only the file that was
 files that it imports beside it, can be imported.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import hashlib

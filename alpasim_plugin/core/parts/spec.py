@@ -2,8 +2,6 @@
 whether it is still the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json

@@ -15,8 +15,6 @@ Light modules only are imported here; `arrays`, `images` and `tables` are import
 used.
 """
 
-from __future__ import annotations
-
 from alpasim_plugin.core.reading.files import (
     check_regular,
     contents,

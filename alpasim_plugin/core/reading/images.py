@@ -2,8 +2,6 @@
 billions of pixels.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parquet tables: rows and bytes by their header, columns by type."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal

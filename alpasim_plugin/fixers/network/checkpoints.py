@@ -1,7 +1,5 @@
 """Read weights: safetensors, or pickles that hold only tensors."""
 
-from __future__ import annotations
-
 import io
 import pickle
 from collections.abc import Mapping, Sequence

@@ -10,8 +10,6 @@ frame that agrees with neither is misplaced: plane-sweeping stereo's photo-consi
 1996), learned.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -13,8 +13,6 @@ that fine texture does not pass through the U-Net. Every value of the noise in t
 function of rollout, camera, frame, step and pixel.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

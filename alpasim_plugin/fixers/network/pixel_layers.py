@@ -5,8 +5,6 @@ Images are ``(B, H, W, C)``: 2D convolutions of a CPU are fastest on them, a 1x1
 matrix product, and a cell of pixels becomes channels by copying contiguous runs.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

@@ -18,8 +18,6 @@ and the generator is the one without references. A warp that is wrong costs noth
 network gives it no weight.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

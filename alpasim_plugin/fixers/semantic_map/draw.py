@@ -8,8 +8,6 @@ Camera axes are x right, y down, z forward; pixel (row i, column j) covers colum
 rows i to i + 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any

@@ -3,8 +3,6 @@
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.kernels import kernel

@@ -13,8 +13,6 @@ A primitive is a stroke or a shape, for which see `kernels`, in `COLUMNS` column
 - 26 to 28: shade/depth of a shape, a plane as well
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

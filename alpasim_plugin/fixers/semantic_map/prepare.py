@@ -5,8 +5,6 @@ Which lines are lane markings is the rule of `world.markings`: marking lines and
 known kind, each once; unknown lane markings are not drawn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

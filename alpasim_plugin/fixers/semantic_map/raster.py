@@ -7,8 +7,6 @@ depend on the number of threads.
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.kernels import kernel

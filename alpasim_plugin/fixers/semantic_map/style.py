@@ -5,8 +5,6 @@ are defined at 1280 pixels of image width. They are measured in normalised coord
 line is H / W times as thick as a vertical one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 Rgb = tuple[int, int, int]

@@ -1,7 +1,5 @@
 """Open any supported Gaussian file by what it is, and report what cleaning dropped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError

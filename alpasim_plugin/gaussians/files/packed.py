@@ -7,8 +7,6 @@ of a 3DGS PLY are right-down-front; its reader turns the model into PLY axes, so
 both files lies in one place.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

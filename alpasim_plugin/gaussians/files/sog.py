@@ -6,8 +6,6 @@ out their largest component; scales and colours are entries of codebooks of 256;
 are shared by palette. Axes are those of a PLY.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import zipfile

@@ -2,8 +2,6 @@
 exposure), then the fit. See `fit_drive`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 downwards.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

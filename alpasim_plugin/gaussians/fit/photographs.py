@@ -19,8 +19,6 @@ Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera;
 names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ three blurs of closed forms. What depends on the target alone is computed once p
 through convolutions takes ten times as long on the CPU, where OpenCV blurs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -7,8 +7,6 @@ actor's frame and belong to it, as in Street Gaussians. Photographs without dept
 (SIFT).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

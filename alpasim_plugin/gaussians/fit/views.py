@@ -1,7 +1,5 @@
 """Hold posed views, and take them from a scene along a log."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 

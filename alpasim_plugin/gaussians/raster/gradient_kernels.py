@@ -17,8 +17,6 @@ whitened coordinates ``s, t`` of the exponent, which stay small for needles.
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 import numpy as np
 
 from alpasim_plugin.core.kernels import kernel

@@ -1,7 +1,5 @@
 """Precompute what does not depend on the camera, so that repeated frames cost only what changes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

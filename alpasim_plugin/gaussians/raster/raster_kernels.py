@@ -15,8 +15,6 @@ below 2e-6, without range reduction.
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.polynomial import chebyshev
 

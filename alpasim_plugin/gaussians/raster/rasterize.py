@@ -1,7 +1,5 @@
 """Render a Gaussian cloud with the backend of choice."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Literal
 

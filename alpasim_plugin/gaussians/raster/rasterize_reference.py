@@ -6,8 +6,6 @@ Splatting (2023), and the constants of `alpasim_plugin.gaussians.constants`; the
 antialiased models is that of Yu et al., Mip-Splatting (2024), equation 10.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ State of testing: the kernels are interpreted on the CPU against the reference i
 compiled for GPUs of compute capability 8.0 and 9.0; they have not been run on a GPU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

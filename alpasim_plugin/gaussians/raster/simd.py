@@ -14,8 +14,6 @@ Every operation takes a number in place of one of its vectors, which then stands
 # Numba's extension interface is untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator,misc,no-any-unimported"
 
-from __future__ import annotations
-
 import operator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Outlines of vehicles as shares of their box, and their skin of quadrilaterals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

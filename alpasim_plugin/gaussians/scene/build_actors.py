@@ -7,8 +7,6 @@ ellipsoids. Everything is scaled to the actor's box, so that what is seen and wh
 same size. Colours come from the stream of the actor's id.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

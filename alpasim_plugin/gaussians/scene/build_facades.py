@@ -5,8 +5,6 @@ of it. Windows are cells, not holes: what an image shows of a facade at street d
 and rhythm.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import cv2

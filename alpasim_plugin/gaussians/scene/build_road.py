@@ -11,8 +11,6 @@ it, put a line in front of all ground within ``(lift + trench) * distance / came
 grows with distance as the cells do.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Build what stands beside the road: kerbs or guard rails, trees, lamp poles, signs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Build a scene graph of Gaussians from a map, tracks and an environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from threading import Lock

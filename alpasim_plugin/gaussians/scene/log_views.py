@@ -7,8 +7,6 @@ camera by rotation alone; within half the views' spacing the skyline moves by le
 the small views beyond some 20 m.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

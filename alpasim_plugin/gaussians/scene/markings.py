@@ -3,8 +3,6 @@
 Which lines are lane markings is the rule of `world.markings`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

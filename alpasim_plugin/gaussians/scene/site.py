@@ -7,8 +7,6 @@ turned along the logged path. Kerbs, trees, poles and facades stand along its le
 (`contours`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property

@@ -5,8 +5,6 @@ A rectangle is covered by a grid of flat Gaussians with a standard deviation of 
 while the outline stays within a quarter of a cell of the true edge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Compare a run folder with the digests in its manifests; nothing is written here."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

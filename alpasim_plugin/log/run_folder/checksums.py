@@ -4,8 +4,6 @@ A log or a film with the stated size and time is taken as it is, since reading g
 every command would cost more than it finds; any other file is read in full.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -5,8 +5,6 @@ unfinished; one whose files differ from their digests is damaged. Both are drive
 command.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 It works on a folder that was copied from another machine, without scenario files or weights.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """Rows of a run folder's tables as plain records: rollouts, and the series of their metrics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -5,8 +5,6 @@ named may be anything.
 used.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import Field

@@ -2,8 +2,6 @@
 from the rollouts' manifests.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -7,8 +7,6 @@ Nothing on the wire depends on the package of a message; only the service path d
 the project.
 """
 
-from __future__ import annotations
-
 from .protos import (
     common_pb2,
     controller_pb2,

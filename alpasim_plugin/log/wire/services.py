@@ -9,8 +9,6 @@ So every file is copied with its package renamed into a separate pool; protobuf'
 holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Which executor a run uses, by the text of ``--executor``."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass

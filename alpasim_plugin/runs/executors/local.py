@@ -4,8 +4,6 @@ A worker that dies breaks its pool: what ran then is done again, each job alone 
 own, since nobody knows which job it was.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import multiprocessing
 import os

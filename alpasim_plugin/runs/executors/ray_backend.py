@@ -6,8 +6,6 @@ writes. Nodes need the same libraries, the same code, and the files of the parts
 a node that differs ends the run with an error that names it.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
