@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import heading_of, wrap_angle
+from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, heading_of, intrinsics, wrap_angle
 from alpasim_plugin.core.types import F64, U8, CameraSpec, Scenario
 from policies.base import front_camera
 
@@ -22,7 +22,6 @@ NOW_M = 6.0
 
 SIDE_DEG = 25.0  # a camera's axis and the middle of a side view are no farther apart
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
-_RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
@@ -79,7 +78,7 @@ class View:
     def K(self) -> F64:
         """Intrinsics ``(3, 3)``."""
         f = self.focal_px
-        return np.array([[f, 0.0, self.width / 2], [0.0, f, self.horizon_row], [0.0, 0.0, 1.0]])
+        return intrinsics(f, f, self.width / 2, self.horizon_row)
 
 
 FRONT = View("front", 0.0, 192, 80, 125.0, 18.0)  # 75 degrees across
@@ -121,7 +120,7 @@ def view_homography(camera: CameraSpec, yaw_rad: float = 0.0, view: View = FRONT
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    rotation = camera.T_rig_camera[:3, :3].T @ turn @ _RIG_FROM_LEVEL_CAMERA
+    rotation = camera.T_rig_camera[:3, :3].T @ turn @ RIG_FROM_LEVEL_CAMERA
     return camera.K @ rotation @ np.linalg.inv(view.K)
 
 
@@ -150,5 +149,5 @@ def sampled_at(camera: CameraSpec, view: View, yaw_rad: float = 0.0) -> tuple[tu
     smaller = camera.width // shrink, camera.height // shrink
     scale = np.diag([smaller[0] / camera.width, smaller[1] / camera.height, 1.0])
     # Pixel centres lie at halves.
-    centre = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    centre = intrinsics(1.0, 1.0, 0.5, 0.5)
     return smaller, np.linalg.inv(centre) @ scale @ centre @ to_camera

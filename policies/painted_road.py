@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.geometry import intrinsics, rigid, se2
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
 
 Colour = tuple[int, int, int]
@@ -38,16 +38,14 @@ def pinhole_camera(
     positive pitch looks down.
     """
     f = width / 2 / np.tan(np.radians(hfov_deg) / 2)
-    K = np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
+    K = intrinsics(f, f, width / 2, height / 2)
     pitch = np.radians(pitch_deg)
     yaw = np.radians(yaw_deg)
     c = np.cos(yaw)
     s = np.sin(yaw)
     forward = np.array([np.cos(pitch) * c, np.cos(pitch) * s, -np.sin(pitch)])
     right = np.array([s, -c, 0.0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = mount_m
+    T = rigid(np.stack([right, np.cross(forward, right), forward], axis=1), mount_m)
     return CameraSpec(name, width, height, K, T)
 
 

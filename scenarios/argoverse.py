@@ -16,6 +16,7 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
     centre_line,
+    intrinsics,
     matrix_from_quat,
     quat_from_matrix,
     se3,
@@ -407,7 +408,7 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
         fx, fy, cx, cy = (float(inner[k][i]) for k in ("fx_px", "fy_px", "cx_px", "cy_px"))
         T_rig_camera = mounts[name].copy()
         T_rig_camera[2, 3] += WHEEL_RADIUS_M  # the rig's origin is on the ground
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        K = intrinsics(fx, fy, cx, cy)
         k1, k2, k3 = (float(inner[k][i]) for k in ("k1", "k2", "k3"))
         lens = LensModel("opencv", (k1, k2, 0.0, 0.0, k3))
         size = int(inner["width_px"][i]), int(inner["height_px"][i])

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.lens import check_lens, resized
 from alpasim_plugin.core.reading.files import contents
 from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
@@ -25,8 +26,6 @@ RIG_PIXELS = b.Bound(
 )
 DEEPEST_M = 0.5  # below the body's surface: a camera behind the windscreen stands so deep
 FARTHEST_M = 0.6  # outside of the body
-# Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).
-_RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def given_cameras(drawn: Drawn) -> tuple[CameraSpec, ...] | None:
@@ -92,11 +91,9 @@ def camera_spec(model: CameraModel | None = None) -> CameraSpec:
     m = model or CameraModel()
     focal = m.focal_px or (_focal_px(m),) * 2
     middle = m.centre_px or (m.width / 2, m.height / 2)
-    K = np.array([[focal[0], 0.0, middle[0]], [0.0, focal[1], middle[1]], [0.0, 0.0, 1.0]])
-    T = np.eye(4)
+    K = intrinsics(*focal, *middle)
     turns = Rotation.from_euler("ZY", [m.yaw_deg, m.pitch_down_deg], degrees=True)
-    T[:3, :3] = turns.as_matrix() @ _RIG_FROM_FORWARD_CAMERA
-    T[:3, 3] = m.x_m, m.y_m, m.z_m
+    T = rigid(turns.as_matrix() @ RIG_FROM_LEVEL_CAMERA, (m.x_m, m.y_m, m.z_m))
     lens = None
     if m.lens != "pinhole":
         coefficients = m.coefficients or ((0.0, focal[0]) if m.lens == "ftheta" else ())

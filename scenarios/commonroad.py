@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, offset_trajectory, quat_from_yaw
+from alpasim_plugin.core.geometry import arc_lengths, offset_trajectory, quat_from_yaw, shifted
 from alpasim_plugin.core.limits import STEP, TIME_STEP_S
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import (
@@ -207,8 +207,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         raise InputError(
             f"{file}, obstacle {chosen.obstacle_id}: 1 state", "choose an ego with a trajectory"
         )
-    T_centre_rig = np.eye(4)
-    T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
+    T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
     steps = np.concatenate([one.steps for one in obstacles if not one.static])
     ends_us = np.round(np.array([steps.min(), steps.max()]) * dt_s * 1e6).astype(np.int64)
     actors = []

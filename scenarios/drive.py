@@ -16,7 +16,7 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_array, write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.geometry import intrinsics, quat_from_yaw
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import file_sha256, parsing
 from alpasim_plugin.core.reading.arrays import open_npy
@@ -230,7 +230,7 @@ def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
 
 
 def _photograph(folder: Path, frame: JsonObject) -> Photograph:
-    K = [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
+    K = intrinsics(*(frame[name] for name in ("fl_x", "fl_y", "cx", "cy")))
     return Photograph(
         frame["t_us"],
         frame["camera"],

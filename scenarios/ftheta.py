@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lens import rays_of
 from alpasim_plugin.core.reading import parsing
@@ -27,8 +28,6 @@ WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
 HORIZONTAL_FOV_RAD = np.pi / 2
 
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
-# Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
-FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 GIVE = "give an f-theta calibration"
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
@@ -45,7 +44,7 @@ def front_camera(calibrated: F64, T_rig_camera: F64) -> CameraSpec:
     """
     focal = WIDTH / 2 / np.tan(HORIZONTAL_FOV_RAD / 2)
     cx, cy = calibrated[:2] * [WIDTH, HEIGHT] / calibrated[2:4]
-    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    K = intrinsics(focal, focal, cx, cy)
     return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_rig_camera))
 
 
@@ -75,7 +74,7 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
             given = (*polynomial, *[0.0] * (6 - len(polynomial)))
             focal = 1 / given[1] if goes_back else given[1]
         lens = LensModel("ftheta", () if goes_back else given, given if goes_back else ())
-        K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+        K = intrinsics(focal, focal, cx, cy)
         cameras.append(CameraSpec(name, int(width), int(height), K, T_rig_camera, lens=lens))
     if not cameras:
         raise InputError(f"{path}: no calibrated camera", "use a scene with its calibration")
@@ -134,10 +133,7 @@ def mount(sensor: JsonObject) -> F64:
     turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
     shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
     turns = Rotation.from_euler("xyz", [nominal["roll-pitch-yaw"], turn], degrees=True).as_matrix()
-    out = np.eye(4)
-    out[:3, :3] = turns[0] @ turns[1] @ FLU_FROM_CAMERA
-    out[:3, 3] = np.array(nominal["t"], np.float64) + np.array(shift, np.float64)
-    return out
+    return rigid(turns[0] @ turns[1] @ RIG_FROM_LEVEL_CAMERA, np.add(nominal["t"], shift))
 
 
 def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
@@ -212,7 +208,7 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
         "linear-d": "0.0",
         "linear-e": "0.0",
     }
-    turn = Rotation.from_matrix(camera.T_rig_camera[:3, :3] @ FLU_FROM_CAMERA.T)
+    turn = Rotation.from_matrix(camera.T_rig_camera[:3, :3] @ RIG_FROM_LEVEL_CAMERA.T)
     mount = {
         "roll-pitch-yaw": turn.as_euler("xyz", degrees=True).tolist(),
         "t": camera.T_rig_camera[:3, 3].tolist(),

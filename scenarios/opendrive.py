@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import densify, project
+from alpasim_plugin.core.geometry import densify, project, rigid, shifted
 from alpasim_plugin.core.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType
@@ -228,10 +228,8 @@ def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
     east = [-np.sin(lon), np.cos(lon), 0.0]
     north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
     up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
-    out = np.eye(4)
-    out[:3, :3] = [east, north, up]
-    out[:3, 3] = -out[:3, :3] @ place
-    return out
+    turn = np.array([east, north, up])
+    return rigid(turn, -turn @ place)
 
 
 def lane_map_of(
@@ -309,8 +307,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     odr = parse_map(path, files.read_xml(path))
     starts = [road.records[0] for road in odr.roads if road.records]
     origin = (np.round(starts[0].x_m), np.round(starts[0].y_m), 0.0) if starts else (0.0, 0.0, 0.0)
-    T_local_map = np.eye(4)
-    T_local_map[:3, 3] = np.negative(origin)
+    T_local_map = shifted(*np.negative(origin))
     lanes, notes = read_lanes(path, odr, T_local_map)
     heads, light_notes = traffic_lights(odr, lanes, T_local_map)
     roads = {road.road_id: road for road in odr.roads if road.records and road.sections}

@@ -15,7 +15,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, centre_line, offset_trajectory, project, unit
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    centre_line,
+    offset_trajectory,
+    project,
+    shifted,
+    unit,
+)
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
@@ -118,8 +125,7 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         for key, track in tracks.items()
     }
     vehicle = _vehicle(tracks[chosen])
-    T_centre_rig = np.eye(4)
-    T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
+    T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
     ego_log = offset_trajectory(centres[chosen], T_centre_rig)
     lanes = {} if roads is None else _lanes(file, roads, origin)
     if any(lane.kind == "vehicle" for lane in lanes.values()):

@@ -12,6 +12,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape
@@ -79,8 +80,6 @@ def _camera(document: JsonObject, where: str) -> CameraSpec:
             f"{where}, transform_matrix: its first three columns are no rotation (off by {off:.2g})",
             "give a rigid transform from the camera to the rig",
         )
-    K = np.array(
-        [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
-    )
+    K = intrinsics(*(frame[name] for name in ("fl_x", "fl_y", "cx", "cy")))
     lens = LensModel(kind, bent) if any(bent) or kind == "fisheye" else None
     return CameraSpec(frame["camera"], frame["w"], frame["h"], K, T_rig_camera, lens=lens)

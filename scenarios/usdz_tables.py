@@ -21,6 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
+from alpasim_plugin.core.geometry import shifted
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
@@ -130,9 +131,7 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
     signs = []
     for key, own in _rows(archive, folder, "traffic_sign"):
         if key.get("map_id") is not None and own.get("center"):
-            pose = np.eye(4)
-            pose[:3, 3] = points([own["center"]])[0]
-            signs.append((pose, SIGN))
+            signs.append((shifted(*points([own["center"]])[0]), SIGN))
     return LaneMap(
         lanes,
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),

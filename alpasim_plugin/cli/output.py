@@ -8,7 +8,6 @@ import shlex
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from rich import progress
@@ -18,8 +17,6 @@ from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
-from alpasim_plugin.core.stage import stages_in
-from alpasim_plugin.log.run_folder.schema import STAGES
 from evaluators.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
@@ -97,7 +94,6 @@ class Progress(progress.Progress):
         )
         self.silent = silent
         self.printed_s = 0.0
-        self.ended = Event()
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""
@@ -120,35 +116,13 @@ class Progress(progress.Progress):
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
         """Announce a run."""
-        self.printed_s = time.monotonic()
         for line in headline(plan, root, threads):
             self.say(line)
         self.add_task("rollouts", total=len(plan.cells))
-        if not self.silent:
-            Thread(target=self.watch, args=(root / STAGES,), daemon=True).start()
-
-    def watch(self, folder: Path) -> None:
-        """Show what the worker does that has been at it for longest, until the run ends; on a pipe
-        every ten seconds.
-        """
-        while not self.ended.wait(1.0):
-            for stage in stages_in(folder)[:1]:
-                text = stage.text(time.monotonic())
-                self.update(self.tasks[-1].id, description=f"rollouts; {terminal(text)}")
-                now_s = time.monotonic()
-                if self.disable and now_s - self.printed_s > LINE_EVERY_S:
-                    self.printed_s = now_s
-                    self.say(text)
-
-    def stop(self) -> None:
-        """End the display."""
-        self.ended.set()
-        super().stop()
 
     def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
         """Count a rollout and print its result; on a terminal only failures."""
         task = self.tasks[-1]
-        self.printed_s = time.monotonic()
         self.advance(task.id)
         done = int(task.completed)
         total = int(task.total or 0)

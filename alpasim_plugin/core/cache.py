@@ -16,7 +16,6 @@ from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.stage import announce
 
 DO_THIS = "free disk space, or name a writable folder in SIMRUN_CACHE"
 
@@ -67,7 +66,6 @@ def cached(
             except InputError:
                 pass  # damaged, and said above
         warn(f"{what} ...")
-        announce(what)
         began = time.perf_counter()
         with atomic_folder(folder) as partial:
             make(partial)

@@ -11,6 +11,9 @@ import numpy.typing as npt
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Trajectory
 
+# Columns: a level camera's x (right), y (down), z (forward) in the rig's axes (forward, left, up).
+RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
 
 def wrap_angle(angle_rad: npt.ArrayLike) -> F64:
     """Wrap angles to [-pi, pi).
@@ -91,6 +94,24 @@ def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:
     return out
 
 
+def rigid(rotation: npt.ArrayLike, xyz: npt.ArrayLike = (0.0, 0.0, 0.0)) -> F64:
+    """Return the ``(4, 4)`` transform of a rotation matrix ``(3, 3)`` and a shift ``(3,)``."""
+    out = np.eye(4)
+    out[:3, :3] = rotation
+    out[:3, 3] = xyz
+    return out
+
+
+def shifted(x_m: float, y_m: float, z_m: float = 0.0) -> F64:
+    """Return the ``(4, 4)`` transform that only shifts."""
+    return rigid(np.eye(3), (x_m, y_m, z_m))
+
+
+def intrinsics(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> F64:
+    """Return the ``(3, 3)`` intrinsics of a pinhole."""
+    return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
+
+
 def se2(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> F64:
     """Return the ``(4, 4)`` transform of a planar pose."""
     return se3([x_m, y_m, z_m], quat_from_yaw(yaw_rad))
@@ -134,6 +155,13 @@ def unit(vectors: F64) -> F64:
 def left_of(along: F64) -> F64:
     """Return vectors ``(..., 2)`` turned to the left by a right angle."""
     return np.stack([-along[..., 1], along[..., 0]], axis=-1)
+
+
+def cross(a: F64, b: F64) -> F64:
+    """Return the cross products ``(...)`` of planar vectors ``(..., 2+)``: positive where b points
+    to the left of a.
+    """
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
@@ -239,7 +267,7 @@ def project(line: F64, xy: F64) -> tuple[float, float]:
     offset = xy[:2] - (a + f[:, None] * d)
     distance2 = np.sum(offset * offset, axis=1)
     i = int(np.argmin(distance2))
-    side = d[i, 0] * offset[i, 1] - d[i, 1] * offset[i, 0]
+    side = cross(d[i], offset[i])
     s = arc_lengths(line)
     return float(s[i] + f[i] * np.sqrt(length2[i])), float(np.copysign(np.sqrt(distance2[i]), side))
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, cross, resample
 from alpasim_plugin.core.types import F64, Bool, HeightField
 from alpasim_plugin.drives.source import Points
 
@@ -90,8 +90,7 @@ class PathFrame:
         away = xy[:, :2] - self.line[nearest, :2]
         forward = self.along[nearest]
         s = self.s[nearest] + np.einsum("ij,ij->i", away, forward)
-        left = forward[:, 0] * away[:, 1] - forward[:, 1] * away[:, 0]
-        return s, left, np.interp(s, self.s, self.line[:, 2])
+        return s, cross(forward, away), np.interp(s, self.s, self.line[:, 2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import shifted
 from alpasim_plugin.core.reading import (
     natural_order,
     parsing,
@@ -184,8 +185,7 @@ def _camera(projections: dict[str, F64], name: str, path: Path) -> tuple[F64, F6
     P = projections[row]
     K = P[:, :3]
     Lens(1, 1, K).check(f"{path}, row {row}", "give the projection of a rectified camera")
-    T = np.eye(4)
-    T[:3, 3] = -np.linalg.solve(K, P[:, 3])
+    T = shifted(*-np.linalg.solve(K, P[:, 3]))
     return K + FROM_CORNER, T  # KITTI counts from pixel centres
 
 

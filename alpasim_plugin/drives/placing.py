@@ -13,7 +13,9 @@ from alpasim_plugin.core.geometry import (
     interpolate,
     inverse,
     left_of,
+    rigid,
     se3,
+    shifted,
     trajectory_from_poses,
     unit,
 )
@@ -83,9 +85,8 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     strip = fit_ground(moved, poses[drive.front][:, :3, 3])
     height = camera_height_m or CAMERA_HEIGHT_M
     field = strip.field() if strip else _below(poses[drive.front][:, :3, 3], height)
-    shift = np.eye(4)
     first = poses[drive.front][0, :3, 3]
-    shift[:3, 3] = -first[0], -first[1], -float(height_at(field, first[None])[0])
+    shift = shifted(-first[0], -first[1], -float(height_at(field, first[None])[0]))
     T = shift @ T
     moved = moved.moved(shift)
     poses = {name: shift @ values for name, values in poses.items()}
@@ -191,9 +192,7 @@ def _upright(up: F64, front: F64) -> F64:
         forward = front[0, :3, 2]
     x = forward - z * float(forward @ z)
     x = unit(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    return T
+    return rigid([x, np.cross(z, x), z])
 
 
 def _scale(
@@ -267,9 +266,9 @@ def _rig(
         y = unit(y)
         turns.append(np.stack([x, y, np.cross(x, y)]) @ pose[:3, :3])
     u, _, vt = np.linalg.svd(np.median(turns, axis=0))
-    mount = np.eye(4)
-    mount[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    mount[:3, 3] = AHEAD_OF_AXLE_M, 0.0, float(np.median(centres[:, 2] - height_at(field, centres)))
+    height_m = float(np.median(centres[:, 2] - height_at(field, centres)))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mount = rigid(turn, (AHEAD_OF_AXLE_M, 0.0, height_m))
     if drive.front_xy_m is not None:
         mount[:2, 3] = drive.front_xy_m
     ego = trajectory_from_poses(

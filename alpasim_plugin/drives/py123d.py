@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, inverse, se3
+from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.limits import BODY_M
 from alpasim_plugin.core.reading import parsing
@@ -163,7 +163,7 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
         fx, fy, cx, cy, skew = facts["intrinsics"]
         if skew:
             raise ValueError(f"a lens with skew {skew:g}")
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + FROM_CORNER
+        K = intrinsics(fx, fy, cx, cy) + FROM_CORNER
         bends = None if facts["is_undistorted"] else facts["distortion"]
         distortion = np.array(bends or [0.0] * 5)
         lens = Lens(facts["width"], facts["height"], K, distortion).check(str(path), DO_THIS)

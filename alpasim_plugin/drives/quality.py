@@ -13,7 +13,7 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.escape import markdown as escape
-from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.geometry import inverse, shifted
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.types import F32
 from alpasim_plugin.drives.obstacles import Standing
@@ -82,9 +82,8 @@ def _covered(graph: SceneGraph, view: PosedView, lateral_m: float) -> float:
     """Return the share of the image's lower half that the model covers, seen from beside where a
     view was taken.
     """
-    shift = np.eye(4)
     pose = inverse(view.camera.T_camera_world)
-    shift[:3, 3] = -lateral_m * pose[:3, 0]  # the camera's own left
+    shift = shifted(*-lateral_m * pose[:3, 0])  # the camera's own left
     camera = replace(view.camera, T_camera_world=inverse(shift @ pose))
     return float((graph.render(camera, {}).alpha[camera.height // 2 :] > OPAQUE).mean())
 

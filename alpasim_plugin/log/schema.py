@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3, shifted
 from alpasim_plugin.core.types import (
     F64,
     Actor,
@@ -106,9 +106,7 @@ class RolloutHeader:
 
 def T_rig_box(vehicle: Vehicle) -> F64:
     """Return the ``(4, 4)`` pose of a vehicle's box centre in its rig frame: a pure translation."""
-    out = np.eye(4)
-    out[:3, 3] = vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2
-    return out
+    return shifted(vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2)
 
 
 # --- to the wire

@@ -15,7 +15,6 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit
@@ -70,7 +69,6 @@ def build(
         start,
         splat,
         scene_id=scene_id,
-        report=lambda step, _: announce(f"fitting {scene_id}", step, splat.steps),
         threads=threads,
         device=device,
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.geometry import interpolate, inverse, rigid, shifted
 from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.seeding import stream
@@ -60,8 +60,7 @@ def built_recording(
     """
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
-    T_rig_offset = np.eye(4)
-    T_rig_offset[1, 3] = recipe.lateral_offset_m if recipe else 0.0
+    T_rig_offset = shifted(0.0, recipe.lateral_offset_m if recipe else 0.0)
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
     shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
 
@@ -117,9 +116,7 @@ def believed_pose(
         for at in (knot, knot + 1)
     )
     error = spread_m * (before + (after - before) * after_us / POSE_KNOT_US)
-    moved = np.eye(4)
-    moved[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
-    moved[:3, 3] = error[:3]
+    moved = rigid(cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0], error[:3])
     return T_camera_world @ inverse(first) @ moved @ first
 
 

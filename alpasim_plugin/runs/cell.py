@@ -20,7 +20,6 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
 from alpasim_plugin.core.places import require_kernels
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.asl import copy_log
@@ -134,12 +133,9 @@ def run_cell(
     with _writing_manifest(cell, options, folder) as manifest:
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
-            announce(f"loading {cell.renderer.name} and {cell.policy.name}")
             parts = builder(cell, options, scenario, threads)
-            announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
-        announce(f"scoring {cell.scene}")
         manifest |= _score(folder, cell, options, scenario)
         if _wants_film(options.video, manifest):
             recorder.save_video()
@@ -173,7 +169,6 @@ def copy_cell(
     folder = root / cell.folder
     source = root / original["path"]
     with _writing_manifest(cell, options, folder) as manifest:
-        announce(f"copying {cell.scene}")
         session = session_uuid(cell.seed, cell.rollout_key)
         name = _service_name(cell.renderer)
         copy_log(source / LOG_NAME, folder / LOG_NAME, session, name)
@@ -224,7 +219,6 @@ def _wants_film(video: str, manifest: JsonView) -> bool:
 def _render_film(
     cell: Cell, options: RunOptions, scenario: Scenario, folder: Path, threads: int
 ) -> None:
-    announce(f"film of {cell.renderer.name}")
     renderer = make_renderer(cell.renderer, scenario, cell.seed, options.device, threads)
     write_film(folder, scenario, renderer)
 

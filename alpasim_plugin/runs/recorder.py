@@ -19,7 +19,6 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.places import temporary_folder
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,
@@ -125,7 +124,6 @@ class Recorder:
         self._film = Film()
         self._last_query_us = -1
         self._steps = 0
-        self._n_steps = 0
         self._first_call = 0
         self._passed = False
         self._writer: AslWriter | None = None
@@ -154,7 +152,6 @@ class Recorder:
 
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
-        self._n_steps = clock.n_steps
         scenario = self._scenario
         header = RolloutHeader(
             scene_id=scenario.scene_id,
@@ -228,7 +225,6 @@ class Recorder:
             )
             self._log.controller_return(after)
             self._steps += 1
-            announce(f"driving {self._scenario.scene_id}", self._steps, self._n_steps)
 
     def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""

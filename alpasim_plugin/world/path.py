@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, direction_of, heading_of
+from alpasim_plugin.core.geometry import arc_lengths, cross, direction_of, heading_of
 from alpasim_plugin.core.types import F64, I64, Bool
 
 CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
@@ -92,7 +92,7 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float) -> F64:
         d = curve(t, 1)
         dd = curve(t, 2)
         speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
-        peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
+        peak = float(np.max(np.abs(cross(d, dd)) / speed**3))
         if peak < least_peak - 1e-9:
             best, d_best, least_peak = curve, d, peak
     yaw = np.unwrap(heading_of(d_best))
@@ -322,5 +322,5 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
         arc_lengths(line),
         line,
         np.unwrap(heading_of(d)),
-        (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5,
+        cross(d, dd) / speed2**1.5,
     )

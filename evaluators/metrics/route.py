@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, interpolate, offset_trajectory
+from alpasim_plugin.core.geometry import arc_lengths, cross, interpolate, offset_trajectory
 from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ego_footprints, held, origin_of
 from evaluators.metrics.presets import PRESETS, Preset
@@ -128,7 +128,7 @@ def left_of(path: F64, s: F64, points: F64) -> F64:
     segment = long[np.clip(np.searchsorted(lengths[long + 1], s), 0, len(long) - 1)]
     offset = points - path[segment]
     along = steps[segment]
-    return np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0])
+    return np.sign(cross(along, offset))
 
 
 def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:

@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.alpasim.server.views import View
+from alpasim_plugin.core.geometry import rigid
 from alpasim_plugin.core.types import F64
 
 SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
@@ -78,11 +79,8 @@ def on_line(a: F64, b: F64, s: float) -> F64:
         >>> on_line(a, b, 3.0)[0, 3].item()
         6.0
     """
-    out = np.eye(4)
     turn, _ = cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])
-    out[:3, :3] = a[:3, :3] @ cv2.Rodrigues(turn * s)[0]
-    out[:3, 3] = a[:3, 3] + s * (b[:3, 3] - a[:3, 3])
-    return out
+    return rigid(a[:3, :3] @ cv2.Rodrigues(turn * s)[0], a[:3, 3] + s * (b[:3, 3] - a[:3, 3]))
 
 
 def apart(a: F64, b: F64) -> float:

@@ -18,6 +18,7 @@ from alpasim_plugin.alpasim.server.sources import LocalSource
 from alpasim_plugin.alpasim.server.status import CallTime, Failures, Unimplemented, answering
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import intrinsics, rigid
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
@@ -306,13 +307,12 @@ class Lidar:
     def cameras(self) -> list[CameraSpec]:
         """Return the cameras of the images, 90 degrees wide, placed on the sensor."""
         width, height = SCAN_PX
-        K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+        K = intrinsics(width / 2, width / 2, width / 2, height / 2)
         out: list[CameraSpec] = []
         for look in np.deg2rad(self.looks_deg):
-            T = np.eye(4)
             c = np.cos(look)
             s = np.sin(look)
-            T[:3, :3] = np.array([[s, 0, c], [-c, 0, s], [0, -1, 0]])
+            T = rigid([[s, 0, c], [-c, 0, s], [0, -1, 0]])
             out.append(CameraSpec(f"scan{len(out)}", width, height, K, T))
         return out
 

@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.core.types import F32, F64, I64, U8
 from alpasim_plugin.gaussians.fit.tracks import Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -87,9 +88,7 @@ class Lens:
                     half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1])
                 )
             )
-            return np.array(
-                [[focal, 0.0, self.K[0, 2]], [0.0, focal, self.K[1, 2]], [0.0, 0.0, 1.0]]
-            )
+            return intrinsics(focal, focal, *self.K[:2, 2])
         whole, _ = cv2.getOptimalNewCameraMatrix(
             self.K - FROM_CORNER, self.distortion, (self.width, self.height), 0.0
         )

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import unit
+from alpasim_plugin.core.geometry import rigid, unit
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -268,12 +268,10 @@ def _solve(
         xyz = xyz + points
         if np.abs(step).max() < 1e-6:
             break
-    out = []
-    for camera, rotation, shift in zip(given, R, t, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation, shift
-        out.append(replace(camera, T_camera_world=T))
-    return out
+    return [
+        replace(camera, T_camera_world=rigid(rotation, shift))
+        for camera, rotation, shift in zip(given, R, t, strict=True)
+    ]
 
 
 def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) -> tuple[F64, F64]:

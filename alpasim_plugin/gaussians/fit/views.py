@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry import interpolate, shifted
 from alpasim_plugin.core.types import F32, F64, U8, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
@@ -71,8 +71,7 @@ def logged_views(
         Where the scene's opacity is below one half the view shows sky, in place of the segmentation
         that recorded images need.
     """
-    shift = np.eye(4)
-    shift[1, 3] = lateral_m
+    shift = shifted(0.0, lateral_m)
     views = []
     log = scenario.ego_log.t_us
     instants = max(1, count // max(1, len(scenario.cameras)))

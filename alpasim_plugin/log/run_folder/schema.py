@@ -33,7 +33,6 @@ REPORTS = (*PAGES, "summary.md", "junit.xml")
 GATE_FILES = ("gate.json", "gate.md", "gate.junit.xml")
 DECISION = "decision.json"  # the question of a run that stopped when it was decided
 FILES = "files.json"  # digests of these; the rollouts have manifests
-STAGES = ".stages"  # what the workers of a run do, while they do it
 LOCK = ".simrun.lock"  # while somebody writes the folder
 AGGREGATE = "aggregate"  # AlpaSim's aggregation of scored logs
 # Files of the folder of a rollout.
