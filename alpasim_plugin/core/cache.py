@@ -28,8 +28,6 @@ def cached(
     make: Callable[[Path], None],
     read: Callable[[Path], T],
     what: str,
-    *,
-    again: bool = False,
 ) -> T:
     """Return what ``read`` finds under a key, made first if it is not there.
 
@@ -42,14 +40,13 @@ def cached(
         make: Fills an empty folder.
         read: Reads a filled one.
         what: What is made, for the lines on standard error.
-        again: Make it even if it is there.
 
     Raises:
         InfrastructureError: The cache cannot be written.
         InputError: What was just made cannot be read.
     """
     folder = places.cache() / kind / key
-    if not again and os.path.exists(folder):
+    if os.path.exists(folder):
         try:
             return read(folder)
         except InputError as error:
@@ -60,7 +57,7 @@ def cached(
         # of a process that was killed while it made this entry
         for left_over in folder.parent.glob(f".{key}.*.tmp"):
             shutil.rmtree(left_over)
-        if not again and os.path.exists(folder):
+        if os.path.exists(folder):
             try:
                 return read(folder)
             except InputError:

@@ -22,20 +22,12 @@ class IdentityFixer(Fixer):
 
     Args:
         settings: Gives the length of a block.
-        scene_id, seed, device, threads: As every fixer takes them; without effect here.
     """
 
     settings_model = FixerSettings
     note = "no network"
 
-    def __init__(
-        self,
-        settings: FixerSettings,
-        scene_id: str = "",
-        seed: int = 0,
-        device: str = "cpu",
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, settings: FixerSettings) -> None:
         self.settings = settings
         self.label = f"{settings.name}, no network"
         self.blocks = BlockRule.of_latents(settings.block_latents)

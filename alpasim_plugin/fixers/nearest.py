@@ -29,21 +29,13 @@ class NearestFixer(Fixer):
 
     Args:
         settings: How many references.
-        scene_id, seed, device, threads: As every fixer takes them; without effect here.
     """
 
     settings_model = NearestSettings
     note = "no network"
     blocks = BlockRule(1, 1)
 
-    def __init__(
-        self,
-        settings: NearestSettings,
-        scene_id: str = "",
-        seed: int = 0,
-        device: str = "cpu",
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, settings: NearestSettings) -> None:
         self.settings = settings
         self.label = f"{settings.name}, no network"
 

@@ -145,11 +145,9 @@ def ensure(
     recipe: ReconstructionRecipe,
     threads: int | None = None,
     device: str = "cpu",
-    *,
-    again: bool = False,
 ) -> tuple[Reconstruction, list[SkyView]]:
     """Return a reconstruction and its sky views from the cache; it is fitted first if it is
-    not there, or if ``again``.
+    not there.
     """
     key = reconstruction_key(scenario, recipe)
     from alpasim_plugin.renderers.reconstruction_build import (
@@ -158,7 +156,7 @@ def ensure(
 
     what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
     make = partial(build, scenario, recipe, threads, device)
-    return cached(KIND, key, make, read_model, what, again=again)
+    return cached(KIND, key, make, read_model, what)
 
 
 def _graph(model: Reconstruction, scenario: Scenario) -> SceneGraph:

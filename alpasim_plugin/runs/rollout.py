@@ -14,7 +14,7 @@ from alpasim_plugin.runs.cameras import CameraRig, make_cadence
 from alpasim_plugin.runs.guards import checked_frames, checked_plan, checked_sensors, reset_policy
 from alpasim_plugin.runs.loop_state import Forecaster, LoopState, PathEnd, PlanQueue
 from alpasim_plugin.runs.recorder import Recorder
-from alpasim_plugin.world.actors import Actors, make_actors
+from alpasim_plugin.world.actors import make_actors
 
 
 def run_rollout(
@@ -24,7 +24,6 @@ def run_rollout(
     seed: int = 0,
     recorder: Recorder | None = None,
     controller: Controller | None = None,
-    actors: Actors | None = None,
 ) -> Recorder:
     """Drive one scenario once and return its recorder.
 
@@ -39,7 +38,6 @@ def run_rollout(
         seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.core.seeding`.
         recorder: Records the rollout; by default into a temporary folder.
         controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
-        actors: Road users at their beginning; by default those of the scenario.
 
     Raises:
         PolicyError: The policy raised or broke its contract.
@@ -50,7 +48,7 @@ def run_rollout(
     controller = complete(
         controller or make_controller(policy.controller, scenario.vehicle), Controller
     )
-    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder, actors)
+    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder)
     reset_policy(policy, seed, scenario.route)
     driving = loop.drive()
     try:
@@ -74,7 +72,6 @@ class Loop:
         sensors: Cameras to render.
         controller: Vehicle model.
         recorder: Records the rollout. Whoever drives calls its ``finish``.
-        actors: Road users at their beginning; by default those of the scenario.
 
     Attributes:
         state: The ego and the newest frames.
@@ -89,7 +86,6 @@ class Loop:
         sensors: Sequence[SensorSpec],
         controller: Controller,
         recorder: Recorder,
-        actors: Actors | None = None,
     ) -> None:
         self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
         self._renderer, self._controller, self._recorder = (
@@ -98,7 +94,7 @@ class Loop:
             recorder,
         )
         self._sensors = sensors
-        self._world = actors or make_actors(scenario)
+        self._world = make_actors(scenario)
         self._plans = PlanQueue(scenario.latency)
         self.state = LoopState.at_start(scenario, clock.n_steps)
         self.actors: Mapping[str, F64] = {}

@@ -64,14 +64,6 @@ def finished(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_one_and_two_workers_give_the_same_frames_and_scores(finished, tmp_path):
-    run(plan_of(), tmp_path, workers=2)
-    assert comparable(tmp_path) == comparable(finished)
-    for path in finished.rglob("frames.jsonl"):
-        assert (tmp_path / path.relative_to(finished)).read_bytes() == path.read_bytes()
-
-
-@pytest.mark.slow
 def test_the_same_command_continues_and_another_setting_does_not_reuse(finished, tmp_path):
     plan = plan_of()
     root = tmp_path / "run"

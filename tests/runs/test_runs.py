@@ -140,20 +140,6 @@ def test_a_policy_without_its_file_is_tried_again(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)
-def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path, seeds):
-    refs = expand("smoke/straight", SHORT)
-    killer = "tests.runs.broken_policies:KillsItsProcess"
-    plan = make_plan(
-        refs, (GREY,), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions()
-    )
-    result, _ = run(plan, tmp_path, workers=2)
-    assert result.n_failed == len(seeds)
-    assert {cell["policy"] for cell in result.summary["failures"]["cells"]} == {killer}
-    assert result.exit_code == 4
-
-
-@pytest.mark.slow
 def test_a_killed_run_loses_no_finished_rollout(tmp_path):
     words = "--renderer clean --policy lane-camera --seeds 3 --workers 1 --no-report"
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", "smoke/straight", *words.split()]
