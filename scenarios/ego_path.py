@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, quat_from_yaw, unit
+from alpasim_plugin.core.geometry import arc_lengths, heading_of, quat_from_yaw, unit
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 from alpasim_plugin.world.roads import Road
@@ -233,7 +233,7 @@ def walk_track(
     share = np.clip(s / distance, 0.0, 1.0)[:, None]
     xyz = start + share * (end - start)
     xyz = xyz + np.array([0.0, 0.0, box.height_m / 2])
-    yaw = np.arctan2(end[1] - start[1], end[0] - start[0])
+    yaw = heading_of(end - start)
     return Trajectory(t_us, xyz, quat_from_yaw(np.full(len(t_us), yaw)))
 
 

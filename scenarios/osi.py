@@ -21,6 +21,7 @@ from alpasim_plugin.core.geometry import (
     offset_trajectory,
     project,
     shifted,
+    step_lengths,
     unit,
 )
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
@@ -241,7 +242,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         s_m = np.array([project(centre, point)[0] for point in border_points])
         order = np.argsort(s_m, kind="stable")
         line = border_points[order]
-        steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+        steps = step_lengths(line)
         edge = line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
         if len(edge) < 2:
             return None

@@ -238,6 +238,11 @@ def arc_lengths(line: F64) -> F64:
     return s
 
 
+def step_lengths(line: F64) -> F64:
+    """Return the distances ``(N - 1,)`` in plan view of neighbours in a polyline ``(N, 2+)``."""
+    return np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+
+
 def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
     """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its
     ends; ``along`` are its `arc_lengths`.
@@ -293,7 +298,7 @@ def densify(line: F64, max_step_m: float = 2.0) -> F64:
     """Insert points so that neighbours of a polyline ``(N, D)`` are at most ``max_step_m`` apart in
     plan view; its own vertices stay.
     """
-    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    steps = step_lengths(line)
     count = np.maximum(np.ceil(steps / max_step_m - 1e-9).astype(np.int64), 1)  # pieces per segment
     if count.size == 0 or int(count.max()) == 1:
         return line
@@ -318,7 +323,7 @@ def centre_line(left: F64, right: F64, max_step_m: float = 2.0) -> F64:
     at_left = resample(left, shares * arc_lengths(left)[-1])
     at_right = resample(right, shares * arc_lengths(right)[-1])
     middle = (at_left + at_right) / 2
-    steps = np.linalg.norm(np.diff(middle[:, :2], axis=0), axis=1)
+    steps = step_lengths(middle)
     keep = np.concatenate([[True], steps > 1e-6 * max(length, 1.0)])
     keep[-1] = True
     return densify(middle[keep], max_step_m)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.geometry import arc_lengths, cross, resample
+from alpasim_plugin.core.geometry import arc_lengths, cross, resample, step_lengths
 from alpasim_plugin.core.types import F64, Bool, HeightField
 from alpasim_plugin.drives.source import Points
 
@@ -63,9 +63,7 @@ class PathFrame:
     """
 
     def __init__(self, path: F64, unit: float) -> None:
-        moved = np.concatenate(
-            [[True], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) > 1e-9]
-        )
+        moved = np.concatenate([[True], step_lengths(path) > 1e-9])
         line = path[moved]
         s = arc_lengths(line[:, :2])
         ends = []

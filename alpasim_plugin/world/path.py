@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, cross, direction_of, heading_of
+from alpasim_plugin.core.geometry import arc_lengths, cross, direction_of, heading_of, step_lengths
 from alpasim_plugin.core.types import F64, I64, Bool
 
 CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
@@ -293,9 +293,7 @@ def polyline_path(xyz: F64) -> Path:
     line = np.asarray(xyz, np.float64)
     if line.shape[1] == 2:
         line = np.column_stack([line, np.zeros(len(line))])
-    line = line[
-        np.concatenate([[True], np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1) > 1e-4])
-    ]
+    line = line[np.concatenate([[True], step_lengths(line) > 1e-4])]
     if len(line) < 2:
         raise InputError(
             f"a line of {len(xyz)} points: fewer than two distinct points",

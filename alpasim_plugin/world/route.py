@@ -157,7 +157,7 @@ def _end_heading(line: F64, last: bool) -> float:
     s = arc_lengths(line)
     span = min(1.0, float(s[-1]))
     a, b = resample(line, [s[-1] - span, s[-1]] if last else [0.0, span])
-    return float(np.arctan2(b[1] - a[1], b[0] - a[0]))
+    return float(heading_of(b - a))
 
 
 # recorded points closer than this to the last kept one are dropped: a car at rest only adds noise

@@ -159,18 +159,6 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
 
 
 @pytest.mark.slow
-def test_a_contact_ends_the_episode():
-    env = DriveEnv(
-        "smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0)
-    )
-    env.reset(seed=0)
-    worth, terminated, _, info, _ = finish(env, np.array([0.0, 1.0], np.float32))
-    assert (terminated, info["ended"], info["metrics"]["collision_any"]) == (True, "collision", 1.0)
-    assert worth < -5.0
-    env.close()
-
-
-@pytest.mark.slow
 def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind():
     env = DriveEnv("smoke/curve", camera="", scene_seeds=(0, 1), overrides=SHORT)
     env.reset(seed=12)

@@ -141,14 +141,6 @@ def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(t
     assert_allclose(shown.frames[:, 4, 24], [[50] * 3, [50] * 3, [150] * 3], atol=3)
 
 
-@pytest.mark.slow
-def test_a_policy_that_has_a_camera_after_all_drives_behind_each_renderer(tmp_path):
-    plan = plan_of(SEES)
-    drive(plan, tmp_path)
-    assert set(origins(tmp_path).values()) == {None}
-    assert {reused for _, reused in drive(plan, tmp_path)[1].results} == {True}
-
-
 def test_a_rollout_that_failed_is_not_copied(tmp_path):
     plan = plan_of("tests.runs.broken_policies:Raises")
     summary, _ = drive(plan, tmp_path)

@@ -18,7 +18,14 @@ import numpy.typing as npt
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, left_of, resample, unit
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    heading_of,
+    left_of,
+    resample,
+    unit,
+    yaw_from_quat,
+)
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, I64, Bool, Lane, Scenario
@@ -181,11 +188,7 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
     path_world = path_of(scenario)
     chord = path_world[-1, :2] - path_world[0, :2]
     heading = scenario.ego_log.quat[0]
-    yaw = (
-        np.arctan2(chord[1], chord[0])
-        if np.hypot(*chord) > 5.0
-        else 2 * np.arctan2(heading[3], heading[0])
-    )
+    yaw = heading_of(chord) if np.hypot(*chord) > 5.0 else yaw_from_quat(heading)
     frame = GroundFrame(path_world[0, :2], float(yaw))
     whole = path = frame.to_ground(path_world)
     if section is None:
