@@ -36,7 +36,6 @@ from alpasim_plugin.world.route import route_from_log
 from scenarios.budget import check_record, check_scenario
 from scenarios.build import built_drive
 from scenarios.cameras import camera_spec, check_mounts, given_cameras
-from scenarios.map_drive import map_drive
 from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
 from scenarios.schema import VehicleSpec
@@ -78,6 +77,8 @@ def load_scenario(
     if drawn.spec.road is not None:
         drive = built_drive(drawn, _vehicle(default))
     elif drawn.spec.map is not None:
+        from scenarios.map_drive import map_drive
+
         drive = map_drive(drawn, _vehicle(default))
     else:
         drive = recorded_drive(drawn, source)

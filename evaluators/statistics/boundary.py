@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import scipy.stats
+import scipy  # its submodules load on first use; scipy.stats would take a second
 
 STEPS = 64  # of the grid between both ends of the range
 FIRST = range(0, STEPS + 1, STEPS // 4)  # driven before the bisection; they show a second change
@@ -143,6 +143,6 @@ def _mean(values: Sequence[float], half_width: float) -> Estimate:
     mean = float(np.mean(values))
     margin = half_width
     if len(values) > 1:
-        quantile = scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1)
+        quantile = scipy.special.stdtrit(len(values) - 1, 0.5 + 0.5 * CONFIDENCE)
         margin += float(quantile * np.std(values, ddof=1) / np.sqrt(len(values)))
     return Estimate(mean, mean - margin, mean + margin)

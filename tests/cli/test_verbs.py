@@ -88,7 +88,7 @@ def test_a_listing_loads_no_numerical_library():
 
 def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels():
     """Its workers load what drives; while they are started, nothing else is to load here."""
-    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'torch', 'av'} & sys.modules.keys())"
+    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'scipy.stats', 'torch', 'av'} & sys.modules.keys())"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True
