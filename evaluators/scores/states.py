@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy  # its submodules load on first use
+from numpy.lib.stride_tricks import sliding_window_view
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
@@ -162,7 +162,7 @@ def smooth(values: F64) -> F64:
     """Return values ``(T,)`` through a Savitzky-Golay filter of order 2, whose window of 8 is never
     longer than they are.
     """
-    return scipy.signal.savgol_filter(values, min(8, _enough(values, 2)), 2)
+    return savitzky_golay(values, 8, 2)
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
@@ -170,14 +170,33 @@ def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: i
     per second to the power of ``times``.
     """
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
-    window = min(window, _enough(values, order))
-    return scipy.signal.savgol_filter(values, window, order, times, step_s)
+    return savitzky_golay(values, window, order, times) / step_s**times
 
 
-def _enough(values: F64, order: int) -> int:
+def savitzky_golay(values: F64, window: int, order: int, times: int = 0) -> F64:
+    """Return a derivative, ``times`` by the index, of the polynomials fitted to a window around each
+    of the values ``(T,)``, as `scipy.signal.savgol_filter` does, whose import takes a second.
+
+    In the middle of an even window none of its values stands. Near an end the polynomial of the
+    first or last window counts.
+
+    Raises:
+        EvaluatorError: There are no more values than the polynomial's order.
+    """
     if len(values) <= order:
         raise EvaluatorError(
             f"a Savitzky-Golay filter: {len(values)} instants, a polynomial of order {order}",
             "score a log of more steps",
         )
-    return len(values)
+    window = min(window, len(values))
+    half = window // 2
+    index = np.arange(len(values))
+    start = np.clip(index - (window - 1) // 2, 0, len(values) - window)
+    place = np.where(
+        (index < half) | (index >= len(values) - half), index - start, (window - 1) / 2
+    )
+    fit = np.linalg.pinv(np.vander(np.arange(window), order + 1, increasing=True))
+    polynomials = np.polynomial.polynomial.polyder(
+        fit @ sliding_window_view(values, window).T, times
+    )
+    return np.polynomial.polynomial.polyval(place, polynomials[:, start], tensor=False)

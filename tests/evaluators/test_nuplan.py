@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 import shapely
 
 from evaluators.scores import nuplan
-from evaluators.scores.states import EgoStates, Tracks
+from evaluators.scores.states import EgoStates, Tracks, savitzky_golay
 
 FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
 OF_PLANS = (
@@ -173,3 +174,11 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
             .shapes(),
         )
         assert hit.tolist() == ((first_s <= after_s) & (after_s <= last_s)).tolist()
+
+
+@pytest.mark.parametrize(("window", "order", "times"), [(8, 2, 0), (15, 2, 1), (5, 3, 2)])
+@pytest.mark.parametrize("longer", [0, 1, 30])
+def test_the_filter_is_scipys(window, order, times, longer):
+    values = np.random.default_rng(longer).normal(size=window + longer).cumsum()
+    want = scipy.signal.savgol_filter(values, window, order, times)
+    np.testing.assert_allclose(savitzky_golay(values, window, order, times), want, atol=1e-12)
