@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_cdt
+import scipy  # its submodules load on first use
 
 from evaluators.statistics.boundary import BESIDE, Interval, changes_of
 
@@ -191,7 +191,7 @@ def _testing_point(claims: Claims, asked: Sequence[Point], skipped: set[Point]) 
     where all are close to one.
     """
     driven = claims.driven | _marked(claims, asked)
-    distance = distance_transform_cdt(~driven, metric="chessboard")
+    distance = scipy.ndimage.distance_transform_cdt(~driven, metric="chessboard")
     for steps in BESIDE:
         nearer = claims.beyond(steps - 1)
         here = claims.beyond(steps)
