@@ -394,7 +394,7 @@ def make_renderer(
         scenario: What is rendered.
         seed: The rollout's seed, for temporal noise and the fixer's noise.
         device: ``cpu`` or ``cuda``.
-        threads: Threads of the CPU rasteriser and of torch; None keeps their settings.
+        threads: Threads of the CPU rasteriser and of a fixer's torch; None keeps their settings.
         overrides: ``KEY=VALUE`` of the fixer's settings, where ``name`` is a string.
 
     Raises:

@@ -8,15 +8,15 @@ import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.views import read_view
-from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import Stub
 from alpasim_plugin.renderers.gaussian import CleanRenderer
+from alpasim_plugin.runs.cameras import recorded_requests
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import answers, channel_to, hosted, pinhole
 
@@ -35,30 +35,12 @@ def served():
 
 
 def ask(t_s=1.0, spec=None):
-    """Return the request for the recorded pose after a time, with the first moving car."""
+    """Return the request for the recorded pose after a time, with the moving cars."""
     scenario = load_scenario(SCENE)
-    t_us = scenario.start_us + int(t_s * 1e6)
-    pose = interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera
-    pair = sensorsim_pb2.PosePair(
-        start_pose=wire_pose(pose, "a test"), end_pose=wire_pose(pose, "a test")
-    )
-    asked = sensorsim_pb2.RGBRenderRequest(
-        scene_id=scenario.scene_id,
-        resolution_w=W,
-        resolution_h=H,
-        camera_intrinsics=spec or pinhole(W, H, "front"),
-        frame_start_us=t_us - 30_000,
-        frame_end_us=t_us,
-        sensor_pose=pair,
-        image_format=sensorsim_pb2.PNG,
-    )
-    for actor in scenario.actors:
-        if not actor.is_static:
-            box = wire_pose(interpolate(actor.track, t_us), "a test")
-            asked.dynamic_objects.add(
-                track_id=actor.actor_id,
-                pose_pair=sensorsim_pb2.PosePair(start_pose=box, end_pose=box),
-            )
+    (request,) = recorded_requests(scenario, scenario.start_us + int(t_s * 1e6))
+    asked = wire_render_request(scenario.scene_id, request, "png")
+    asked.resolution_w, asked.resolution_h = W, H
+    asked.camera_intrinsics.CopyFrom(spec or pinhole(W, H, "front"))
     return asked
 
 
@@ -188,7 +170,7 @@ def test_questions_about_scenes_are_answered(served):
                 sensorsim_pb2.LidarRenderRequest(lidar_config={"lidar_type": 7})
             ),
             "UNIMPLEMENTED",
-            "type 7 needs an --upstream",
+            "lidar of type 7",
         ),
     ],
 )

@@ -16,12 +16,14 @@ from alpasim_plugin.alpasim.server.views import camera_of, read_sides, read_view
 from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.lens import lens_of, lens_shares
 from alpasim_plugin.core.shutter import bands
-from alpasim_plugin.core.types import RenderRequest
+from alpasim_plugin.core.types import Exposure, RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
+from alpasim_plugin.gaussians.scene.log_views import actors_at
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import sensorsim_pb2
+from alpasim_plugin.runs.cameras import recorded_requests
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta
@@ -47,31 +49,20 @@ def ask(
     """
     scenario = load_scenario(SCENE)
     t_us = scenario.start_us + 2_000_000
-    start, end = (interpolate(scenario.ego_log, t) for t in (t_us - 1000 * ms, t_us))
-    poses = [
-        wire_pose(T @ scenario.cameras[0].T_rig_camera, "a test")
-        for T in (start, end @ se2(0, 0, turn_rad))
-    ]
-    asked = sensorsim_pb2.RGBRenderRequest(
-        scene_id=scenario.scene_id,
-        resolution_w=W,
-        resolution_h=H,
-        camera_intrinsics=spec or pinhole(W, H, "front"),
-        frame_start_us=t_us - 1000 * ms,
-        frame_end_us=t_us,
-        image_format=sensorsim_pb2.PNG,
-        sensor_pose=sensorsim_pb2.PosePair(start_pose=poses[0], end_pose=poses[1]),
+    open_us = t_us - 1000 * ms
+    (request,) = recorded_requests(scenario, t_us)
+    T_rig_camera = request.camera.T_rig_camera
+    start, end = interpolate(scenario.ego_log, [open_us, t_us])
+    request = replace(
+        request,
+        camera=replace(request.camera, shutter_us=1000 * ms),
+        T_world_camera=np.stack([start @ T_rig_camera, end @ se2(0, 0, turn_rad) @ T_rig_camera]),
+        exposure=Exposure(np.zeros((1, 1)), actors_at(scenario.actors, open_us)),
     )
+    asked = wire_render_request(scenario.scene_id, request, "png")
+    asked.resolution_w, asked.resolution_h = W, H
+    asked.camera_intrinsics.CopyFrom(spec or pinhole(W, H, "front"))
     asked.camera_intrinsics.shutter_type = shutter_type
-    for actor in scenario.actors:
-        if not actor.is_static:
-            pair = [
-                wire_pose(interpolate(actor.track, t), "a test") for t in (t_us - 1000 * ms, t_us)
-            ]
-            asked.dynamic_objects.add(
-                track_id=actor.actor_id,
-                pose_pair=sensorsim_pb2.PosePair(start_pose=pair[0], end_pose=pair[1]),
-            )
     return asked
 
 
