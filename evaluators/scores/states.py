@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.polynomial import polynomial
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
@@ -196,7 +197,6 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0) -> F64:
         (index < half) | (index >= len(values) - half), index - start, (window - 1) / 2
     )
     fit = np.linalg.pinv(np.vander(np.arange(window), order + 1, increasing=True))
-    polynomials = np.polynomial.polynomial.polyder(
-        fit @ sliding_window_view(values, window).T, times
-    )
-    return np.polynomial.polynomial.polyval(place, polynomials[:, start], tensor=False)
+    polynomials = polynomial.polyder(fit @ sliding_window_view(values, window).T, times)
+    found = polynomial.polyval(place, polynomials[:, start], tensor=False)
+    return found.astype(np.float64)
