@@ -65,7 +65,7 @@ def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
     assert "within 2 s" in found["stops"].reason
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", first_of([2, 1]))
 def test_a_worker_has_its_threads_and_passes_no_safe_path_on(threads):
     ((_, seen),) = run_jobs(environment, ["OMP_NUM_THREADS"], 1, threads, limit_s=60.0)
     assert seen == (str(threads), None)
@@ -76,7 +76,7 @@ def environment(name):
     return os.environ.get(name), os.environ.get("PYTHONSAFEPATH")
 
 
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("workers", first_of([3, 1]))
 def test_results_do_not_depend_on_the_number_of_workers(workers):
     assert dict(map_jobs(work, ["a", "b", "c", "d"], workers)) == {
         "a": "A",
@@ -99,7 +99,7 @@ def test_an_error_ends_the_work_and_reaches_the_parent(item, error):
         dict(run_jobs(work, [item, "a"], 2))
 
 
-@pytest.mark.parametrize("item", ["hangs", "stops"])
+@pytest.mark.parametrize("item", first_of(["hangs", "stops"]))
 def test_work_that_is_left_early_ends_its_workers(item):
     outcomes = run_jobs(work, [item, "a"], 2)
     assert next(outcomes) == ("a", "A")

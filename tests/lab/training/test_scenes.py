@@ -14,6 +14,7 @@ from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
 from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, UNSEEN_DAMAGE
 from alpasim_plugin.lab.training.scenes import DRAWS, SPLITS, draw_spec, write_scenes
 from scenarios.load import load_scenario
+from tests.examples import first_of
 
 DRAWN = 60
 ALL = [(split, family) for split in ("train", "test-unseen") for family in SPLITS[split].families]  # type: ignore[index]
@@ -44,7 +45,7 @@ def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training():
     assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
 
 
-@pytest.mark.parametrize("family", ["cross_left", "cross_right"])
+@pytest.mark.parametrize("family", first_of(["cross_left", "cross_right"]))
 def test_the_expert_gives_way_to_who_comes_from_a_side(family, tmp_path):
     """Of five drawn junctions the log slows down in some, for one who comes from the named side."""
     slowed = 0
