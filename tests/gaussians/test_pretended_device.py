@@ -106,7 +106,7 @@ FISHEYE = LensModel("fisheye", (0.01,), max_angle_rad=1.5)
 
 
 @pytest.mark.parametrize(
-    ("capacity", "lens"), first_rows_of([(1 << 16, None), (1 << 16, FISHEYE), (10, None)])
+    ("capacity", "lens"), first_rows_of([(1 << 12, None), (1 << 12, FISHEYE), (10, None)])
 )
 def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capacity, lens):
     graph, poses = scene()
