@@ -164,6 +164,12 @@ def cross(a: F64, b: F64) -> F64:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
+def in_axes(vectors: F64, yaw_rad: F64) -> F64:
+    """Return planar vectors ``(..., 2)`` in axes whose x has a heading ``(...)``."""
+    along = direction_of(yaw_rad)
+    return np.stack([np.sum(vectors * along, axis=-1), cross(along, vectors)], axis=-1)
+
+
 def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
     """Interpolate unit quaternions ``(N, 4)`` on the shorter arc; falls back to normalised lerp
     below 1e-8 rad, where it is exact.

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import rectangle_corners, wrap_angle
+from alpasim_plugin.core.geometry import in_axes, rectangle_corners, wrap_angle
 from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.metrics.footprint import ActorTable, Footprints
 from evaluators.metrics.sweep import Motions, first_contact, gaps
@@ -288,11 +288,7 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     """
     center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
-    c = np.cos(yaw[:, 0])
-    s = np.sin(yaw[:, 0])
-    seen = np.stack(
-        [c * center[:, 0] + s * center[:, 1], c * center[:, 1] - s * center[:, 0]], axis=1
-    )
+    seen = in_axes(center, yaw[:, 0])
     half = pairs.half[:, 0]
     flat = np.zeros(len(tau))
     own = shapely.polygons(rectangle_corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))

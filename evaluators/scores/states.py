@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import polynomial
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
+from alpasim_plugin.core.geometry import in_axes, inverse, offset_trajectory, yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.metrics.footprint import ActorTable, Footprints
 from evaluators.metrics.presets import Preset
@@ -108,11 +108,7 @@ def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F6
     yaw = np.unwrap(yaw_from_quat(rear.quat))
     rear_xy = rear.xyz[:, :2] - origin[:2]
     vectors = _rate(rear_xy, t_us)
-    c = np.cos(yaw)
-    s = np.sin(yaw)
-    velocity = np.stack(
-        [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1
-    )
+    velocity = in_axes(vectors, yaw)
     # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
     turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
     size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse
 from alpasim_plugin.core.types import F32, F64, Actor, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
@@ -64,9 +64,8 @@ class SkyMask:
         turned_away = self._axes @ R[:, 2] < 0.5
         nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
         view = self._views[nearest]
-        half = np.array(
-            [[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]
-        )  # the warp counts from pixel centres, cameras from the corner
+        # The warp counts from pixel centres, cameras from the corner.
+        half = intrinsics(1.0, 1.0, 0.5, 0.5)
         to_view = (
             np.linalg.inv(half)
             @ view.camera.K
