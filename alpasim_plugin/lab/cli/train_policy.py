@@ -90,7 +90,7 @@ def policy(
 
     The network has the views that all scenes' cameras show: the front one, or also the left and the
     right one; then it starts from the weights of 'learned' and has three stages, in OUT/front,
-    OUT/sides and OUT/last.
+    OUT/sides and OUT.
 
     Before the first update, perturbed rollouts off the logged paths are rendered into
     OUT/demonstrations, with the path and speeds of a privileged expert as labels.

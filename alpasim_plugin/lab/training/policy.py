@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from policies.learned_net import (
 )
 from policies.learned_views import in_planes, network_input
 
+Report = Callable[[int, Mapping[str, float]], None]
 SIGMA_KNOT = KNOTS_M.index(16.0)
 
 
@@ -265,12 +267,16 @@ class PolicyStage:
     keeps_front: bool = False
 
 
+def _counted(report: Report, before: int, step: int, numbers: Mapping[str, float]) -> None:
+    report(before + step, numbers)
+
+
 ONE_CAMERA = (PolicyStage("", 1),)
 # The updates of `learned-three`.
 SEVERAL_CAMERAS = (
     PolicyStage("front", 7300),
     PolicyStage("sides", 2800, keeps_front=True),
-    PolicyStage("last", 1900, peak_lr=1e-3, keeps_front=True),
+    PolicyStage("", 1900, peak_lr=1e-3, keeps_front=True),
 )
 
 
@@ -280,7 +286,7 @@ def train(
     out: Path,
     steps: int,
     recipe: PolicyRecipe,
-    report: Callable[[int, Mapping[str, float]], None] | None = None,
+    report: Report | None = None,
 ) -> list[tuple[PolicyTask, Trainer[PolicyBatch]]]:
     """Train a network in the stages for its views, and leave it with the averaged weights of the
     last; the same call resumes.
@@ -291,7 +297,7 @@ def train(
         out: Folder of the run.
         steps: Updates of all stages; each has its part, and one at least.
         recipe: Of the first stage; each later one has the next seed.
-        report: Called after each update with its number within its stage, and what was measured.
+        report: Called after each update with its number and what was measured.
 
     Returns:
         Task and trainer of each stage.
@@ -302,6 +308,7 @@ def train(
     stages = SEVERAL_CAMERAS if len(net.views) > 1 else ONE_CAMERA
     whole = sum(stage.updates for stage in stages)
     done = []
+    before = 0
     for index, stage in enumerate(stages):
         net.see.requires_grad_(not stage.keeps_front)
         task = PolicyTask(net, demonstrations, replace(recipe, seed=recipe.seed + index))
@@ -314,7 +321,8 @@ def train(
             ema=0.998,
         )
         trainer = Trainer(net, out / stage.name, schedule, task.batch, task.loss, task.facts)
-        trainer.run(report)
+        trainer.run(report and partial(_counted, report, before))
+        before += length
         net.load_state_dict(trainer.averaged())
         done.append((task, trainer))
     return done
