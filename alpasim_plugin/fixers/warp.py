@@ -230,7 +230,7 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
             there = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
             u, v = u if there else 0.5, v if there else 0.5
             x[row, column] = np.float32(u + FIRST_PX) if there else NOWHERE_PX
-            y[row, column] = np.float32(v + FIRST_PX) if there else NOWHERE_PX
+            y[row, column] = np.float32(v + FIRST_PX)
             place[column], distance[column], seen[column] = (
                 np.uint32(np.int32(v) * columns_then + np.int32(u)),
                 rz,
@@ -279,7 +279,7 @@ def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, x, 
             pz = z * (ray[2, 0] * u0 + ray[2, 1] * v0 + ray[2, 2]) + eye[2]
             if not (low[0] < px < high[0] and low[1] < py < high[1] and low[2] <= pz < high[2]):
                 continue
-            x[row, column], y[row, column], held[row, column] = NOWHERE_PX, NOWHERE_PX, 0
+            x[row, column], held[row, column] = NOWHERE_PX, 0
             rz = project[2, 0] * px + project[2, 1] * py + project[2, 2] * pz + project[2, 3]
             if not rz > NEAREST_M:
                 continue

@@ -61,7 +61,7 @@ def built_recording(
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
     T_rig_offset = shifted(0.0, recipe.lateral_offset_m if recipe else 0.0)
-    largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
+    largest = max((spec.width * spec.height for spec in scenario.cameras), default=1)
     shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
 
     @lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))

@@ -138,7 +138,7 @@ def run_cell(
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
         if _wants_film(options.video, manifest):
-            recorder.save_video()
+            recorder.film.save(folder)
             if not manifest["has_camera"]:
                 _render_film(cell, options, scenario, folder, threads)
     return manifest

@@ -74,11 +74,10 @@ def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:
         period_us = scenario.period_us(SensorSpec(camera.name))
         times = range(log.render_start_us, int(log.ego.t_us[-1]) + 1, period_us)
         requests = [logged_request(log, camera, t_us) for t_us in times]
-        number = 0
-        while requests and rule.frames(number) <= len(requests):
-            end = rule.frames(number)
-            for frame in checked_frames(renderer, requests[:end]):
+        size = rule.first
+        while size <= len(requests):
+            for frame in checked_frames(renderer, requests[:size]):
                 film.add(frame)
-            requests = requests[end:]
-            number += 1
+            requests = requests[size:]
+            size = rule.then
     film.save(folder)

@@ -121,7 +121,7 @@ class Recorder:
         self._times = StageTimes()
         self._frames: list[JsonObject] = []
         self._debug: list[JsonObject] = []
-        self._film = Film()
+        self.film = Film()
         self._last_query_us = -1
         self._steps = 0
         self._first_call = 0
@@ -192,7 +192,7 @@ class Recorder:
             }
             self._frames.append(facts | dict(frame.facts))
         if self._keep_frames:
-            self._film.add(frame)
+            self.film.add(frame)
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""
@@ -257,10 +257,6 @@ class Recorder:
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
         }
-
-    def save_video(self) -> None:
-        """Write the video; nothing for a rollout without frames."""
-        self._film.save(self.folder)
 
     @property
     def _log(self) -> AslWriter:

@@ -83,7 +83,7 @@ def sources(run: Run, rollout: Rollout, log: RolloutLog) -> list[Source]:
     video = run.file_of(rollout, VIDEO_NAME)
     if cameras or video is None:
         return [Source(name, tuple(images)) for name, images in cameras.items()]
-    filmed = sorted({str(row["camera"]) for row in frame_rows(run, rollout)})
+    filmed = sorted({row["camera"] for row in frame_rows(run, rollout)})
     return [Source(", ".join(filmed) or "all cameras", video=(video, log.render_start_us))]
 
 

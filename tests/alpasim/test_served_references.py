@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.caches import SceneCache, resolve_served
-from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.types import RenderRequest
+from alpasim_plugin.runs.cameras import recorded_requests
 
 SCENE = """
 version: 1
@@ -33,10 +32,7 @@ def served(file, renderer):
 
 
 def request(entry, t_us):
-    scenario = entry.scenario
-    camera = scenario.cameras[0]
-    pose = interpolate(scenario.ego_log, scenario.start_us + t_us) @ camera.T_rig_camera
-    return RenderRequest(scenario.start_us + t_us, camera, np.stack([pose, pose]), {})
+    return recorded_requests(entry.scenario, entry.scenario.start_us + t_us)[0]
 
 
 @pytest.mark.slow

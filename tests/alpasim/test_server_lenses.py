@@ -122,15 +122,10 @@ def by_ftheta(spec):
     ]
 
 
-@pytest.mark.parametrize(
-    ("spec", "project"),
-    [
-        (distorted(), by_opencv),
-        (fisheye(), by_opencv_fisheye),
-        (ftheta(True), by_ftheta),
-        (ftheta(False), by_ftheta),
-    ],
-)
+LENSES = [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)]
+
+
+@pytest.mark.parametrize(("spec", "project"), [*LENSES, (ftheta(True), by_ftheta)])
 def test_each_direction_is_shown_where_the_lens_puts_it(spec, project):
     sides = read_sides(spec, 320, 180)
     for ray, pixel in zip(RAYS, project(spec), strict=True):
@@ -140,10 +135,7 @@ def test_each_direction_is_shown_where_the_lens_puts_it(spec, project):
 
 
 @pytest.mark.parametrize("size", [(320, 180), (640, 360)])
-@pytest.mark.parametrize(
-    ("spec", "project"),
-    [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)],
-)
+@pytest.mark.parametrize(("spec", "project"), LENSES)
 def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
     spec, project, size
 ):

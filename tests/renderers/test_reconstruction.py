@@ -329,11 +329,6 @@ def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none()
     )
     assert 0.2 < turned_deg.mean() < 0.6
     assert np.abs(np.diff(errors[:, :3, 3], axis=0)).mean() < 0.5 * errors[:, :3, 3].std()
-    again = misplaced(many, 0.1, "s", 0)
-    assert all(
-        np.array_equal(a.camera.T_camera_world, b.camera.T_camera_world)
-        for a, b in zip(moved, again, strict=True)
-    )
 
 
 def test_the_pinholes_of_a_lens_are_misplaced_as_one():

