@@ -155,12 +155,12 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     if len(lenses) > 1:
         step = ground.step_px(size)
         across = size // step | 1
-        by_both = (part[:, :, ::step, ::step] for part in (by_ground, by_depth))
-        apart = torch.sub(*(_disagreement(part, across) for part in by_both))
+        both = torch.cat([part[:, :2, ::step, ::step] for part in (by_ground, by_depth)])
+        of_ground, of_depth = _disagreement(both, across).chunk(2)
         share = (depth / on_ground.view_as(depth).clamp(min=ground.NEAREST_M))[:, ::step, ::step]
         about = (share > ground.ABOUT[0]) & (share < ground.ABOUT[1])
         most = torch.where(about, ground.NEAR_PREFERENCE, ground.PREFERENCE) * across**2
-        agrees = (apart <= most).repeat_interleave(step, dim=1)
+        agrees = (of_ground - of_depth <= most).repeat_interleave(step, dim=1)
         agrees = agrees.repeat_interleave(step, dim=2)[:, :height, :width]
         chosen &= agrees | (depth <= 0)
     return torch.where(chosen[:, None, :, :, None], by_ground, by_depth)
@@ -170,6 +170,8 @@ def _filled(parts: Tensor, lenses: Sequence[int]) -> Tensor:
     """Return recorded frames ``(V, K, P, 4)``, each filled in by the others of its lens, of all parts
     ``(V, N, P, 4)``.
     """
+    if len(lenses) == parts.shape[1]:
+        return parts
     out = []
     for lens in torch.split(parts, list(lenses), dim=1):
         image, *others = lens.unbind(1)
@@ -297,8 +299,10 @@ def _ground_depth(planes: Tensor, rays: Tensor, depth: Tensor, users: Users) -> 
 
 
 def _disagreement(images: Tensor, size: int) -> Tensor:
-    """Return by how many levels the first two images differ around each pixel; see `ground`."""
-    a, b = images[:, :2].float().unbind(1)
+    """Return by how many levels two images ``(V, 2, h, w, 4)`` differ around each pixel; see
+    `ground`.
+    """
+    a, b = images.float().unbind(1)
     apart = ((a - b).abs()[..., :3].sum(dim=-1) / 3).round()
     apart = torch.where(torch.minimum(a, b)[..., 3] == 0, ground.UNSEEN, apart)
     around = F.pad(apart[:, None], (size // 2,) * 4, mode="reflect")
