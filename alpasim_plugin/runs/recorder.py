@@ -98,6 +98,9 @@ class Recorder:
         keep_frames: Keep the cameras' frames for a video.
         versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs",
             "egodriver": "lane-camera"}``.
+
+    Attributes:
+        film: The frames that were kept.
     """
 
     def __init__(
