@@ -42,7 +42,7 @@ from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road, beside, cubics_at, parse_map
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 from scenarios.usdz_archive import Archive
-from scenarios.usdz_tables import clipgt_map, without_rails
+from scenarios.usdz_tables import clipgt_map
 
 RIG_MEMBER = "rig_trajectories.json"
 RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
@@ -83,13 +83,11 @@ class RoadMap:
     notes: tuple[str, ...]
 
 
-def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> RecordedLog:
+def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
     """Read a scene as a recorded log, to drive in or to score logs against.
 
     Args:
         path: The scene.
-        rails: False drops the lanes' rails after the centres are made, so that scorers widen the
-            centres by 1.85 m.
         needs_map: False accepts a scene without a map: scorers say what they lack.
 
     Raises:
@@ -135,7 +133,7 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
     return RecordedLog(
         scene_id=scene_id,
         source="usdz",
-        lane_map=road.lane_map if rails else without_rails(road.lane_map),
+        lane_map=road.lane_map,
         ground=ground,
         ego_log=ego_log,
         vehicle=vehicle,
@@ -145,7 +143,7 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         content_hash=files.content_hash,
         notes=tuple(notes),
         first_frame_us=first_frame_us,
-        alpasim_map=road.alpasim if rails or road.alpasim is None else without_rails(road.alpasim),
+        alpasim_map=road.alpasim,
     )
 
 

@@ -13,7 +13,6 @@ a link of a lane to no sign, a sign without an id, a stop line marked implicit.
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -137,14 +136,6 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
         stop_lines=tuple(line for line in stop_lines if len(line) > 1),
         signs=tuple(signs),
-    )
-
-
-def without_rails(lane_map: LaneMap) -> LaneMap:
-    """Return a map whose lanes have only their centres, so that scorers widen those by 1.85 m."""
-    return replace(
-        lane_map,
-        lanes={key: replace(lane, left=None, right=None) for key, lane in lane_map.lanes.items()},
     )
 
 

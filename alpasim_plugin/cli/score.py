@@ -49,10 +49,6 @@ def score(
     settings: Annotated[
         Path | None, Flag("AlpaSim's eval-config.yaml, with --preset alpasim.")
     ] = None,
-    rails: Annotated[
-        bool,
-        Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails"),
-    ] = True,
     evaluators: Evaluators = (),
     out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None,
     as_json: Json = False,
@@ -78,7 +74,7 @@ def score(
             progress.add_task(name, total=len(paths))
             results[name] = execute_score(
                 paths,
-                KnownScenes(scene, rails),
+                KnownScenes(scene),
                 one if own is None else own.preset(one),
                 own,
                 parts,

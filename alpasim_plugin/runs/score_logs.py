@@ -302,15 +302,13 @@ class KnownScenes:
 
     Args:
         places: Scenes (anything that ``simrun run`` drives), or folders of them.
-        rails: Whether lanes of AlpaSim scenes keep their rails.
 
     Raises:
         InputError: A place without scenes, or two AlpaSim scenes with one id.
     """
 
-    def __init__(self, places: Sequence[str | Path], rails: bool = True) -> None:
+    def __init__(self, places: Sequence[str | Path]) -> None:
         self.places = [str(place) for place in places]
-        self._rails = rails
         self._archives: dict[str, Path] = {}
         self._others: list[str] = []
         self._read: dict[str, LoggedScene | Scenario] = {}
@@ -334,7 +332,7 @@ class KnownScenes:
             InputError: None of the places has it, or it cannot be read.
         """
         if scene_id not in self._read and scene_id in self._archives:
-            record = read_usdz(self._archives[scene_id], self._rails, needs_map=False)
+            record = read_usdz(self._archives[scene_id], needs_map=False)
             scene = Scene(
                 record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
             )

@@ -254,33 +254,6 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
     assert said.count("error: ") == said.count("hint: ") == 2  # for each damaged log
 
 
-def test_lanes_without_rails_are_centres_widened(golden, tmp_path):
-    folder = golden / "cases" / "rails-stripped"
-    command = [
-        "score",
-        str(folder),
-        "--scene",
-        str(folder / "scenes"),
-        "--preset",
-        "alpasim",
-        "--no-rails",
-    ]
-    out = tmp_path / "scored"
-    assert (
-        run_command([*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(out)])
-        == 0
-    )
-    want = {
-        row["rollout_id"]: row
-        for row in json.loads((folder / "aggregate" / "results-summary.json").read_text())[
-            "rollouts"
-        ]
-    }
-    for row in rows(out):
-        name = "min_distance_to_lane_boundary_m"
-        assert row[name] == pytest.approx(want[row["rollout"]]["metrics"][name], abs=1e-4)
-
-
 def test_bad_commands_say_what_to_do(our_run, tmp_path, capsys):
     own = ["score", str(our_run), "--out", str(tmp_path / "x")]
     settings = tmp_path / "eval.yaml"

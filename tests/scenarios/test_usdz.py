@@ -244,13 +244,6 @@ def test_golden_scenes_are_read(shared_data):
     assert not read_usdz_scene(next(folder.glob("cases/no-map/scenes/*.usdz"))).lane_map.lanes
 
 
-def test_stripped_rails_leave_the_centres(tmp_path):
-    lane = read_usdz_scene(write(tmp_path / "a.usdz"), rails=False).lane_map.lanes["L0"]
-    assert lane.left is None
-    assert lane.right is None
-    assert len(lane.centre) > 2
-
-
 def test_a_segment_of_exactly_two_metres_is_split_as_in_alpasims_loader(tmp_path):
     rows = [{"key": key("L"), "lane": {"left_rail": rail(1.0, 61), "right_rail": rail(-1.0, 61)}}]
     scene = read_usdz_scene(
