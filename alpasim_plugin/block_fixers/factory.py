@@ -34,5 +34,4 @@ blocks = FixerFactory(
         "artifixer-pre": "variant of the comparison: opacity in every block, long blocks; to be trained",
         "artifixer": "variant of the comparison: artifixer-pre, distilled; to be trained",
     },
-    "alpasim_plugin.block_fixers.drawn_blocks:drawn_blocks",
 )

@@ -8,6 +8,7 @@ import shlex
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from rich import progress
@@ -17,6 +18,8 @@ from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
+from alpasim_plugin.core.stage import stages_in
+from alpasim_plugin.log.run_folder.schema import STAGES
 from evaluators.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
@@ -119,6 +122,19 @@ class Progress(progress.Progress):
         for line in headline(plan, root, threads):
             self.say(line)
         self.add_task("rollouts", total=len(plan.cells))
+        if not self.silent:
+            Thread(target=self.watch, args=(root / STAGES,), daemon=True).start()
+
+    def watch(self, folder: Path) -> None:
+        """Show what a worker does, until the run ends; on a pipe every ten seconds."""
+        while not self.finished:
+            time.sleep(1.0)
+            for text in stages_in(folder)[:1]:
+                self.update(self.tasks[-1].id, description=f"rollouts; {terminal(text)}")
+                now_s = time.monotonic()
+                if self.disable and now_s - self.printed_s > LINE_EVERY_S:
+                    self.printed_s = now_s
+                    self.say(text)
 
     def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
         """Count a rollout and print its result; on a terminal only failures."""

@@ -43,14 +43,11 @@ class FixerFactory(Generic[S]):
         session: Makes one rollout's session from settings, scene id, seed, device and threads. It
             imports what loads torch.
         help: One line for every fixer that the factory makes, by its name.
-        drawn_blocks: ``module:function`` that runs blocks with random weights, where there are any:
-            see `block_fixers.drawn_blocks`.
     """
 
     settings_model: type[S]
     session: Callable[[S, str, int, str, int | None], Fixer]
     help: Mapping[str, str] = field(default_factory=dict)
-    drawn_blocks: str = ""
 
     def __call__(
         self,

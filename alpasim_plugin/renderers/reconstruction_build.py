@@ -15,6 +15,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit
@@ -71,6 +72,7 @@ def build(
         scene_id=scene_id,
         threads=threads,
         device=device,
+        report=lambda step, _: announce(f"fitting {scene_id}: {step} of {splat.steps} updates"),
     )
     actors = {
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS

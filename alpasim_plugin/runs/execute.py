@@ -7,6 +7,7 @@ therefore run rollouts in any order.
 """
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,9 @@ from pathlib import Path
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
     copy_cell,
     failed_manifest,
@@ -145,10 +148,13 @@ def execute(
             manifests[cell.folder] = manifest
             on_done(manifest, False)
 
-    take(_run(todo, plan, root, how))
-    jobs = [(cell, manifests[original.folder]) for cell, original in copies]
-    take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
-    take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
+    try:
+        take(_run(todo, plan, root, how))
+        jobs = [(cell, manifests[original.folder]) for cell, original in copies]
+        take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
+        take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
+    finally:
+        shutil.rmtree(root / STAGES, ignore_errors=True)
     return [manifests[cell.folder] for cell in plan.cells]
 
 
@@ -186,9 +192,10 @@ def _work(options: RunOptions, root: Path, here: Threads, job: Job) -> JsonObjec
     share_card(options.device, here.workers)
     cell, original = job
     threads = here.per_worker
-    if original is None:
-        return run_cell(cell, options, root, threads)
-    return copy_cell(cell, options, root, threads, original)
+    with shown_in(root / STAGES):
+        if original is None:
+            return run_cell(cell, options, root, threads)
+        return copy_cell(cell, options, root, threads, original)
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> JsonObject:

@@ -39,7 +39,7 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import (
 )
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
-from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, blocks, transparent_splats
+from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, transparent_splats
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario
@@ -184,19 +184,6 @@ def fixer_rate(device: str) -> Facts:
     return _rated(device, {f"cameras: {count}": partial(fixes, count) for count in (1, 6)})
 
 
-def block_rate(device: str) -> Facts:
-    """Time a block of eight frames of the largest generator beside what it costs at least, with a
-    forward of its own for the history and without.
-    """
-
-    def fixes(history: str) -> Call:
-        fix = blocks(history, *MIDDLE, device)
-        return lambda: download(fix().mean())
-
-    kinds = "finalise", "last-forward"
-    return _rated(device, {history: partial(fixes, history) for history in kinds})
-
-
 SECTIONS: dict[str, Callable[[str], Facts]] = {
     "card": card,
     "rasteriser": rasteriser,
@@ -207,7 +194,6 @@ SECTIONS: dict[str, Callable[[str], Facts]] = {
     "rollout": rollout,
     "raster_rate": raster_rate,
     "fixer_rate": fixer_rate,
-    "block_rate": block_rate,
 }
 # What leaves out the part of a section that failed; where nothing does, the card is left out.
 ON_CPU = "run with --device cpu"
@@ -217,7 +203,6 @@ AVOIDED_BY = {
     "block_fixer": f"--renderer onefixer fixes frame by frame; otherwise {ON_CPU}",
     "gradient": "run simrun import drive with --device cpu, and what fits behind 3dgs once as well",
     "fixer_rate": f"--renderer 3dgs leaves the fixer out; otherwise {ON_CPU}",
-    "block_rate": "choose onefixer-dit-s or onefixer in the place of onefixer-2b",
 }
 
 
@@ -230,7 +215,7 @@ def _rated(device: str, calls: dict[str, Callable[[], Call]]) -> Facts:
         facts[what] = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
         if name is None:
             continue
-        ms = _median_ms(make())
+        ms = median_ms(make())
         known = name in PEAKS
         share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
         facts[what] |= {"ms": ms, "roofline_share": share}
@@ -260,8 +245,8 @@ def compared(
             "different": int((differs > 0).sum()),
             "odd_share": odd_share,
             "launches": _launches(ours),
-            "ms": _median_ms(ours),
-            "cpu_ms": _median_ms(theirs),
+            "ms": median_ms(ours),
+            "cpu_ms": median_ms(theirs),
         }
         if odd_share > ODD_SHARE:
             facts |= {"ok": False, "why": f"it differs from the CPU by more than {LEVELS} levels"}
@@ -275,7 +260,7 @@ def _launches(make: Call) -> int:
     return sum("Launch" in event.name for event in profile.events())
 
 
-def _median_ms(make: Call) -> float:
+def median_ms(make: Call) -> float:
     """Return the median time of a call, which ends with an array on the host."""
     times_s = []
     for _ in range(REPEATS):

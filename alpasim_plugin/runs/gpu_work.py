@@ -4,23 +4,17 @@ bytes, over the card's peak rates (its roofline).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
-from torch import Tensor
 
-from alpasim_plugin.core.parts import find
-from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 
 SPLATS = 2_000_000
 OPACITY = 0.02  # so low that no splat hides another: every pair of splat and tile is blended
 DISTANCE_M = 10.0
-BLOCKS_BEFORE = 3  # until an attention window of six latents is full
 
 # Dense TFLOP/s of bfloat16 and of float32 without TF32, and GB/s of the memory, by the name that
 # CUDA gives: NVIDIA's data sheets, and its white paper of the Ada architecture.
@@ -53,28 +47,13 @@ class Work(NamedTuple):
         return round(max(self.gflop / rate, 1e3 * self.gb / memory), 3)
 
 
-# As the laboratory counts them (docs/gpu.md): a frame of `transparent_splats` at
-# 1920x1080; at 960x544 a frame of ``onefixer`` with two recorded images a camera, and a block of
-# `blocks` by what makes its history.
+# As the laboratory counts them (docs/gpu.md): a frame of `transparent_splats` at 1920x1080, and at
+# 960x544 a frame of ``onefixer`` with two recorded images a camera.
 COUNTED = {
     "splats": Work(19.45, 0.959),
     "cameras: 1": Work(2.06, 0.086),
     "cameras: 6": Work(12.36, 0.498),
-    "finalise": Work(54830.0, 60.985, "bf16"),
-    "last-forward": Work(29475.85, 41.772, "bf16"),
 }
-
-
-def blocks(history: str, width: int, height: int, device: str) -> Callable[[], Tensor]:
-    """Return a call that fixes one further block by ``onefixer-2b`` with random weights and a full
-    attention window. On the device ``meta`` it computes nothing.
-    """
-    settings = fixer_settings("onefixer-2b", [f"history={history}"])
-    factory = load(find("fixer", settings.name).target, "fixer")
-    fix: Callable[[], Tensor] = load(factory.drawn_blocks, "fixer")(settings, width, height, device)
-    for _ in range(BLOCKS_BEFORE):
-        fix()
-    return fix
 
 
 def transparent_splats(width: int, height: int) -> tuple[GaussianCloud, PinholeCamera]:

@@ -19,6 +19,7 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.places import temporary_folder
+from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,
@@ -127,6 +128,7 @@ class Recorder:
         self.film = Film()
         self._last_query_us = -1
         self._steps = 0
+        self._n_steps = 0
         self._first_call = 0
         self._passed = False
         self._writer: AslWriter | None = None
@@ -155,6 +157,7 @@ class Recorder:
 
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
+        self._n_steps = clock.n_steps
         scenario = self._scenario
         header = RolloutHeader(
             scene_id=scenario.scene_id,
@@ -228,6 +231,7 @@ class Recorder:
             )
             self._log.controller_return(after)
             self._steps += 1
+            announce(f"driving {self._scenario.scene_id}: {self._steps} of {self._n_steps} steps")
 
     def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""

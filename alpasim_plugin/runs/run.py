@@ -27,6 +27,7 @@ from alpasim_plugin.log.run_folder.schema import (
     ROLLOUTS_FOLDER,
     RUN_INFO,
     SCENES,
+    STAGES,
     TABLES,
     slug,
 )
@@ -46,7 +47,7 @@ from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
-OF_A_RUN = {LOCK, ROLLOUTS_FOLDER, SCENES, FILES, DECISION, *TABLES, *REPORTS}
+OF_A_RUN = {LOCK, ROLLOUTS_FOLDER, SCENES, STAGES, FILES, DECISION, *TABLES, *REPORTS}
 SHORT_KEY = 4  # letters in the name of a run folder
 
 

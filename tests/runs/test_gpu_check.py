@@ -50,10 +50,6 @@ def test_a_section_that_the_budget_does_not_reach_is_not_begun(monkeypatch):
     assert not any(section["ok"] for section in facts.values())
 
 
-SMALL = ["blocks=1", "width=32", "head_width=16", "mlp_width=32", "text_width=8", "context_width=8"]
-SMALL = [*(f"dit.{size}" for size in SMALL), "vae.base=8", "precision=fp32", "codec_precision=fp32"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("section", ["semantic_map", "gradient", "block_fixer"])
 def test_a_section_compares_a_card_with_the_processor(section, monkeypatch):
@@ -71,16 +67,11 @@ def test_a_section_compares_a_card_with_the_processor(section, monkeypatch):
         [
             ("raster_rate", "NVIDIA L4"),
             ("fixer_rate", "an unknown card"),
-            ("block_rate", "NVIDIA H200"),
         ],
     ),
 )
 def test_a_rate_is_a_share_of_the_peak_of_a_known_card(section, card, monkeypatch):
-    def small(name, given=()):
-        return fixer_settings(name, [*given, *SMALL] if name == "onefixer-2b" else given)
-
     monkeypatch.setattr(gpu_work, "SPLATS", 200)
-    monkeypatch.setattr(gpu_work, "fixer_settings", small)
     sizes = {"MIDDLE": (32, 32), "LARGE": (64, 32), "REPEATS": 1}
     for name, value in (sizes | {"facts_of": lambda device: {"card": card}}).items():
         monkeypatch.setattr(gpu_check, name, value)

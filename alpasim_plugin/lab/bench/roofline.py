@@ -1,15 +1,18 @@
 """Count what a frame costs a card at least: the table ``COUNTED`` of `alpasim_plugin.runs.gpu_work`.
 
-    python -m alpasim_plugin.lab.bench.roofline
+    python -m alpasim_plugin.lab.bench.roofline [DEVICE]
+
+With a card it also times blocks of the largest generator there, with random weights.
 
 Operations are two a multiply-add, of products, convolutions and attention alone. Bytes are what
 each of them reads and writes where everything between them is fused, and what a frame is made of
-and results in. Nothing is computed.
+and results in. Counting computes nothing.
 """
 
 from __future__ import annotations
 
 import copy
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,14 +23,16 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils.flop_counter import FlopCounterMode
 
+from alpasim_plugin.core.devices import download, facts_of, require_device
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.pixel_generator import TORCH
 from alpasim_plugin.fixers.pixel_fixer import GivenFrame, fix_frame, in_range
 from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.gaussians.constants import TILE
-from alpasim_plugin.runs.gpu_check import LARGE, MIDDLE
-from alpasim_plugin.runs.gpu_work import H100, SPLATS, Work, blocks
+from alpasim_plugin.lab.bench.drawn_blocks import drawn_blocks
+from alpasim_plugin.runs.gpu_check import LARGE, MIDDLE, median_ms
+from alpasim_plugin.runs.gpu_work import H100, PEAKS, SPLATS, Work
 
 PAIRS = 1.58  # of a splat and tiles: (1 + 2 h / 16)^2 for h = 2.06 px, where its alpha is 1/255
 # Operations of `triton_kernels.project` a splat, and of `composite` a splat and pixel.
@@ -38,6 +43,7 @@ BLEND_FLOP = 23
 SPLAT_BYTES = 260 + 2 * 72
 PAIR_BYTES = 4 * 8
 PIXEL_BYTES = 24
+BLOCKS_BEFORE = 3  # until an attention window of six latents is full
 
 
 class _Counter(TorchFunctionMode):
@@ -90,9 +96,20 @@ def fixer_work(cameras: int, width: int, height: int) -> Work:
     return Work(*_counted(lambda: fix_frame(on_meta, settings, given), given))
 
 
-def block_work(history: str, width: int, height: int) -> Work:
+def blocks(history: str, width: int, height: int, device: str) -> Callable[[], Tensor]:
+    """Return a call that fixes one further block by ``onefixer-2b`` with random weights and a full
+    attention window. On the device ``meta`` it computes nothing.
+    """
+    settings: Any = fixer_settings("onefixer-2b", [f"history={history}"])
+    fix = drawn_blocks(settings, width, height, device)
+    for _ in range(BLOCKS_BEFORE):
+        fix()
+    return fix
+
+
+def block_work(history: str) -> Work:
     """Count a block of ``onefixer-2b``, of eight frames."""
-    return Work(*_counted(blocks(history, width, height, "meta")), "bf16")
+    return Work(*_counted(blocks(history, *MIDDLE, "meta")), "bf16")
 
 
 # By the names of the core's table, in the sizes that its check of a card times.
@@ -100,16 +117,27 @@ COUNTS: dict[str, Callable[[], Work]] = {
     "splats": partial(raster_work, *LARGE),
     "cameras: 1": partial(fixer_work, 1, *MIDDLE),
     "cameras: 6": partial(fixer_work, 6, *MIDDLE),
-    "finalise": partial(block_work, "finalise", *MIDDLE),
-    "last-forward": partial(block_work, "last-forward", *MIDDLE),
 }
+HISTORIES = "finalise", "last-forward"  # by what a block's history is made
+
+
+def timed(device: str, history: str, work: Work) -> str:
+    """Time blocks on a card; return the milliseconds and the share of its peak."""
+    fix = blocks(history, *MIDDLE, device)
+    ms = median_ms(lambda: download(fix().mean()))
+    card = str(facts_of(device).get("card"))
+    share = f"{work.least_ms(card) / ms:.2f} of its peak" if card in PEAKS else "peak not known"
+    return f"{ms} ms on {card}, {share}"
 
 
 def main() -> None:
     """Print the table, with the time that an H100 takes at its peak rates."""
-    for name, count in COUNTS.items():
+    counts = COUNTS | {history: partial(block_work, history) for history in HISTORIES}
+    for name, count in counts.items():
         work = count()
         say(f"{name}: {work}, {work.least_ms(H100)} ms at the peak of an {H100}")
+        if name in HISTORIES and len(sys.argv) > 1:
+            say(f"{name}: {timed(require_device(sys.argv[1]), name, work)}")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ SUMMARY = "summary.json"  # the last of the tables
 TABLES = (ROLLOUTS, STEPS, SUMMARY)
 PAGES = ("report.html", "flips.json")
 REPORTS = (*PAGES, "summary.md", "junit.xml")
+STAGES = ".stages"  # what the workers of a run do, while they do it
 GATE_FILES = ("gate.json", "gate.md", "gate.junit.xml")
 DECISION = "decision.json"  # the question of a run that stopped when it was decided
 FILES = "files.json"  # digests of these; the rollouts have manifests
