@@ -5,6 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.reading import read_text
+
 _files: list[Path] = []  # of this process; at most one
 
 
@@ -32,6 +35,6 @@ def stages_in(folder: Path) -> list[str]:
     """Return what the processes that write into a folder do."""
     found = []
     for path in sorted(folder.glob("*")):
-        with suppress(OSError):  # its process has ended just now
-            found.append(path.read_text(encoding="utf-8"))
+        with suppress(SimrunError):  # its process has ended just now
+            found.append(read_text(path))
     return found
