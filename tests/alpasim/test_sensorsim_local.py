@@ -34,10 +34,10 @@ def served():
         yield Stub(channel, "SensorsimService"), made
 
 
-def ask(spec=None):
-    """Return the request for the recorded pose after a second, with the moving cars."""
+def ask(t_s=1.0, spec=None):
+    """Return the request for the recorded pose after a time, with the moving cars."""
     scenario = load_scenario(SCENE)
-    (request,) = recorded_requests(scenario, scenario.start_us + 1_000_000)
+    (request,) = recorded_requests(scenario, scenario.start_us + int(t_s * 1e6))
     asked = wire_render_request(scenario.scene_id, request, "png")
     asked.resolution_w, asked.resolution_h = W, H
     asked.camera_intrinsics.CopyFrom(spec or pinhole(W, H, "front"))
