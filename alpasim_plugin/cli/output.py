@@ -96,7 +96,7 @@ class Progress(progress.Progress):
             disable=silent or not console.is_terminal,
         )
         self.silent = silent
-        self.printed_s = 0.0
+        self.printed_s = time.monotonic()
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""

@@ -1,5 +1,6 @@
 """What a process does at the moment, for whoever waits for it."""
 
+from alpasim_plugin.cli import output
 from alpasim_plugin.cli.output import Progress
 from alpasim_plugin.core.stage import announce, shown_in, stages_in
 
@@ -16,6 +17,7 @@ def test_a_stage_is_seen_while_it_lasts_and_not_after(tmp_path):
 def test_what_a_worker_does_is_shown_while_a_run_lasts(tmp_path, monkeypatch, capsys):
     progress = Progress()
     task = progress.add_task("rollouts", total=1)
+    monkeypatch.setattr(output, "LINE_EVERY_S", -1.0)
     monkeypatch.setattr("time.sleep", lambda seconds: progress.advance(task))
     with shown_in(tmp_path):
         announce("fitting a: 3 of 10 updates")
