@@ -10,7 +10,7 @@ import numpy as np
 
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
 from alpasim_plugin.core.types import U8, Frame, Scenario, SensorSpec
-from alpasim_plugin.log import read_asl
+from alpasim_plugin.log import decode_image, encode_image, read_asl
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, VIDEO_NAME
 from alpasim_plugin.log.video import VideoWriter
@@ -25,11 +25,12 @@ class Film:
     """The frames of all cameras, by time."""
 
     def __init__(self) -> None:
-        self._shots: dict[int, dict[str, U8]] = {}
+        self._shots: dict[int, dict[str, bytes]] = {}
 
     def add(self, frame: Frame) -> None:
-        """Keep a frame, no wider than `WIDTH_PX`."""
-        self._shots.setdefault(frame.t_us, {})[frame.camera] = smaller(frame.rgb, WIDTH_PX)
+        """Keep a frame, no wider than `WIDTH_PX`, as a JPEG: a long drive has thousands."""
+        shot = encode_image(smaller(frame.rgb, WIDTH_PX), "jpeg")
+        self._shots.setdefault(frame.t_us, {})[frame.camera] = shot
 
     def save(self, folder: Path) -> None:
         """Write ``front.mp4``; nothing without frames. A camera without a frame at an instant shows
@@ -39,12 +40,13 @@ class Film:
         if not times:
             return
         step_us = int(np.diff(times).min(initial=SECOND_US))
-        shown = {name: rgb for t_us in reversed(times) for name, rgb in self._shots[t_us].items()}
+        shown = {name: shot for t_us in reversed(times) for name, shot in self._shots[t_us].items()}
         tick = Fraction(1, SECOND_US)
         with VideoWriter(folder / VIDEO_NAME, tick, Fraction(SECOND_US, step_us)) as video:
             for t_us in times:
                 shown |= self._shots[t_us]
-                video.write(beside(list(shown.values())), t_us - times[0], step_us)
+                images = beside(list(map(decode_image, shown.values())))
+                video.write(images, t_us - times[0], step_us)
 
 
 def beside(images: Sequence[U8]) -> U8:

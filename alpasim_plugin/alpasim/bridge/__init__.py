@@ -2,5 +2,6 @@
 without torch, numba or PyAV.
 
 The distribution is put together by `build.py`, under the name ``alpasim_onefixer_bridge``: the wire
-messages, Hydra presets, and ``onefixer-bridge``, which asks a renderer service what it is. Nothing here imports the rest of the project.
+messages, Hydra presets, and ``onefixer-bridge``, which asks a renderer service what it is. Nothing
+here imports the rest of the project.
 """
