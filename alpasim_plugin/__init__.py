@@ -9,9 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.core import places
+from alpasim_plugin.core.files import places, real
 from alpasim_plugin.core.lazy import lazy_names
-from alpasim_plugin.core.reading import real
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy

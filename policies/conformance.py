@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.blame import defined, raised
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.parts.blame import defined, raised
 from alpasim_plugin.core.plan_check import (
     blank_scenario,
     plan_problem,

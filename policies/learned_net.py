@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import parsing
-from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.arrays import read_metadata
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.types import F64
 from policies.learned_input import CHANNELS, COMMANDS, FRONT, View
 

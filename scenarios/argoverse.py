@@ -14,6 +14,9 @@ import numpy.typing as npt
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing, real
+from alpasim_plugin.core.files.arrays import parse_npy
+from alpasim_plugin.core.files.tables import Kind
 from alpasim_plugin.core.geometry import (
     centre_line,
     intrinsics,
@@ -22,9 +25,6 @@ from alpasim_plugin.core.geometry import (
     se3,
 )
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import parsing, real
-from alpasim_plugin.core.reading.arrays import parse_npy
-from alpasim_plugin.core.reading.tables import Kind
 from alpasim_plugin.core.types import (
     F64,
     I64,

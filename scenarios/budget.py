@@ -1,7 +1,7 @@
 """What a scenario may hold and cost: the one gate that every source passes.
 
 `check_record` looks at what a reader returned, `check_scenario` at the finished scenario. Ranges of
-single quantities are in `alpasim_plugin.core.limits`.
+single quantities are in `alpasim_plugin.core.files.limits`.
 
 The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km: ground and kerbs by the drive's length, trees and walls by the surroundings, and for
 sharp cameras lane markings, kerbs and road users once more for every halving of their cells.
@@ -11,9 +11,9 @@ from dataclasses import astuple
 
 import numpy as np
 
-from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import limits as b
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.world.ground import BUILT_WHOLE_M

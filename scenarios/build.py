@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.limits import ROAD_M
 from alpasim_plugin.core.geometry import direction_of, heading_of, interpolate, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.limits import ROAD_M
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile

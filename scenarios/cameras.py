@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alpasim_plugin.core import limits as b
-from alpasim_plugin.core.config import Document, load_yaml, validate
+from alpasim_plugin.cameras.lens import check_lens, resized
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import limits as b
+from alpasim_plugin.core.files.config import Document, load_yaml, validate
+from alpasim_plugin.core.files.reading import contents
 from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
-from alpasim_plugin.core.lens import check_lens, resized
-from alpasim_plugin.core.reading.files import contents
 from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
 from scenarios.schema import CameraModel, CameraSet, Rigs
 from scenarios.variation import Drawn
@@ -136,7 +136,7 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
 
                 cameras = rig_cameras(path)
             elif path.suffix == ".json":
-                from scenarios.transforms import read_transforms
+                from alpasim_plugin.cameras.transforms import read_transforms
 
                 cameras = read_transforms(path)
             else:

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.limits import STEP, TIME_STEP_S
 from alpasim_plugin.core.geometry import arc_lengths, offset_trajectory, quat_from_yaw, shifted
-from alpasim_plugin.core.limits import STEP, TIME_STEP_S
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import (
     F64,
     I64,

@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.geometry import centre_line, heading_of
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
 from scenarios.recorded import near

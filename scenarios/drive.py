@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_array, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256, parsing
+from alpasim_plugin.core.files.arrays import open_npy
+from alpasim_plugin.core.files.atomic import write_array, write_json
 from alpasim_plugin.core.geometry import intrinsics, quat_from_yaw
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import file_sha256, parsing
-from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.types import (
     F64,
     Actor,

@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
+from alpasim_plugin.cameras.lens import rays_of
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.lens import rays_of
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive

@@ -22,8 +22,8 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, heading_of, se2, transform_points
-from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
 from scenarios.map_lines import is_left_of, rails

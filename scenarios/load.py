@@ -14,10 +14,10 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.geometry import speeds
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
-from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.types import (
     Actor,
     BackgroundFile,

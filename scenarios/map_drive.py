@@ -13,7 +13,7 @@ import shapely
 from scipy.ndimage import gaussian_filter1d
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path, smooth_path

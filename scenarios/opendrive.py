@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing, some_of
+from alpasim_plugin.core.files.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.geometry import densify, project, rigid, shifted
-from alpasim_plugin.core.limits import LATERAL_OFFSET_M
-from alpasim_plugin.core.reading import parsing, some_of
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType
 from scenarios.map_lines import bordered
 from scenarios.map_route import Spot

@@ -20,9 +20,9 @@ import scipy
 from numpy.polynomial import Polynomial
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.geometry import transform_points
-from alpasim_plugin.core.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)

@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
-from alpasim_plugin.core import reading
+from alpasim_plugin.core import files as reading
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import COORDINATE_M, SOURCE_BYTES
-from alpasim_plugin.core.reading.files import parse_xml
-from alpasim_plugin.core.reading.tables import Kind, check_columns
+from alpasim_plugin.core.files.limits import COORDINATE_M, SOURCE_BYTES
+from alpasim_plugin.core.files.reading import parse_xml
+from alpasim_plugin.core.files.tables import Kind, check_columns
 from alpasim_plugin.core.types import (
     F64,
     I64,

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
-from alpasim_plugin.core import limits as b
+from alpasim_plugin.core.files import limits as b
 from alpasim_plugin.core.printing import say
 from scenarios.schema_parts import (
     ActorSpec,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from alpasim_plugin.core import limits as b
+from alpasim_plugin.core.files import limits as b
 
 Angle = Annotated[float, Field(ge=-1e4, le=1e4)]  # radians, not wrapped
 Turn = Literal["left", "straight", "right"]

@@ -6,11 +6,11 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from alpasim_plugin.core.config import Document, load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import contents, parsing, real
+from alpasim_plugin.core.files.config import Document, load_yaml
 from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
-from alpasim_plugin.core.reading import contents, parsing, real
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
 from scenarios.variation import Drawn

@@ -13,12 +13,12 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import Field
 
-from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_text, real
+from alpasim_plugin.core.files.config import load_yaml, validate
+from alpasim_plugin.core.files.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.core.parts import names as part_names
-from alpasim_plugin.core.reading import read_text, real
 from scenarios.schema_parts import Part, field, within
 from scenarios.sources import import_advice, source_of
 

@@ -30,10 +30,10 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.reading import parse_xml
 from alpasim_plugin.core.geometry import heading_of, quat_from_matrix, transform_points
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import parsing
-from alpasim_plugin.core.reading.files import parse_xml
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_wide

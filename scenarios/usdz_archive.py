@@ -9,13 +9,13 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.config import parse
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parse_json, parsing
+from alpasim_plugin.core.files.config import parse
+from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
+from alpasim_plugin.core.files.reading import check_names, open_regular
+from alpasim_plugin.core.files.tables import parse_parquet
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
-from alpasim_plugin.core.reading import parse_json, parsing
-from alpasim_plugin.core.reading.files import check_names, open_regular
-from alpasim_plugin.core.reading.tables import parse_parquet
 from scenarios.recorded import SourceFiles
 
 

@@ -20,9 +20,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
+from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.geometry import shifted
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
 from scenarios.recorded import MAX_REACH_M

@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 
 from alpasim_plugin import __version__
-from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import atomic_file
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import (

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.config import Document, apply_overrides, dotted, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import real
+from alpasim_plugin.core.files.config import Document, apply_overrides, dotted, validate
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import real
 from alpasim_plugin.core.seeding import stream
 from scenarios.schema import RangeSpec, ScenarioSpec
 from scenarios.schema_parts import Part

@@ -16,7 +16,7 @@ from hypothesis import settings
 
 from tests.examples import PROFILE, examples
 from tests.laboratory import NOT_COLLECTED, laboratory_is_installed
-from tests.report.browser import Browser, find_chromium
+from tests.pages.browser import Browser, find_chromium
 
 pytest_plugins = ("tests.durations",)
 settings.register_profile(

@@ -1,5 +1,5 @@
 """Data flows one way (docs/architecture.md): a room imports what stands before it in `ROOMS`, never
-what stands after it.
+what stands after it. Folders inside a room have an order too.
 """
 
 import ast
@@ -14,27 +14,54 @@ import pytest
 REPO = Path(__file__).resolve().parents[1]
 A = "alpasim_plugin."
 
-# The rooms in the order in which data flows, and what each may import besides itself and `BASE`.
-BASE = (A + "core",)
+# What every room may import. Within it, too, a folder imports only those before it.
+BASE = (A + "core", A + "core.files", A + "core.parts")
+CLOUDS = (A + "gaussians", A + "gaussians.files", A + "gaussians.raster")
+GAUSSIANS = (*CLOUDS, A + "gaussians.scene", A + "gaussians.fit")
+LOG = (A + "log.wire", A + "log")
+RUN_FOLDER = A + "log.run_folder"
+# The rooms, and the folders inside of them, in the order in which data flows, and what each may
+# import besides itself and `BASE`.
 STAGES = {
     A + "world": (),
-    A + "gaussians": (A + "world",),
-    "scenarios": (A + "world",),
-    A + "renderers": (A + "gaussians", A + "world"),
-    A + "drives": (A + "gaussians", A + "world", "scenarios"),
-    A + "fixers": (A + "gaussians", A + "world"),
+    A + "cameras": (),
+    A + "gaussians": (),
+    A + "gaussians.files": (A + "gaussians",),
+    A + "gaussians.raster": (A + "gaussians",),
+    A + "gaussians.scene": CLOUDS,
+    A + "gaussians.fit": (*CLOUDS, A + "gaussians.scene"),
+    A + "streets": (A + "world", *CLOUDS, A + "gaussians.scene"),
+    "scenarios": (A + "world", A + "cameras"),
+    A + "renderers": (A + "world", A + "cameras", *GAUSSIANS, A + "streets"),
+    A + "drives": (A + "world", A + "cameras", *GAUSSIANS, "scenarios"),
+    A + "fixers.network": (),
+    A + "fixers.semantic_map": (A + "world", A + "cameras", *CLOUDS),
+    A + "fixers": (
+        A + "world",
+        A + "cameras",
+        *CLOUDS,
+        A + "fixers.network",
+        A + "fixers.semantic_map",
+    ),
     "policies": (),
     A + "control": (),
-    A + "log": (),
-    A + "alpasim.client": (A + "world", A + "control", A + "log"),  # parts that are a service's
-    "evaluators": (A + "log",),
+    A + "log.wire": (),
+    A + "log": (A + "log.wire",),
+    RUN_FOLDER: LOG,
+    A + "alpasim.client": (A + "world", A + "control", *LOG),  # parts that are a service's
+    "evaluators.metrics": (RUN_FOLDER,),
+    "evaluators.statistics": (RUN_FOLDER, "evaluators.metrics"),
+    "evaluators.alpasim": ("evaluators.metrics", "evaluators.statistics"),
+    "evaluators.pages": (*LOG, RUN_FOLDER, "evaluators.metrics", "evaluators.statistics"),
 }
+# The public face of the evaluators: it imports names of its folders, and holds nothing else.
+FACES = ("evaluators",)
 # These compose the stages: each may import everything that stands before it, but no plug-in room.
 AFTER_THE_STAGES = (A + "runs", A + "alpasim", A + "gym", A + "cli")
 # Rooms that register themselves by entry points, as another distribution does. Nobody imports them.
 PLUG_INS = (A + "block_fixers", A + "lab")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "simrun")
-ROOMS = (*BASE, *STAGES, *AFTER_THE_STAGES, *PLUG_INS)
+ROOMS = (*BASE, *STAGES, *FACES, *AFTER_THE_STAGES, *PLUG_INS)
 
 
 @dataclass(frozen=True)
@@ -75,8 +102,9 @@ def modules():
 
 
 def room_of(module):
-    """Return the room that a module lies in; None for the face of the package."""
-    return next((room for room in ROOMS if module == room or module.startswith(room + ".")), None)
+    """Return the innermost room that a module lies in; None for the face of the package."""
+    rooms = [room for room in ROOMS if module == room or module.startswith(room + ".")]
+    return max(rooms, key=len, default=None)
 
 
 def imported(nodes):
@@ -91,11 +119,11 @@ def imported(nodes):
 
 def may_import(room):
     """Return the rooms that a room may import besides itself."""
-    if room in PLUG_INS:  # the laboratory may use the block generators, which ship without it
-        return set(ROOMS[: ROOMS.index(room)])
+    if room in BASE:
+        return set(BASE[: BASE.index(room)])
     if room in STAGES:
         return {*BASE, *STAGES[room]}
-    return set(ROOMS[: ROOMS.index(room)])
+    return set(ROOMS[: ROOMS.index(room)])  # the laboratory may use the block generators
 
 
 def upward_imports(module):
@@ -104,6 +132,8 @@ def upward_imports(module):
     if room is None:
         return []
     allowed = may_import(room)
+    if module.path.name == "__init__.py":  # a face gives names of the folders below it
+        allowed = {*allowed, *(name for name in ROOMS if name.startswith(room + "."))}
     found = {(name, room_of(name)) for name in imported(module.nodes)}
     return [
         f"{module.name} imports {name}"

@@ -125,12 +125,12 @@ def test_no_module_binds_a_name_twice():
 
 # Module -> why it opens files by itself.
 READERS = {
-    "alpasim_plugin.core.reading.files": "it is the reader",
+    "alpasim_plugin.core.files.reading": "it is the reader",
     "alpasim_plugin.cli.main": "the null device",
-    "alpasim_plugin.core.reading.arrays": "memory maps, after `check_regular`",
-    "alpasim_plugin.core.reading.tables": "parquet, after `check_regular`",
-    "alpasim_plugin.core.atomic": "what it has just written",
-    "alpasim_plugin.core.lock": "a lock file, after a check of its own",
+    "alpasim_plugin.core.files.arrays": "memory maps, after `check_regular`",
+    "alpasim_plugin.core.files.tables": "parquet, after `check_regular`",
+    "alpasim_plugin.core.files.atomic": "what it has just written",
+    "alpasim_plugin.core.files.lock": "a lock file, after a check of its own",
     "alpasim_plugin.gaussians.files.ply": "large arrays, of a stream from `open_regular`",
     "alpasim_plugin.cli.new": "templates inside the package",
     "alpasim_plugin.alpasim.bridge.build": "sources inside the package",
@@ -139,7 +139,7 @@ READING = {"open", "os.open", "np.load", "np.fromfile", "np.memmap", "cv2.imread
 
 
 def reads_files(module):
-    """Tell whether a module opens files for reading other than by `alpasim_plugin.core.reading`."""
+    """Tell whether a module opens files for reading other than by `alpasim_plugin.core.files`."""
     for node in module.nodes:
         if not isinstance(node, ast.Call):
             continue
@@ -159,7 +159,7 @@ RAISING = {"exists", "is_file", "is_dir", "is_symlink", "resolve"}
 
 def test_paths_of_users_go_through_functions_that_do_not_raise():
     """`pathlib` raises for names that are too long and for circles of links; `os.path` and
-    `alpasim_plugin.core.reading.real` do not.
+    `alpasim_plugin.core.files.real` do not.
     """
     found = [
         f"{module.name}: {ast.unparse(node)}"

@@ -58,8 +58,8 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import (
     from_grid,
     to_grid,
 )
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
 
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"

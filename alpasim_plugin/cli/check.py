@@ -27,7 +27,7 @@ from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.tables import again
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, in_words
-from evaluators.numbers import plural
+from evaluators.statistics.numbers import plural
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
 from scenarios.suite import expand

@@ -9,20 +9,20 @@ from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import first_screen, show, terminal_width, warn
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
-from evaluators.numbers import plural
-from evaluators.opening import Run, read_run
-from evaluators.report.tables import PairRow, pair_rows
-from evaluators.report.terminal import metric_lines
+from evaluators.pages.tables import PairRow, pair_rows
+from evaluators.pages.terminal import metric_lines
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
+from evaluators.statistics.numbers import plural
+from evaluators.statistics.opening import Run, read_run
 from evaluators.statistics.outcomes import LISTED, outcome_table
 from evaluators.statistics.summary import CUT_RULES
 

@@ -12,8 +12,8 @@ from rich.markdown import Markdown
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_text
 from alpasim_plugin.core.flags import Positional
-from alpasim_plugin.core.reading import read_text
 
 FOLDERS = (
     Path(__file__).resolve().parents[2] / "docs",

@@ -11,11 +11,11 @@ import typer
 
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
-from alpasim_plugin.core import places
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.core.files import places
+from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.runs.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"

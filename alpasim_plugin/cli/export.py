@@ -19,8 +19,8 @@ from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 from alpasim_plugin.runs.export import export_run, export_scenes
 from alpasim_plugin.runs.recordings import export_mcap, require_mcap
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.opening import Run
-from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
+from evaluators.pages.cells import Wanted, cells_of, check_wanted, read_logs
+from evaluators.statistics.opening import Run
 
 SHOWN_CELLS = 4  # in the message that there are several
 

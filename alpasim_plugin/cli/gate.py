@@ -17,9 +17,7 @@ from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.self_test import run_self_test
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
-from evaluators.numbers import plural
-from evaluators.opening import read_run
-from evaluators.report.ci import write_gate_files
+from evaluators.pages.ci import write_gate_files
 from evaluators.statistics.baselines import (
     check_matches,
     is_repeatable,
@@ -30,6 +28,8 @@ from evaluators.statistics.baselines import (
 from evaluators.statistics.boundary_gate import boundary_verdict
 from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.gate import GateVerdict, check_gate, check_number_of_scenes, load_gate
+from evaluators.statistics.numbers import plural
+from evaluators.statistics.opening import read_run
 from scenarios.suite import load_suite
 
 EPILOG = """

@@ -8,8 +8,8 @@ from typing import Any
 from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
-from evaluators.numbers import plural
-from evaluators.report.runs import RunEntry, find_runs, runs_table
+from evaluators.pages.runs import RunEntry, find_runs, runs_table
+from evaluators.statistics.numbers import plural
 
 VALUES = ("mean", "ci95_clustered", "n_rollouts")
 

@@ -23,8 +23,8 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
+from alpasim_plugin.core.files.places import damaged_kernels
 from alpasim_plugin.core.lazy import installed_names
-from alpasim_plugin.core.places import damaged_kernels
 from alpasim_plugin.core.printing import print_any_character, say, warn
 
 # Panel of the help page -> verb -> module of this package and its function, and one line of help,
@@ -301,7 +301,7 @@ def _run(args: list[str]) -> int:
         message = error.format_message()
         errors = getattr(error.__cause__, "errors", None)  # of pydantic, which Typer asks
         if errors is not None:
-            from alpasim_plugin.core.reading.files import wanted_of
+            from alpasim_plugin.core.files.reading import wanted_of
 
             problem = errors()[0]
             found = f"{problem['input']!r}, wanted {wanted_of(problem)}"

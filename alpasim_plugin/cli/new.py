@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.cli.output import show
-from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.flags import Positional
 
 Kind = Literal["policy", "scenario", "renderer", "fixer", "metric"]

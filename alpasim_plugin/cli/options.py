@@ -15,8 +15,8 @@ import typer
 from typer.core import TyperArgument
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.limits import SEED, SEEDS
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.core.limits import SEED, SEEDS
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 
 FIXER_PREFIX = "fixer."

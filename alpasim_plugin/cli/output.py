@@ -15,19 +15,19 @@ from rich import progress
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.files.stage import stages_in
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.printing import warn as warn
-from alpasim_plugin.core.stage import stages_in
 from alpasim_plugin.log.run_folder.schema import STAGES
-from evaluators.numbers import plural
+from evaluators.statistics.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
     from alpasim_plugin.core.types import Scenario
     from alpasim_plugin.runs.execute import Threads
     from alpasim_plugin.runs.plan import RunPlan
-    from evaluators.opening import Run
     from evaluators.statistics.decision import State
+    from evaluators.statistics.opening import Run
 
 SHOWN_CHANGES = 4
 SHOWN_SCENES = 5
@@ -69,8 +69,8 @@ class Escaped:
 
 def first_screen(run: Run) -> list[Any]:
     """Return the one table of a run as lines for `show`."""
-    from evaluators.report.overview import overview_of
-    from evaluators.report.terminal import overview_lines
+    from evaluators.pages.overview import overview_of
+    from evaluators.pages.terminal import overview_lines
 
     return list(overview_lines(overview_of(run), terminal_width()))
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
 from alpasim_plugin.cli.output import varied_numbers
-from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import atomic_file
 from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.core.types import Actor, Box, Scenario, Trajectory
 from alpasim_plugin.log.run_folder.writer import scene_as_json
@@ -23,7 +23,7 @@ from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
-from evaluators.report.birdseye import chord_angle, drawn_map
+from evaluators.pages.birdseye import chord_angle, drawn_map
 
 MOMENTS = 5  # that are shown, evenly from the first frame to the end
 MARGIN_M = 15.0

@@ -39,18 +39,18 @@ from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.schema import LOCK, OUTPUT_NAME
 from alpasim_plugin.runs.decide import SequentialTest, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
-from alpasim_plugin.runs.executors.choice import parse_executor
+from alpasim_plugin.runs.executor_choice import parse_executor
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
 from alpasim_plugin.runs.vary import BoundarySearch, parse_sweeps
 from evaluators import preset as find_preset
-from evaluators.numbers import plural
-from evaluators.opening import read_run
-from evaluators.report.decision import decision_lines
+from evaluators.pages.decision import decision_lines
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
+from evaluators.statistics.numbers import plural
+from evaluators.statistics.opening import read_run
 from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand
 
@@ -347,7 +347,7 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
 
 
 def _print_result(result: RunResult) -> None:
-    from evaluators.report.terminal import next_line
+    from evaluators.pages.terminal import next_line
 
     root = result.root
     run = read_run(root)

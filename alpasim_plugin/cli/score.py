@@ -16,8 +16,8 @@ from evaluators import preset as find_preset
 from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import presets
-from evaluators.opening import read_run
-from evaluators.report.terminal import render_presets
+from evaluators.pages.terminal import render_presets
+from evaluators.statistics.opening import read_run
 
 SHOWN_FAILURES = 5
 

@@ -24,11 +24,11 @@ from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.opening import Run as OpenedRun
-from evaluators.opening import read_run
-from evaluators.report.terminal import metric_lines
-from evaluators.viewer.cells import Wanted
-from evaluators.viewer.page import MB, write_page
+from evaluators.pages.cells import Wanted
+from evaluators.pages.page import MB, write_page
+from evaluators.pages.terminal import metric_lines
+from evaluators.statistics.opening import Run as OpenedRun
+from evaluators.statistics.opening import read_run
 
 PAGE = "view.html"
 

@@ -10,8 +10,8 @@ from alpasim_plugin.core.flags import Positional
 from alpasim_plugin.runs.logged_rollout import named_rollout
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.opening import read_run
-from evaluators.viewer.cause import cause_of, worst_failure, write_cause
+from evaluators.pages.cause import cause_of, worst_failure, write_cause
+from evaluators.statistics.opening import read_run
 
 EPILOG = """
 Examples:

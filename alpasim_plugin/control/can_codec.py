@@ -15,8 +15,8 @@ import can
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.config import load_yaml, validate
 from alpasim_plugin.core.lazy import require_library
 
 FrameId = tuple[int, bool]  # identifier, and whether it is an extended one of 29 bits

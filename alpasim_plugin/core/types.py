@@ -119,7 +119,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class LensModel:
-    """What a lens does to rays, beside the ``K`` of its camera; equations in `core.lens`."""
+    """What a lens does to rays, beside the ``K`` of its camera; equations in `cameras.lens`."""
 
     kind: Literal["opencv", "fisheye", "ftheta"]
     # opencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. fisheye: k1 to k4. ftheta: the distance from the
@@ -157,7 +157,7 @@ class SensorSpec:
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """When a rolling shutter exposes the pixels of a frame; see `core.shutter`."""
+    """When a rolling shutter exposes the pixels of a frame; see `cameras.shutter`."""
 
     # (H, W), (H, 1) or (1, W): 0 at shutter start, 1 at its end; NaN: nobody looks at that pixel
     share: F32

@@ -13,12 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_bytes, read_json, read_json_object
+from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
+from alpasim_plugin.core.files.images import PNG
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import read_bytes, read_json, read_json_object
-from alpasim_plugin.core.reading.images import PNG
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source

@@ -20,10 +20,10 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import natural_order, read_bytes, real
+from alpasim_plugin.core.files.limits import SOURCE_BYTES
+from alpasim_plugin.core.files.reading import parsing
 from alpasim_plugin.core.geometry import inverse, se3
-from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import natural_order, read_bytes, real
-from alpasim_plugin.core.reading.files import parsing
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.lens import Lens

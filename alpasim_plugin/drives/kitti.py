@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import shifted
-from alpasim_plugin.core.reading import (
+from alpasim_plugin.core.files import (
     natural_order,
     parsing,
     read_bytes,
@@ -24,7 +23,8 @@ from alpasim_plugin.core.reading import (
     real,
     some_of,
 )
-from alpasim_plugin.core.reading.images import check_image
+from alpasim_plugin.core.files.images import check_image
+from alpasim_plugin.core.geometry import shifted
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.source import PERIOD_US, SourceDrive, name_numbers
 from alpasim_plugin.gaussians.fit.lens import FROM_CORNER, Lens

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import contents, natural_order, parsing, real, some_of
+from alpasim_plugin.core.files import contents, natural_order, parsing, real, some_of
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing

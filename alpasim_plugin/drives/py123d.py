@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.limits import BODY_M
 from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.limits import BODY_M
-from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
 from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
 from alpasim_plugin.gaussians.fit.lens import FROM_CORNER, Lens

@@ -11,8 +11,8 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.escape import markdown as escape
+from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.geometry import inverse, shifted
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.types import F32

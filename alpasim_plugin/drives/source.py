@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import Bound
-from alpasim_plugin.core.reading import natural_order
+from alpasim_plugin.core.files import natural_order
+from alpasim_plugin.core.files.limits import Bound
 from alpasim_plugin.core.types import F64, Actor, Bool, Vehicle
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import parsing, read_json_object
+from alpasim_plugin.core.files import parsing, read_json_object
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.build import (

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.arrays import read_metadata, refuse_shards
+from alpasim_plugin.core.files.atomic import write_safetensors
+from alpasim_plugin.core.files.reading import parse_json
 from alpasim_plugin.core.interfaces import Declaration, Fixer
-from alpasim_plugin.core.reading.arrays import read_metadata, refuse_shards
-from alpasim_plugin.core.reading.files import parse_json
 from alpasim_plugin.fixers.settings import WeightedSettings
 
 if TYPE_CHECKING:

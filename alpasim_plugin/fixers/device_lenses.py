@@ -1,4 +1,4 @@
-"""Join the planes of the pinholes that cover a lens on the device that drew them: what `core.lens`
+"""Join the planes of the pinholes that cover a lens on the device that drew them: what `cameras.lens`
 does with arrays.
 """
 
@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.cameras.lens import NOT_HELD, Lens
 from alpasim_plugin.core.devices import upload
-from alpasim_plugin.core.lens import NOT_HELD, Lens
 
 LEAST = 1e-6  # weight by which is divided where no pinhole shows the lens
 
@@ -45,7 +45,7 @@ def joined_planes(sides: Sequence[Lens], planes: Sequence[Any]) -> Any:
 def joined_tensor(
     sides: Sequence[Lens], images: Sequence[Tensor], outside: int = 0, holds: bool = False
 ) -> Tensor:
-    """Return the lens's image of those of its pinholes ``(h, w, C)``; see `core.lens.joined_image`."""
+    """Return the lens's image of those of its pinholes ``(h, w, C)``; see `cameras.lens.joined_image`."""
     first = images[0]
     shape = sides[0].height, sides[0].width
     total = torch.zeros((*shape, first.shape[-1]), device=first.device)

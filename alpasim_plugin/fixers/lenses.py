@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core import lens
-from alpasim_plugin.core.lens import Lens
+from alpasim_plugin.cameras import lens
+from alpasim_plugin.cameras.lens import Lens
 from alpasim_plugin.core.types import Frame
 
 
 def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
-    """Return the frame of a camera's lens, with its references; see `core.lens.joined`. Planes that
+    """Return the frame of a camera's lens, with its references; see `cameras.lens.joined`. Planes that
     are on a device stay there.
     """
     planes = [frame.pending for frame in frames]
@@ -26,7 +26,7 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
 
 def joined_image(sides: Sequence[Lens], images: Sequence[Any]) -> Any:
     """Return the lens's image of those of its pinholes ``(h, w, C)``, arrays or tensors; see
-    `core.lens.joined_image`.
+    `cameras.lens.joined_image`.
     """
     if isinstance(images[0], np.ndarray) or sides[0].resample is None:
         return lens.joined_image(sides, images)

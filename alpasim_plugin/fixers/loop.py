@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.cameras.lens import blackened
+from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
-from alpasim_plugin.core.lens import blackened
-from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.parts.spec import MODES
 from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario

@@ -19,10 +19,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from alpasim_plugin.cameras.lens import lens_camera
+from alpasim_plugin.cameras.shutter import Band, bands, joined
 from alpasim_plugin.core.devices import batched
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.lens import lens_camera
-from alpasim_plugin.core.shutter import Band, bands, joined
 from alpasim_plugin.core.types import (
     F64,
     I64,

@@ -12,8 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import Document, apply_overrides, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.config import Document, apply_overrides, load_yaml, validate
 from alpasim_plugin.fixers.network import schedule
 
 Positive = Annotated[int, Field(ge=1)]

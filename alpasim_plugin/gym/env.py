@@ -16,8 +16,8 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.bicycle import Command, step
 from alpasim_plugin.control.tracker import check_interval, planar, spatial
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.interfaces import Controller
-from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runs.executors.local import J, Lost, R, run_jobs
+from alpasim_plugin.runs.local_executor import J, Lost, R, run_jobs
 
 
 def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterator[tuple[J, R]]:

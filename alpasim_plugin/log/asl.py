@@ -15,11 +15,11 @@ from typing import Any, BinaryIO
 
 from google.protobuf.message import DecodeError
 
-from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.files.atomic import disk_error
+from alpasim_plugin.core.files.limits import ENTRY_BYTES, LOG_BYTES
+from alpasim_plugin.core.files.reading import open_regular
 from alpasim_plugin.core.interfaces import EMPTY
-from alpasim_plugin.core.limits import ENTRY_BYTES, LOG_BYTES
-from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.log.wire import logging_pb2
 
 _LENGTH = struct.Struct(">I")

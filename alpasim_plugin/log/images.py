@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import images
+from alpasim_plugin.core.files import images
 from alpasim_plugin.core.types import U8
 
 ImageEncoding = Literal["png", "jpeg"]

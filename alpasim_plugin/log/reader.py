@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import BODY_M
+from alpasim_plugin.core.files.limits import BODY_M
 from alpasim_plugin.core.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import (

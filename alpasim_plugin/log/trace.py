@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing, read_json_lines
+from alpasim_plugin.core.files.atomic import atomic_file
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.reading import parsing, read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import temporary_path
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.limits import ARCHIVE_BYTES
-from alpasim_plugin.core.reading import check_regular
+from alpasim_plugin.core.files import check_regular
+from alpasim_plugin.core.files.atomic import temporary_path
+from alpasim_plugin.core.files.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.types import I64, U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state

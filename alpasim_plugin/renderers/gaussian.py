@@ -15,11 +15,11 @@ from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView, with_background
 from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.rolling import SplatRenderer
+from alpasim_plugin.streets.builder import build_scene
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.types import F32, F64, Scenario
-from alpasim_plugin.gaussians.scene.build_facades import lit_windows, place_houses
-from alpasim_plugin.gaussians.scene.build_street import lamp_posts
-from alpasim_plugin.gaussians.scene.site import make_site, path_of, section_of
 from alpasim_plugin.renderers.view import View
+from alpasim_plugin.streets.build_facades import lit_windows, place_houses
+from alpasim_plugin.streets.build_street import lamp_posts
+from alpasim_plugin.streets.site import make_site, path_of, section_of
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, height_at
 
 SIGHT_M = 150.0

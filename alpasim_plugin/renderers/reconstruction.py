@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.cache import cached
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
     F32,
@@ -33,8 +33,6 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.gaussians.fit.lens import gain_between
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.build_actors import build_actor
-from alpasim_plugin.gaussians.scene.builder import finished
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
 from alpasim_plugin.gaussians.scene.scene_graph import (
     Level,
@@ -54,6 +52,8 @@ from alpasim_plugin.renderers.reconstruction_key import (
 )
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
 from alpasim_plugin.renderers.rolling import SplatRenderer
+from alpasim_plugin.streets.build_actors import build_actor
+from alpasim_plugin.streets.builder import finished
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import lens_camera
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import lens_camera
+from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.loop import fit

@@ -16,9 +16,9 @@ import numpy as np
 
 from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files.arrays import read_npz
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.reading import file_sha256
-from alpasim_plugin.core.reading.arrays import read_npz
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe

@@ -14,9 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import lens_camera
+from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, rigid, shifted
-from alpasim_plugin.core.lens import lens_camera
-from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera

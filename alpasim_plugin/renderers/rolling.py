@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+from alpasim_plugin.cameras.shutter import Band, at_share, bands, motion_px
 from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.shutter import Band, at_share, bands, motion_px
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
 from alpasim_plugin.gaussians.raster.output import RasterOutput

@@ -6,11 +6,11 @@ from itertools import islice
 
 import numpy as np
 
+from alpasim_plugin.cameras.shutter import rolling_exposure
 from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import cv2
 
+from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.control import Controller
-from alpasim_plugin.core.atomic import disk_error
 from alpasim_plugin.core.errors import FaultOfPart, SimrunError
+from alpasim_plugin.core.files.atomic import disk_error
+from alpasim_plugin.core.files.places import require_kernels
+from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
-from alpasim_plugin.core.places import require_kernels
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.asl import copy_log

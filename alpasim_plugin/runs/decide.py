@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.files.stage import shown_in
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.stage import shown_in
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
@@ -27,8 +27,8 @@ from alpasim_plugin.runs.cell import (
     rescore_cell,
     run_cell,
 )
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor
-from alpasim_plugin.runs.executors.local import Lost, run_jobs
+from alpasim_plugin.runs.executor_choice import LOCAL, Executor
+from alpasim_plugin.runs.local_executor import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
 OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
@@ -163,7 +163,7 @@ def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done
     if how.executor.is_local:
         yield from _run_local([(cell, None) for cell in todo], plan, root, how)
     elif todo:
-        from alpasim_plugin.runs.executors.ray_backend import run_on_ray
+        from alpasim_plugin.runs.ray_executor import run_on_ray
 
         workers = how.threads.workers
         for cell, got in run_on_ray(plan, todo, root, how.executor, workers, how.limit_s):

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from alpasim_plugin.core.atomic import atomic_file, atomic_folder, write_json, write_text
-from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, write_json, write_text
+from alpasim_plugin.core.files.config import load_yaml
+from alpasim_plugin.core.files.limits import ARCHIVE_BYTES
+from alpasim_plugin.core.files.reading import open_regular
 from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.core.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.parts import require_installed
-from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.core.types import (
     Scenario,
 )

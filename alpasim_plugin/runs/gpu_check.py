@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from alpasim_plugin.cameras.lens import resized
 from alpasim_plugin.core.devices import download, facts_of, require_device, upload
-from alpasim_plugin.core.lens import resized
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, Frame, RenderRequest, Scenario

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.blame import blaming, defined, is_own
 from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
+from alpasim_plugin.core.parts.blame import blaming, defined, is_own
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import (
     Frame,

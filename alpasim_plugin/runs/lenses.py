@@ -5,9 +5,9 @@ the loop see the lens.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from alpasim_plugin.cameras.lens import resized, sides_of
+from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.interfaces import Renderer, complete
-from alpasim_plugin.core.lens import resized, sides_of
-from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.types import CameraSpec, Frame, RecordedFrame, RenderRequest
 
 SMALLER = 4  # by side, of the cameras whose pinholes are counted

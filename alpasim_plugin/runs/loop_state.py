@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.cameras.shutter import rolling_exposure
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.geometry import (
     arc_lengths,
@@ -25,7 +26,6 @@ from alpasim_plugin.core.geometry import (
     wrap_angle,
     yaw_of,
 )
-from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import (
     F64,
     I64,

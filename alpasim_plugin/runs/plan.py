@@ -279,7 +279,7 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
             )
         shown_by_files = [actor for actor in scenario.actors if actor.appearance is not None]
         if shown_by_files:
-            from alpasim_plugin.gaussians.scene.build_actors import build_actor  # loads kernels
+            from alpasim_plugin.streets.build_actors import build_actor  # loads kernels
 
             for actor in shown_by_files:
                 build_actor(actor, scenario)

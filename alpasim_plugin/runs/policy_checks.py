@@ -14,8 +14,8 @@ from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig
 from alpasim_plugin.runs.execute import HowToRun
-from alpasim_plugin.runs.executors.local import Lost, run_jobs
 from alpasim_plugin.runs.guards import checked_sensors
+from alpasim_plugin.runs.local_executor import Lost, run_jobs
 from alpasim_plugin.runs.plan import RunPlan
 from policies.base import make_policy
 from policies.conformance import check_policy

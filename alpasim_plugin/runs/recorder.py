@@ -16,10 +16,10 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.files.places import temporary_folder
+from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.places import temporary_folder
-from alpasim_plugin.core.stage import announce
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,

@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files import read_json, real
+from alpasim_plugin.core.files.atomic import atomic_file
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.core.reading import read_json, real
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
-from evaluators.opening import Run
-from evaluators.report.rollouts import events_of
-from evaluators.viewer.cells import Logs, WatchedCell
-from evaluators.viewer.images import NO_FRAMES, Source, sources
+from evaluators.pages.cells import Logs, WatchedCell
+from evaluators.pages.images import NO_FRAMES, Source, sources
+from evaluators.pages.rollouts import events_of
+from evaluators.statistics.opening import Run
 
 Rgb = tuple[float, float, float]
 Message = JsonObject
@@ -69,7 +69,7 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
     Args:
         run: The run.
         cell: Which ones.
-        logs: Its logs (`evaluators.viewer.cells.read_logs`).
+        logs: Its logs (`evaluators.pages.cells.read_logs`).
         path: The file; replaced.
 
     Returns:

@@ -20,11 +20,11 @@ from typing import Self
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.atomic import atomic_folder, write_bytes
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.files import natural_order, real
+from alpasim_plugin.core.files.atomic import atomic_folder, write_bytes
+from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.core.reading import natural_order, real
-from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter

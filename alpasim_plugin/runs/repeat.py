@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from alpasim_plugin.core.atomic import scratch_folder
+from alpasim_plugin.core.files.atomic import scratch_folder
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of

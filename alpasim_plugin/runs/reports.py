@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import U8, RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
@@ -14,18 +14,18 @@ from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, REPORTS
 from alpasim_plugin.runs.film import beside
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
-from evaluators.opening import Run, read_run
-from evaluators.report.ci import write_junit, write_summary_md
-from evaluators.report.flips import (
+from evaluators.pages.cause import cause_of, write_cause
+from evaluators.pages.cells import read_log
+from evaluators.pages.ci import write_junit, write_summary_md
+from evaluators.pages.flips import (
     FLIPS_NAME,
     Flip,
     find_flips,
     flip_entries,
     key_of_entry,
 )
-from evaluators.report.html import write_report
-from evaluators.viewer.cause import cause_of, write_cause
-from evaluators.viewer.cells import read_log
+from evaluators.pages.html import write_report
+from evaluators.statistics.opening import Run, read_run
 
 
 def write_reports(root: Path, page: bool = True) -> Path | None:

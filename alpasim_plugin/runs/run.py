@@ -11,9 +11,9 @@ from typing import ClassVar, Protocol
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.reading import real, some_of
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
 from alpasim_plugin.log.run_folder.checksums import state_files
@@ -34,7 +34,7 @@ from alpasim_plugin.log.run_folder.schema import (
 from alpasim_plugin.log.run_folder.writer import unfinish, write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor
+from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import RunPlan
 from alpasim_plugin.runs.policy_checks import check_policies
 from alpasim_plugin.runs.provenance import hardware, project, versions

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import encode_image, read_asl

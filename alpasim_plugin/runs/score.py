@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.files import file_sha256, real
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.reading import file_sha256, real
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
 from alpasim_plugin.log.run_folder.writer import unfinish, write_parquet, write_scene, writing

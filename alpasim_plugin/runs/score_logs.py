@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.files import real, some_of
+from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec
-from alpasim_plugin.core.reading import real, some_of
 from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of

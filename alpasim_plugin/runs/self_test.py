@@ -10,9 +10,9 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import Progress, execute_run
 from evaluators.metrics.presets import DEFAULT
-from evaluators.opening import read_run
 from evaluators.statistics.baselines import table_of_run
 from evaluators.statistics.gate import GateSpec, GateVerdict, check_gate
+from evaluators.statistics.opening import read_run
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
 

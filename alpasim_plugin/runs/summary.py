@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import real
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import real
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.rows import rollouts_of_table

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.places import temporary_folder
-from alpasim_plugin.core.reading import parsing, real
+from alpasim_plugin.core.files import parsing, real
+from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE

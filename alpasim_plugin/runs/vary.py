@@ -23,7 +23,7 @@ from alpasim_plugin.core.seeding import POINT
 from alpasim_plugin.runs.plan import Cell, RunPlan
 from alpasim_plugin.runs.run import Progress
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
-from evaluators.report.boundary import sentence_of
+from evaluators.pages.boundary import sentence_of
 from evaluators.statistics.boundary import (
     MOST_POINTS,
     STEPS,

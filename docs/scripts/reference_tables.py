@@ -17,8 +17,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from alpasim_plugin.cli.main import PANELS, load_verb
+from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
-from evaluators.scores.table import BENCHMARKS
 from scenarios.schema import models
 from scenarios.schema_parts import Part
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from alpasim_plugin.core.config import load_yaml, validate
+from alpasim_plugin.core.files.config import load_yaml, validate
 from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics.presets import ALPASIM, Preset
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
+from evaluators.metrics import nuplan
 from evaluators.metrics.contact import (
     FRONT,
     LATERAL,
@@ -25,8 +26,7 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import handover_us, series, with_preset
-from evaluators.scores import nuplan
-from evaluators.scores.scored import ScoredRollout
+from evaluators.metrics.scored import ScoredRollout
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"

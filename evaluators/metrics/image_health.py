@@ -20,7 +20,7 @@ def decode(image: LoggedImage) -> U8:
     Raises:
         InputError: The bytes are no image, or one larger than the bounds.
     """
-    from alpasim_plugin.core.reading.images import decode_image
+    from alpasim_plugin.core.files.images import decode_image
 
     where = f"camera {image.camera!r} at {image.end_us} us"
     return decode_image(image.data, where, "log PNG or JPEG")

@@ -1,7 +1,7 @@
 """How the ego moves, also where nothing is touched: comfort, braking, time to collision, who is
 ahead, wrong way, red light, impact.
 
-The bounds are nuPlan's (`evaluators.scores.nuplan`), the safe distance is that of
+The bounds are nuPlan's (`evaluators.metrics.nuplan`), the safe distance is that of
 responsibility-sensitive safety: Shalev-Shwartz et al., "On a formal model of safe and scalable
 self-driving cars", definition 1.
 """
@@ -9,11 +9,11 @@ self-driving cars", definition 1.
 import numpy as np
 
 from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
+from evaluators.metrics import nuplan
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import handover_us, series, with_preset
-from evaluators.scores import nuplan
-from evaluators.scores.scored import ScoredRollout
-from evaluators.scores.states import EgoStates, Tracks
+from evaluators.metrics.scored import ScoredRollout
+from evaluators.metrics.states import EgoStates, Tracks
 
 RESPONSE_S = 1.0
 RSS_ACCEL_MPS2 = 3.5

@@ -10,8 +10,8 @@ import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from alpasim_plugin.core.config import guess
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.config import guess
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Preset:
         None  # whose evaluation, in which version: stamped on the results with the rest
     )
     protocol: str | None = (
-        None  # the benchmark whose score is given as well, by its name in `evaluators.scores`
+        None  # the benchmark whose score is given as well, by its name in `evaluators.metrics.protocols`
     )
     # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness *
     # shorter side / 2.

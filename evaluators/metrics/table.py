@@ -19,7 +19,7 @@ from alpasim_plugin.core.image_metrics import BLACK_MAX
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
-from evaluators.scores.table import BENCHMARKS
+from evaluators.metrics.score_table import BENCHMARKS
 
 if TYPE_CHECKING:
     from alpasim_plugin.core.parts.spec import PartSpec

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS, MetricTable
-from evaluators.opening import Run
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
+from evaluators.statistics.opening import Run
 from evaluators.statistics.paired import Pair, Table, compare_pairs, pairs_within
 from evaluators.statistics.variants import Base, Variant, base_named, choices, variants_in
 

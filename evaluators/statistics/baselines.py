@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing, read_json_object
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Row
 from evaluators.metrics import MetricTable
-from evaluators.opening import Run, read_run
+from evaluators.statistics.opening import Run, read_run
 
 SCHEMA_VERSION = 2
 MADE_WITH = (

@@ -26,7 +26,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_as
+from alpasim_plugin.core.files import read_json_as
 from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import Side

@@ -16,14 +16,14 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import guess, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.files.config import guess, load_yaml, validate
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
-from evaluators.numbers import plural, short
+from evaluators.statistics.numbers import plural, short
 from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (

@@ -6,7 +6,8 @@ from typing import Any
 
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
-from evaluators.numbers import (
+from evaluators.statistics.intervals import FEW_SCENES
+from evaluators.statistics.numbers import (
     finite,
     interval,
     plural,
@@ -14,7 +15,6 @@ from evaluators.numbers import (
     scale_and_unit,
     short,
 )
-from evaluators.statistics.intervals import FEW_SCENES
 from evaluators.statistics.verdicts import LEAST_SCENES
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"

@@ -16,7 +16,7 @@ from alpasim_plugin.core.geometry import quat_from_matrix, se2
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import api_version, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
-from tests.cameras import ahead
+from tests.camera_builders import ahead
 
 CAMERA = "camera_front_wide_120fov"
 WIDTH = 48

@@ -30,7 +30,7 @@ from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.log.wire import sensorsim_pb2
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
-from tests.cameras import ahead
+from tests.camera_builders import ahead
 
 AHEAD = ahead()
 SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135], [0, 0, 1]]), AHEAD)

@@ -12,8 +12,8 @@ from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.lens_cache import LensCache
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import read_sides, straight_of
+from alpasim_plugin.cameras.lens import joined_image
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import joined_image
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import sensorsim_pb2

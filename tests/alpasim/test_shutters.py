@@ -13,9 +13,9 @@ from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.sources import drawn_map
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import camera_of, read_sides, read_view
+from alpasim_plugin.cameras.lens import lens_of, lens_shares
+from alpasim_plugin.cameras.shutter import bands
 from alpasim_plugin.core.geometry import interpolate, se2
-from alpasim_plugin.core.lens import lens_of, lens_shares
-from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import Exposure, RenderRequest
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes

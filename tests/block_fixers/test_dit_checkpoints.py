@@ -17,9 +17,9 @@ from safetensors.torch import save_file
 from alpasim_plugin.block_fixers.dit import FLOAT32_KEYS, CosmosCausalDiT
 from alpasim_plugin.block_fixers.factory import blocks
 from alpasim_plugin.block_fixers.networks import at_precision
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.dit_cases import SMALL, clip, furthest

@@ -10,7 +10,7 @@ from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.core.files.arrays import read_metadata
 from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels

@@ -6,8 +6,8 @@ import torch
 
 from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.fixers import fixer_settings
 from tests.block_fixers.fixer_cases import Recorded, fixer, run_blocks
 from tests.block_fixers.whole_clip import whole_clip

@@ -11,7 +11,7 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.checksums import sealed
 from tests.core.checksum_files import vouch_for
-from tests.report.make_run import Plan, make_run
+from tests.pages.make_run import Plan, make_run
 
 SCENES = tuple(f"scene-{i:02d}" for i in range(8))
 EASY = """version: 1

@@ -14,7 +14,7 @@ from alpasim_plugin.cli import run, serve
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, command_of
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.runs.executors.choice import Executor
+from alpasim_plugin.runs.executor_choice import Executor
 
 
 class Reached(Exception):

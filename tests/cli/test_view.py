@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from tests.report.make_run import Plan
-from tests.viewer.make_watched import make_watched, unfinished
+from tests.pages.make_run import Plan
+from tests.pages.make_watched import make_watched, unfinished
 
 PLAN = Plan(
     renderers=("clean", "3dgs"), scenes=("smoke-straight", "urban-left_turn"), seeds=(0,), steps=10

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from evaluators.opening import read_run
+from evaluators.statistics.opening import read_run
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "ci.md"
 MINE = "my_policy:Mine"

@@ -9,8 +9,8 @@ import pytest
 import scipy.signal
 import shapely
 
-from evaluators.scores import nuplan
-from evaluators.scores.states import EgoStates, Tracks, savitzky_golay
+from evaluators.metrics import nuplan
+from evaluators.metrics.states import EgoStates, Tracks, savitzky_golay
 
 FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
 OF_PLANS = (

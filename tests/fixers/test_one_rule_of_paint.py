@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
-from alpasim_plugin.gaussians.scene.markings import marking_strokes
-from alpasim_plugin.gaussians.scene.site import make_site
+from alpasim_plugin.streets.markings import marking_strokes
+from alpasim_plugin.streets.site import make_site
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.markings import marking_lines
 from scenarios.load import load_scenario

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from alpasim_plugin.cameras.shutter import bands, rolling
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.shutter import bands, rolling
 from alpasim_plugin.core.types import (
     Actor,
     Box,
@@ -28,7 +28,7 @@ from alpasim_plugin.fixers.warp import (
     WarpTarget,
     warp,
 )
-from tests.cameras import ahead
+from tests.camera_builders import ahead
 
 WIDTH = 64
 HEIGHT = 32

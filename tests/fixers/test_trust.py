@@ -15,7 +15,7 @@ from alpasim_plugin.fixers.trust import (
     trust_facts,
     trust_sums,
 )
-from evaluators.viewer.images import seen_before, trust_by_time
+from evaluators.pages.images import seen_before, trust_by_time
 
 
 def trust(output, render, recorded):

@@ -4,7 +4,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box, CameraSpec, LaneMap, Marking
-from tests.cameras import ahead
+from tests.camera_builders import ahead
 
 AHEAD = ahead(0.0)
 PIN = CameraSpec("pin", 256, 144, np.array([[128.0, 0, 128], [0, 128, 72], [0, 0, 1]]), AHEAD)

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from alpasim_plugin.alpasim.server.caches import SceneEntry
+from alpasim_plugin.cameras.lens_cover import LensCover
+from alpasim_plugin.cameras.shutter import rolling
 from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of, upload_together
-from alpasim_plugin.core.lens_cover import LensCover
-from alpasim_plugin.core.shutter import rolling
 from alpasim_plugin.core.types import (
     OPACITY_MEAN,
     RECORDED_SHARE,

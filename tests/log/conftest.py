@@ -4,7 +4,7 @@ import pytest
 
 from alpasim_plugin.log import read_asl
 from tests.log.make_rollout import write_rollout
-from tests.report.conftest import usual_run as usual_run
+from tests.pages.conftest import usual_run as usual_run
 
 
 @pytest.fixture

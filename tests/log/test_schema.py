@@ -20,7 +20,7 @@ from alpasim_plugin.log.run_folder.schema import (
     rollout_folder,
 )
 from alpasim_plugin.log.run_folder.sides import RolloutTable
-from evaluators.opening import Run, read_run
+from evaluators.statistics.opening import Run, read_run
 from tests.core.checksum_files import vouch_for
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.atomic import write_safetensors
+from alpasim_plugin.cameras.lens import resized
 from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.geometry import inverse, se2, transform_points
-from alpasim_plugin.core.lens import resized
 from alpasim_plugin.core.types import EgoState, Observation
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout

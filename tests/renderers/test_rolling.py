@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from alpasim_plugin.cameras.shutter import at_share, bands_of, rolling
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.shutter import at_share, bands_of, rolling
 from alpasim_plugin.core.types import Behaviour, Exposure, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput

@@ -17,7 +17,7 @@ from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
 from alpasim_plugin.world.ground import flat
-from tests.cameras import ahead
+from tests.camera_builders import ahead
 from tests.examples import first_of
 from tests.renderers.recorded_drive import recorded_drive
 

@@ -27,11 +27,11 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.rows import series_by_cell
 from alpasim_plugin.world.ground import flat
-from evaluators.opening import Run, read_run
-from tests.cameras import ahead
+from evaluators.statistics.opening import Run, read_run
+from tests.camera_builders import ahead
 from tests.core.checksum_files import vouch_for
-from tests.report.make_run import Plan
-from tests.viewer.make_watched import make_watched
+from tests.pages.make_run import Plan
+from tests.pages.make_watched import make_watched
 
 SMALL = Plan(
     renderers=("clean", "3dgs"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE
 from alpasim_plugin.log.run_folder.writer import write_table

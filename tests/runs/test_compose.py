@@ -10,8 +10,8 @@ from alpasim_plugin import make_renderer
 from alpasim_plugin.block_fixers.chunk import ChunkRenderer
 from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.parts import resolve, resolve_renderer, spec
-from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from scenarios.suite import expand

@@ -15,8 +15,7 @@ from alpasim_plugin.runs import decide as decide_module
 from alpasim_plugin.runs.decide import SequentialTest, drawing_order, plan_of_two
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_search
-from evaluators.opening import read_run
-from evaluators.report.html import render_report
+from evaluators.pages.html import render_report
 from evaluators.statistics.decision import (
     DECISION,
     Question,
@@ -24,6 +23,7 @@ from evaluators.statistics.decision import (
     metric_question,
     read_decision,
 )
+from evaluators.statistics.opening import read_run
 from scenarios.suite import ScenarioRef, expand
 from tests.runs.grey_policy import BY_GREY
 from tests.runs.grey_renderer import GREY

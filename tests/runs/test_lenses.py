@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from alpasim_plugin.cameras.lens import rays_of
+from alpasim_plugin.cameras.lens_cover import LensCover
+from alpasim_plugin.cameras.shutter import rolling_exposure
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.lens import rays_of
-from alpasim_plugin.core.lens_cover import LensCover
-from alpasim_plugin.core.shutter import rolling_exposure
 from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest
 from alpasim_plugin.fixers.loop import BlockRunner
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.lock import one_writer
+from alpasim_plugin.core.files.lock import one_writer
 from tests.runs.make_many import COMMITS, Many, make_one, unfinish
 
 OLD = "2026-01-10T08:00:00+00:00"

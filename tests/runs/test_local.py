@@ -12,8 +12,8 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.lab.jobs import map_jobs
-from alpasim_plugin.runs.executors import local
-from alpasim_plugin.runs.executors.local import Lost, run_jobs
+from alpasim_plugin.runs import local_executor as local
+from alpasim_plugin.runs.local_executor import Lost, run_jobs
 from tests.examples import first_of
 
 
@@ -113,7 +113,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path, repo, threads):
     (tmp_path / "driver.py").write_text(
         "import os, time\n"
         "from pathlib import Path\n"
-        "from alpasim_plugin.runs.executors.local import run_jobs\n"
+        "from alpasim_plugin.runs.local_executor import run_jobs\n"
         "def work(folder):\n"
         "    Path(folder, str(os.getpid())).touch()\n"
         "    time.sleep(60)\n"

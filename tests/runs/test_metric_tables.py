@@ -20,7 +20,7 @@ from alpasim_plugin.log.run_folder.manifests import (
 from alpasim_plugin.runs.summary import aggregate_runs
 from evaluators import resolve_evaluators
 from evaluators.metrics import table_of
-from evaluators.opening import read_run
+from evaluators.statistics.opening import read_run
 
 PLUGIN = """
 from alpasim_plugin.core.types import MetricInfo

@@ -8,8 +8,8 @@ import os
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.runs.executors import ray_backend
-from alpasim_plugin.runs.executors.choice import Executor, parse_executor
+from alpasim_plugin.runs import ray_executor as ray_backend
+from alpasim_plugin.runs.executor_choice import Executor, parse_executor
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.atomic import temporary_path
+from alpasim_plugin.core.files.atomic import temporary_path
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.writer import remove_left_overs
 from alpasim_plugin.runs.plan import RunOptions, make_plan

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from evaluators.opening import read_run
-from tests.report.make_run import Plan, make_run
+from evaluators.statistics.opening import read_run
+from tests.pages.make_run import Plan, make_run
 
 duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed: pip install duckdb")
 SCENES = ("smoke-straight", "urban-left_turn", "hard-curve")

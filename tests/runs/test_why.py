@@ -17,8 +17,8 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.run import execute_run
 from evaluators.metrics.outcomes import SHORT_OF_END
-from evaluators.opening import read_run
-from evaluators.viewer.cause import cause_of
+from evaluators.pages.cause import cause_of
+from evaluators.statistics.opening import read_run
 from scenarios.suite import expand
 from tests.runs.faulty_policies import CAUSES, FAULTS
 from tests.runs.grey_renderer import GREY

@@ -7,7 +7,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
-from alpasim_plugin.gaussians.scene.build_actors import build_actors
+from alpasim_plugin.streets.build_actors import build_actors
 from scenarios.load import load_scenario
 
 ROAD = """version: 1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from alpasim_plugin.cameras.lens import rays_of, sides_of
 from alpasim_plugin.cli.output import size_lines
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import rays_of, sides_of
 from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.types import LensModel
 from alpasim_plugin.runs.lenses import drawn_pixels

@@ -4,8 +4,8 @@ bounded.
 
 import pytest
 
-from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.config import load_yaml
 from scenarios.suite import load_suite
 
 DEPTH = 12

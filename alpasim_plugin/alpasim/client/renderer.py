@@ -10,8 +10,8 @@ from typing import Any
 from alpasim_plugin.alpasim.client.channel import READY_S, Address, Service, encoding_of
 from alpasim_plugin.alpasim.client.driver import cameras_of
 from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request

@@ -24,10 +24,10 @@ from alpasim_plugin.alpasim.server.sources import (
     read_masks,
 )
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256, read_bytes
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.queries import options_of
-from alpasim_plugin.core.reading import file_sha256, read_bytes
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene
+from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
-from alpasim_plugin.core.lens_cover import LensCover
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
-from alpasim_plugin.core.reading import some_of
 from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.references import ReferenceSession, session_of

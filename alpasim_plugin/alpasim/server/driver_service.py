@@ -27,11 +27,11 @@ from alpasim_plugin.alpasim.server.hosting import SESSION_BYTES, SESSIONS, Host,
 from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.alpasim.server.views import MAX_TIME_US, Straight, straight_of
 from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.files.images import check_image, image_fault
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
 from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.reading.images import check_image, image_fault
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,

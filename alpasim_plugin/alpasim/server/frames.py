@@ -14,8 +14,8 @@ from alpasim_plugin.alpasim.server.lens_cache import size_of
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import MAX_PIXELS, View, read_view
+from alpasim_plugin.cameras.lens import blackened
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lens import blackened
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.wire import sensorsim_pb2

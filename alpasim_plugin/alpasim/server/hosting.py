@@ -24,8 +24,8 @@ import grpc
 
 from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.files import read_bytes, read_text
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.reading import read_bytes, read_text
 from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
 from alpasim_plugin.log.wire.services import MESSAGE_BYTES, V1ALPHA, Reflection, handlers
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 
 from alpasim_plugin.alpasim.server.lens_cache import lenses
 from alpasim_plugin.alpasim.server.views import View, camera_of
-from alpasim_plugin.core.lens import Lens, lens_shares
-from alpasim_plugin.core.shutter import Along, rolling
+from alpasim_plugin.cameras.lens import Lens, lens_shares
+from alpasim_plugin.cameras.shutter import Along, rolling
 from alpasim_plugin.core.types import F32, F64, Exposure
 from alpasim_plugin.log.wire import sensorsim_pb2
 

@@ -26,11 +26,11 @@ from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, read_sides, straight_of
+from alpasim_plugin.cameras.lens import Lens, blind_of
+from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, project
-from alpasim_plugin.core.lens import Lens, blind_of
-from alpasim_plugin.core.reading.images import read_image
-from alpasim_plugin.core.shutter import at_share
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps

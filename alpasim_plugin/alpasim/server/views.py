@@ -1,6 +1,6 @@
 """What one render request says: where and when a camera looks, and through which lens.
 
-Any lens is rendered by the pinholes that cover it, then resampled (`core.lens`). Where the asked
+Any lens is rendered by the pinholes that cover it, then resampled (`cameras.lens`). Where the asked
 size is not that of the calibration, a pinhole scales per axis; an f-theta lens scales its principal
 point per axis and its polynomial by the mean of both factors, as AlpaSim's own overlay does.
 """
@@ -14,9 +14,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.alpasim.server.lens_cache import lenses
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.lens import (
+from alpasim_plugin.cameras.lens import (
     DO_THIS,
     WIDEST_RAD,
     Lens,
@@ -25,6 +23,8 @@ from alpasim_plugin.core.lens import (
     resized,
     sides_of,
 )
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, LensModel
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 

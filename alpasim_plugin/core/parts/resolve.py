@@ -13,8 +13,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from alpasim_plugin.core.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.interfaces import Declaration, require_methods
 from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.core.parts.source import (
@@ -36,7 +37,6 @@ from alpasim_plugin.core.parts.spec import (
     digest,
     part_digest,
 )
-from alpasim_plugin.core.reading import file_sha256
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
-from alpasim_plugin.core.blame import raised
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256, read_bytes
+from alpasim_plugin.core.files import file_sha256, read_bytes
+from alpasim_plugin.core.parts.blame import raised
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
 INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions

@@ -14,7 +14,6 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from alpasim_plugin.core import interfaces
-from alpasim_plugin.core.blame import blaming
 from alpasim_plugin.core.errors import (
     EvaluatorError,
     FixerError,
@@ -25,6 +24,7 @@ from alpasim_plugin.core.errors import (
 )
 from alpasim_plugin.core.interfaces import complete, contract_error
 from alpasim_plugin.core.metric_types import MetricInfo
+from alpasim_plugin.core.parts.blame import blaming
 from alpasim_plugin.core.parts.source import code_digest, load, make_importable
 
 # entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
@@ -333,7 +333,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "comfort, hard braking, time to collision, safe distance, wrong way and red light",
         ),
         "protocols": (
-            "evaluators.scores.protocols:FACTORY",
+            "evaluators.metrics.protocols:FACTORY",
             "scores of nuPlan and NAVSIM",
         ),
         "plan": (

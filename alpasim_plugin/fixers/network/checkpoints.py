@@ -10,10 +10,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import WEIGHT_BYTES
-from alpasim_plugin.core.reading import check_regular, file_sha256, parsing
-from alpasim_plugin.core.reading.arrays import ONE_FILE, refuse_shards
-from alpasim_plugin.core.reading.files import open_regular
+from alpasim_plugin.core.files import check_regular, file_sha256, parsing
+from alpasim_plugin.core.files.arrays import ONE_FILE, refuse_shards
+from alpasim_plugin.core.files.limits import WEIGHT_BYTES
+from alpasim_plugin.core.files.reading import open_regular
 
 StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")

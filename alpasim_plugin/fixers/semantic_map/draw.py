@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.cameras.shutter import bands, joined
 from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.shutter import bands, joined
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
 from alpasim_plugin.fixers.semantic_map import kernels
 from alpasim_plugin.fixers.semantic_map.prepare import (

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading.files import open_regular, parsing
+from alpasim_plugin.core.files.reading import open_regular, parsing
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianArrays, GaussianCloud, build_cloud
 from alpasim_plugin.gaussians.files.packed import (
     is_compressed_ply,

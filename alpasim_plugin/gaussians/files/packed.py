@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_bytes
+from alpasim_plugin.core.files.limits import GAUSSIANS
+from alpasim_plugin.core.files.reading import parsing, some_of, unzstd
 from alpasim_plugin.core.geometry import quat_from_matrix
-from alpasim_plugin.core.limits import GAUSSIANS
-from alpasim_plugin.core.reading import read_bytes
-from alpasim_plugin.core.reading.files import parsing, some_of, unzstd
 from alpasim_plugin.core.types import F64, I64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays, quat_multiply
 from alpasim_plugin.gaussians.constants import EPS2D_PX2

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.core.atomic import atomic_file, write_bytes
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import GAUSSIANS
-from alpasim_plugin.core.reading.files import open_regular, parsing, read_bytes, some_of
+from alpasim_plugin.core.files.atomic import atomic_file, write_bytes
+from alpasim_plugin.core.files.limits import GAUSSIANS
+from alpasim_plugin.core.files.reading import open_regular, parsing, read_bytes, some_of
 from alpasim_plugin.core.types import F64, U8, FloatArray
 from alpasim_plugin.gaussians.cloud import (
     GaussianArrays,

@@ -18,9 +18,9 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
-from alpasim_plugin.core.reading import parse_json, read_bytes
-from alpasim_plugin.core.reading.files import as_shape, parsing, some_of
+from alpasim_plugin.core.files import parse_json, read_bytes
+from alpasim_plugin.core.files.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
+from alpasim_plugin.core.files.reading import as_shape, parsing, some_of
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.constants import EPS2D_PX2

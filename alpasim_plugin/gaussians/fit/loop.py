@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.devices import require_device, true_rows, upload
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.arrays import START_ANEW, read_checkpoint
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.image_metrics import CAP_DB, decibels
-from alpasim_plugin.core.reading import parsing
-from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud

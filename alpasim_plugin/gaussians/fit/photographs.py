@@ -29,11 +29,11 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_bytes, read_json_object
+from alpasim_plugin.core.files.images import check_image, decode_image, image_fault
+from alpasim_plugin.core.files.limits import SOURCE_BYTES
+from alpasim_plugin.core.files.reading import as_shape
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import read_bytes, read_json_object
-from alpasim_plugin.core.reading.files import as_shape
-from alpasim_plugin.core.reading.images import check_image, decode_image, image_fault
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud

@@ -20,16 +20,20 @@ import cv2
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_as
-from alpasim_plugin.core.reading.images import read_image
+from alpasim_plugin.core.files import read_json_as
+from alpasim_plugin.core.files.atomic import write_json
+from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene.builder import with_background
-from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode
+from alpasim_plugin.gaussians.scene.scene_graph import (
+    Level,
+    SceneGraph,
+    SceneNode,
+    with_background,
+)
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
 
 INDEX_FILE = "reconstruction.json"

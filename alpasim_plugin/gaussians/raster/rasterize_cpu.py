@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.places import require_kernels
+from alpasim_plugin.core.files.places import require_kernels
 from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid

@@ -32,7 +32,7 @@ from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
@@ -133,6 +133,7 @@ def nodes_by_tile(
 
 
 CELL_PX = 3.5  # larger is faster and coarser
+FILE_TILE_M = 16.0  # blocks in which a model from a file is culled
 SceneView = tuple[PinholeCamera, Mapping[str, F64]]  # from where, and ``T_world_box`` of the actors
 
 
@@ -340,4 +341,24 @@ def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
 def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:
     return np.array([node.sphere[0] for node in nodes]).reshape(-1, 3), np.array(
         [node.sphere[1] for node in nodes]
+    )
+
+
+def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:
+    """Return the scene with a Gaussian model as its background, cut into blocks that are culled one
+    by one.
+
+    Args:
+        graph: Actors and sky, and a road that is drawn with the model.
+        cloud: The model in its file's frame.
+        T_world_file: ``(4, 4)`` rotation, translation and one scale for all axes.
+    """
+    placed = placed_cloud(cloud, T_world_file)
+    nodes = nodes_by_tile(
+        "file", [(0.0, placed, tile_numbers(placed.means[:, :2], FILE_TILE_M, 1_000_003))]
+    )
+    return SceneGraph(
+        [*graph.background, *nodes],
+        list(graph.actors.values()),
+        graph.sky,
     )

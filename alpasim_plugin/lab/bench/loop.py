@@ -21,9 +21,9 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
+from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.runs.cell import make_renderer

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 import torch
 
-from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.parts import PartSpec, build
-from alpasim_plugin.core.reading import file_sha256
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.files.atomic import write_json
 
 EPILOG = (
     "Examples: `simrun bench loop`, `simrun bench loop --renderer 3dgs,onefixer@2 --out loop.json`"

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.devices import require_device
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.recipes.recipe import Stage

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_bytes
+from alpasim_plugin.core.files.atomic import write_bytes
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.parts import build, resolve
-from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.quality import Variant, quality_clip, run_variant

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading.files import kind_of
+from alpasim_plugin.core.files.reading import kind_of
 from alpasim_plugin.fixers.bundle import bundle_header
 
 

@@ -21,8 +21,8 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.clips import GROUP, SIDE
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
-from alpasim_plugin.core.atomic import write_array
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_array
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.clip_batches import shown_map
 from alpasim_plugin.lab.training.latent_clips import LatentClip, LatentClips

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.atomic import atomic_folder, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_json_as, read_json_object
+from alpasim_plugin.core.files.arrays import open_npy
+from alpasim_plugin.core.files.atomic import atomic_folder, write_json
 from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3, wrap_angle
-from alpasim_plugin.core.reading import read_json_as, read_json_object
-from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, CameraSpec, RenderRequest, Route, Scenario
 from alpasim_plugin.lab.training.perturbed_rollouts import (

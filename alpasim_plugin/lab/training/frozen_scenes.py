@@ -15,7 +15,7 @@ from pathlib import Path
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_as
+from alpasim_plugin.core.files import read_json_as
 
 RECORD = Path(__file__).parents[3] / "configs" / "fixers" / "test-scenes.json"
 

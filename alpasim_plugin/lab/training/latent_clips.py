@@ -25,8 +25,8 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.clips import GROUP
 from alpasim_plugin.block_fixers.sampling import opacity_mask
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
-from alpasim_plugin.core.atomic import write_array
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_array
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.lab.training.clips import to_tensor

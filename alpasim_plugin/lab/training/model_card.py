@@ -14,8 +14,8 @@ from typing import Any
 
 import torch
 
-from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.reading import read_json_lines
+from alpasim_plugin.core.files import read_json_lines
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.lab.training.trainer import CORE_S
 
 

@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import atomic_file, atomic_folder
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parse_json, parsing
+from alpasim_plugin.core.files.arrays import open_npy
+from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder
 from alpasim_plugin.core.image_metrics import psnr_db
-from alpasim_plugin.core.reading import parse_json, parsing
-from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.pair_store import SEQUENCE_FILE, write_info
 from alpasim_plugin.lab.training.reference_store import F16

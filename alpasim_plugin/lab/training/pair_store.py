@@ -25,10 +25,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import read_json_object
-from alpasim_plugin.core.reading.arrays import open_npy
+from alpasim_plugin.core.files import read_json_object
+from alpasim_plugin.core.files.arrays import open_npy
+from alpasim_plugin.core.files.atomic import atomic_folder
 from alpasim_plugin.core.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256
-from alpasim_plugin.core.reading.arrays import read_metadata
+from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files.arrays import read_metadata
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, save_bundle
 from alpasim_plugin.fixers.network.checkpoints import load_weights

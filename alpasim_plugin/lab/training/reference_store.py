@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.arrays import open_npy
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.reading.arrays import open_npy
 from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.references import ReferenceIndex

@@ -12,8 +12,8 @@ from typing import Literal
 
 import yaml
 
-from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.scene_draws import Spec
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES, Family

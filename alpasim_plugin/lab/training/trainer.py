@@ -19,11 +19,11 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import torch
 from torch import Tensor, distributed, nn
 
-from alpasim_plugin.core.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.core.devices import autocast, upload
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.reading import parse_json, parsing, read_text
-from alpasim_plugin.core.reading.arrays import START_ANEW, read_checkpoint
+from alpasim_plugin.core.files import parse_json, parsing, read_text
+from alpasim_plugin.core.files.arrays import START_ANEW, read_checkpoint
+from alpasim_plugin.core.files.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.fixers.network.checkpoints import listed, load_weights
 from alpasim_plugin.lab.training.processes import join_ranks, rows_of_all, side_stream
 

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.fixers.network.checkpoints import StateDict, load_weights, weight
 from alpasim_plugin.lab.video_metrics.perceptual_net import check_images
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import inside
+from alpasim_plugin.core.files import inside
 from alpasim_plugin.log.run_folder.checksums import problem_of, stated_files
 from alpasim_plugin.log.run_folder.manifests import Damage, inspect_rollout, read_run_json
 from alpasim_plugin.log.run_folder.schema import (

@@ -13,10 +13,10 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256, read_json_as
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.core.reading import file_sha256, read_json_as
 from alpasim_plugin.log.run_folder.schema import AGAIN, FILES
 
 DIGEST = "sha256"  # member of a JSON file: the digest of the others

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import read_json_as, real
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.reading import read_json_as, real
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
     check_seal,

@@ -17,9 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
-from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.core.limits import SOURCE_BYTES
-from alpasim_plugin.core.reading import (
+from alpasim_plugin.core.files import (
     inside,
     parsing,
     read_bytes,
@@ -27,6 +25,8 @@ from alpasim_plugin.core.reading import (
     read_json_object,
     real,
 )
+from alpasim_plugin.core.files.limits import SOURCE_BYTES
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from alpasim_plugin.core.files.tables import Kind, check_parquet, read_parquet
 from alpasim_plugin.core.parts import digest
-from alpasim_plugin.core.reading.tables import Kind, check_parquet, read_parquet
 
 if TYPE_CHECKING:
     import pyarrow as pa

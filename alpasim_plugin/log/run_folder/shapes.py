@@ -1,7 +1,7 @@
 """Shapes of the JSON files of a run folder, as far as readers rely on them; members that are not
 named may be anything.
 
-`alpasim_plugin.core.reading.read_json_as` compares a file with one of these before any of it is
+`alpasim_plugin.core.files.read_json_as` compares a file with one of these before any of it is
 used.
 """
 

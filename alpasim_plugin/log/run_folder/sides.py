@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.reading import parsing
+from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, metrics_in
 

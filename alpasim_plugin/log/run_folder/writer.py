@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import atomic_file, write_bytes, write_json
+from alpasim_plugin.core.files.lock import one_writer
+from alpasim_plugin.core.files.tables import read_parquet
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.lock import one_writer
-from alpasim_plugin.core.reading.tables import read_parquet
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
     FILES,
@@ -41,7 +41,7 @@ GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 CHUNK_ROWS = 4096  # rows that are held as dictionaries, which take ten times the memory
 _TEMPORARY = re.compile(
     r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp"
-)  # as `alpasim_plugin.core.atomic.temporary_path` makes them
+)  # as `alpasim_plugin.core.files.atomic.temporary_path` makes them
 
 
 @contextmanager

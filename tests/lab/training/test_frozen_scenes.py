@@ -6,8 +6,8 @@ from dataclasses import asdict
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.lab.training.frozen_scenes import (
     RECORD,
     check_scenes,

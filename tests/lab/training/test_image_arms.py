@@ -11,7 +11,7 @@ from alpasim_plugin.block_fixers.dit import initial_weights
 from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
-from alpasim_plugin.core.atomic import write_safetensors
+from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.refine import refine_frames

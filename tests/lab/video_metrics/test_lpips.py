@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading import file_sha256
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.video_metrics.image_distance import (
     FOLDER_VARIABLE,

@@ -1,0 +1,1 @@
+"""Cameras: from a pixel to a ray and back. Lens models, shutters, and calibrations from files."""

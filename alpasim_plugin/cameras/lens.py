@@ -1,0 +1,583 @@
+"""Lenses: which ray each pixel of a camera sees, and the pinholes that cover a lens.
+
+Any lens is rendered by ideal pinholes that cover it, then resampled: by one up to
+`WIDEST_OF_ONE_RAD` from the axis, up to `WIDEST_OF_PANELS_RAD` by three that stand side by side, and
+beyond by the sides of a cube. Rays are x right, y down, z forward; the centre of pixel (row i,
+column j) is (j + 0.5, i + 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.cameras.shutter import Along
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import (
+    F32,
+    F64,
+    U8,
+    Bool,
+    CameraSpec,
+    Frame,
+    LensModel,
+    RenderRequest,
+)
+
+WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the image
+# Of one plane: twice the pixels of the lens. Wider ones have more, and smear what is near.
+WIDEST_OF_ONE_RAD = np.deg2rad(50.0)
+WIDEST_OF_PANELS_RAD = np.deg2rad(70.0)
+WIDEST_OF_CUBE_RAD = np.deg2rad(110.0)  # of several planes
+BLEND = 0.02  # difference of the cosines to two pinholes' axes within which both are shown
+MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
+# a ray whose projection misses its pixel by more lies outside what the lens model describes
+CLOSE_PX = 0.05
+# weight of a reference's pixel that does not hold, where 255 is that of one that does
+NOT_HELD = np.float32(1)
+BEYOND_PX = 24  # a lens goes on so far beyond its image's edges, where resampling looks as well
+CHECKED_PX = 192  # across, of the image that a lens is checked with
+TABLE = 4096  # samples of a radius to angle function
+DO_THIS = "give intrinsics that describe a lens"
+# The axes x, y, z of a pinhole on each side of a cube, in the lens's axes.
+SIDES = {
+    "ahead": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "left": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "up": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "down": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A lens as a pinhole that covers it, or a part of it, shows it.
+
+    Attributes:
+        width, height: Pixels of the lens.
+        K: ``(3, 3)`` the pinhole to render.
+        cover: Its width and height.
+        resample: ``(height, w, 2)`` float32 place in the pinhole's image of every pixel; None
+            where the lens is that pinhole.
+        seen: ``(height, w)`` which pixels of the lens this pinhole shows; None: all.
+        weight: ``(height, w)`` float32, share of this pinhole among those that cover the
+            lens; None: all of it.
+        T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
+        side: Its name among those that cover the lens; empty where it is the only one.
+        first_column: The column of the lens at which its part of the image begins.
+    """
+
+    width: int
+    height: int
+    K: F64
+    cover: tuple[int, int]
+    resample: F32 | None = None
+    seen: Bool | None = None
+    weight: F32 | None = None
+    T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
+    side: str = ""
+    first_column: int = 0
+
+    def spec(self, name: str, T_rig_camera: F64, shutter_us: int = 0) -> CameraSpec:
+        """Return the covering pinhole of a lens at a mounting, as a camera."""
+        T = T_rig_camera @ self.T_lens_pinhole
+        return CameraSpec(
+            f"{name}.{self.side}" if self.side else name, *self.cover, self.K, T, shutter_us
+        )
+
+    @property
+    def part(self) -> tuple[slice, slice]:
+        """Return the part of the lens's image that this pinhole shows, rows and columns."""
+        width = self.width if self.resample is None else self.resample.shape[1]
+        return slice(None), slice(self.first_column, self.first_column + width)
+
+    def shown(self, covering: Any) -> Any:
+        """Return `part` of the lens's image, of one or several channels, of a covering one."""
+        place = self.resample
+        if place is None:
+            return covering
+        return cv2.remap(covering, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def lens_camera(pinhole: str) -> str:
+    """Return the name of the camera whose lens a pinhole covers, by its name (see `Lens.spec`)."""
+    camera, _, side = pinhole.rpartition(".")
+    return camera or side
+
+
+class Rays(NamedTuple):
+    """What the pixels of a lens see, row by row.
+
+    Attributes:
+        ray: ``(H * W, 3)``.
+        seen: ``(H * W,)`` where the lens sees anything.
+        focal: Pixels per radian on the axis, in x and y.
+    """
+
+    ray: F64
+    seen: Bool
+    focal: tuple[float, float]
+
+    @property
+    def widest_rad(self) -> float:
+        """Return the largest angle from the optical axis that is seen."""
+        ray = self.ray[self.seen]
+        return float(np.arctan2(np.linalg.norm(ray[:, :2], axis=1), ray[:, 2]).max())
+
+
+def lens_of(camera: CameraSpec) -> Lens:
+    """Return a camera's lens covered by one pinhole.
+
+    Raises:
+        InputError: Values that make no lens, or a view of more than `WIDEST_RAD` from the axis.
+    """
+    if camera.lens is None:
+        return Lens(camera.width, camera.height, camera.K, (camera.width, camera.height))
+    rays = rays_of(camera)
+    if rays.widest_rad > WIDEST_RAD:
+        raise InputError(
+            f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
+            f"set max_angle to at most {np.rad2deg(WIDEST_RAD):.0f} degrees, or use --upstream",
+        )
+    return _covered(camera, rays, rays.seen, "")
+
+
+def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
+    """Return a camera's lens covered by as few pinholes as show all of it well.
+
+    Raises:
+        InputError: Values that make no lens, or a view of more than `WIDEST_OF_CUBE_RAD` from the
+            axis.
+    """
+    if camera.lens is None:
+        return (lens_of(camera),)
+    rays = rays_of(camera)
+    _require_cover(camera, rays)
+    if rays.widest_rad <= WIDEST_OF_ONE_RAD:
+        return (_covered(camera, rays, rays.seen, ""),)
+    turns = _panels(rays)
+    if rays.widest_rad > WIDEST_OF_PANELS_RAD:
+        turns = {side: np.array(axes, dtype=np.float64).T for side, axes in SIDES.items()}
+    ahead = np.stack([rays.ray @ turn[:, 2] for turn in turns.values()])
+    behind_most = np.maximum(ahead - ahead.max(axis=0) + BLEND, 0) * rays.seen
+    weights = behind_most / np.maximum(behind_most.sum(axis=0), 1e-12)
+    sides = []
+    for (side, turn), weight in zip(turns.items(), weights, strict=True):
+        if weight.any():
+            whole = _covered(camera, rays, weight > 0, side, turn)
+            assert whole.resample is not None, "a pinhole that covers a lens"
+            share = weight.astype(np.float32).reshape(camera.height, camera.width)
+            own = np.flatnonzero(share.any(axis=0))
+            first = int(own[0])
+            end = int(own[-1]) + 1
+            place, share = (
+                np.ascontiguousarray(part[:, first:end]) for part in (whole.resample, share)
+            )
+            part = replace(whole, first_column=first, resample=place, seen=None, weight=share)
+            sides.append(part)
+    return tuple(sides)
+
+
+def _panels(rays: Rays) -> dict[str, F64]:
+    """Return by name how three pinholes are turned about the lens's upright axis so that each shows
+    a third of its width: their axes as columns.
+    """
+    ray = rays.ray[rays.seen]
+    azimuth = np.arctan2(ray[:, 0], ray[:, 2])
+    low = float(azimuth.min())
+    high = float(azimuth.max())
+    middles = low + (high - low) * np.array([1, 3, 5]) / 6
+    return {
+        name: cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+        for name, angle in zip(("left", "ahead", "right"), middles, strict=True)
+    }
+
+
+def part_of(request: RenderRequest, side: Lens, share: F32 | None = None) -> RenderRequest:
+    """Return the request of one pinhole of a request's lens, exposed as ``share`` says where the
+    lens's shutter rolls.
+    """
+    camera = request.camera
+    exposure = request.exposure
+    if exposure is not None and share is not None:
+        exposure = replace(exposure, share=share)
+    return replace(
+        request,
+        camera=side.spec(camera.name, camera.T_rig_camera, camera.shutter_us),
+        T_world_camera=request.T_world_camera @ side.T_lens_pinhole,
+        ahead=[part_of(later, side, share) for later in request.ahead],
+        exposure=exposure,
+    )
+
+
+def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
+    """Return the frame of a camera's lens, with its references, from those of its pinholes, in
+    order; where the lens sees nothing it is black and opaque.
+    """
+    first = frames[0]
+    if sides[0].resample is None:
+        return first
+    events = dict.fromkeys(event for frame in frames for event in frame.events)
+    blank = np.zeros((1, 1, 4), np.uint8)
+    references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
+    alphas = [frame.alpha for frame in frames]
+    return replace(
+        first,
+        camera=camera,
+        rgb=joined_image(sides, [frame.rgb for frame in frames]),
+        alpha=None if first.alpha is None else joined_image(sides, alphas, 1),
+        depth=None,
+        references=tuple(joined_image(sides, images, holds=True) for images in references),
+        events=tuple(events),
+        on_device=None,
+    )
+
+
+def joined_image(
+    sides: Sequence[Lens], images: Sequence[Any], outside: int = 0, holds: bool = False
+) -> Any:
+    """Return the lens's image ``(height, width, ...)`` of those of its pinholes.
+
+    Args:
+        sides: The pinholes.
+        images: One of each.
+        outside: The value where the lens sees nothing.
+        holds: Whether the last of four channels says how well a pixel holds; one that does not hold
+            gives way to that of the other pinhole.
+    """
+    if len(sides) == 1:
+        out = sides[0].shown(images[0])
+        if sides[0].seen is not None:
+            out[~sides[0].seen] = outside
+        return out
+    shape = sides[0].height, sides[0].width
+    out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
+    shown = np.zeros(shape, np.float32)
+    end = 0  # of the columns that a pinhole before has filled
+    for lens, image in zip(sides, images, strict=True):
+        assert lens.weight is not None, "one of several pinholes"
+        part = lens.shown(image)
+        weight = lens.weight * (part[..., 3] + NOT_HELD) if holds else lens.weight
+        both = max(0, end - lens.first_column)
+        if both:
+            given = out[lens.part], part, shown[lens.part], weight
+            mixed = cv2.blendLinear(*(np.ascontiguousarray(image[:, :both]) for image in given))
+            part[:, :both] = mixed
+        out[lens.part] = part
+        shown[lens.part] += weight
+        end = max(end, lens.part[1].stop)
+    if cv2.countNonZero(shown) < shown.size:
+        out[shown == 0] = outside
+    return out
+
+
+def blind_of(sides: Sequence[Lens]) -> Bool | None:
+    """Return where a lens sees nothing ``(height, width)``; None where it sees everywhere."""
+    if sides[0].resample is None:
+        return None
+    white = np.full((1, 1), 255, np.uint8)
+    blind = joined_image(sides, [white] * len(sides)) == 0
+    return blind if blind.any() else None
+
+
+def blackened(image: U8, blind: Bool | None) -> U8:
+    """Return an image ``(height, width, 3)`` that is black where its lens sees nothing."""
+    return image if blind is None else np.where(blind[..., None], np.uint8(0), image)
+
+
+def rays_of(camera: CameraSpec) -> Rays:
+    """Return what each pixel of a camera with a lens sees.
+
+    Raises:
+        InputError: Values that make no lens, or a lens that sees nothing.
+    """
+    lens, K = _checked(camera)
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    offset = np.stack([x, y], axis=-1).reshape(-1, 2) - K[:2, 2]
+    focal = float(K[0, 0]), float(K[1, 1])
+    if lens.kind == "opencv":
+        plane, seen = _undistorted(offset / focal, lens, focal)
+        ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    else:
+        plane = (
+            offset / focal if lens.kind == "fisheye" else offset @ np.linalg.inv(_linear(lens)).T
+        )
+        radius = np.linalg.norm(plane, axis=1)
+        if lens.pixel_to_angle:
+            angle = _value(lens.pixel_to_angle, radius)
+            seen = (angle >= 0) & (angle <= _limit(lens))
+        else:
+            angle, seen = _inverse(_radius_of_angle(lens), radius, _limit(lens), camera.name)
+        across = plane / np.maximum(radius, 1e-12)[:, None] * np.sin(angle)[:, None]
+        ray = np.concatenate([across, np.cos(angle)[:, None]], axis=1)
+        if lens.kind == "ftheta":
+            focal = _ftheta_focal(lens), _ftheta_focal(lens)
+    _require(bool(seen.any()), camera.name, "a lens that sees nothing at this size")
+    return Rays(ray, seen, focal)
+
+
+def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
+    """Return where a camera's lens shows rays ``(N, 3)``: pixels ``(N, 2)``, the middle of the
+    first being (0.5, 0.5), and which of them it shows, up to `BEYOND_PX` beyond its image.
+    """
+    lens, K = _checked(camera)
+    across = np.linalg.norm(ray[:, :2], axis=1)
+    if lens.kind == "opencv":
+        ahead = np.where(ray[:, 2] > 1e-3, ray[:, 2], np.inf)[:, None]
+        plane = ray[:, :2] / ahead
+        pixel = _distorted(plane, lens) * K[[0, 1], [0, 1]]
+        good = (ray[:, 2] > 1e-3) & (np.linalg.norm(plane, axis=1) < _opencv_reach(camera))
+    else:
+        angle = np.arctan2(across, ray[:, 2])
+        if lens.pixel_to_angle:
+            corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)])
+            reach = 2 * float(np.linalg.norm(corners - K[:2, 2], axis=1).max())
+            radius, good = _inverse(np.array(lens.pixel_to_angle), angle, reach, camera.name)
+        else:
+            radius = _value(_radius_of_angle(lens), angle)
+            good = angle <= _growing(lens)
+        plane = ray[:, :2] / np.maximum(across, 1e-12)[:, None] * radius[:, None]
+        pixel = plane * K[[0, 1], [0, 1]] if lens.kind == "fisheye" else plane @ _linear(lens).T
+    pixel = pixel + K[:2, 2]
+    size = np.array([camera.width, camera.height])
+    inside = ((pixel > -BEYOND_PX) & (pixel < size + BEYOND_PX)).all(axis=1)
+    return pixel, good & inside
+
+
+def place_in_lens(camera: CameraSpec, pinhole: Lens) -> tuple[F32, Bool]:
+    """Return where a camera's lens shows each pixel of a covering pinhole: ``(h, w, 2)`` column and
+    row, counted from the centre of the first pixel; and which it shows, ``(h, w)``.
+    """
+    width, height = pinhole.cover
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    plane = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(pinhole.K).T
+    pixel, shown = pixels_of(camera, plane @ pinhole.T_lens_pinhole[:3, :3].T)
+    place = (pixel - 0.5).astype(np.float32).reshape(height, width, 2)
+    return place, shown.reshape(height, width)
+
+
+def lens_shares(camera: CameraSpec, pinhole: Lens, along: Along, backwards: bool) -> F32:
+    """Return when each pixel of a covering pinhole is exposed: the share of the shutter of the
+    lens's row (or column) that shows it; NaN where none does. See `shutter.Exposure`.
+    """
+    place, shown = place_in_lens(camera, pinhole)
+    count, at = (camera.height, place[..., 1]) if along == "rows" else (camera.width, place[..., 0])
+    share = np.clip(at / max(count - 1, 1), 0, 1) if count > 1 else np.ones_like(at)
+    near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return np.where(near, 1 - share if backwards else share, np.float32(np.nan)).astype(np.float32)
+
+
+def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
+    """Return a camera whose image has another size: its middle and its focal lengths follow each
+    side, the polynomials of an f-theta lens the mean of both.
+    """
+    scale = width / camera.width, height / camera.height
+    lens = camera.lens
+    if lens is not None and lens.kind == "ftheta":
+        mean = (scale[0] + scale[1]) / 2
+        forward = tuple(a * mean for a in lens.coefficients)
+        backward = tuple(b / mean**k for k, b in enumerate(lens.pixel_to_angle))
+        lens = replace(lens, coefficients=forward, pixel_to_angle=backward)
+    K = np.diag([*scale, 1.0]) @ camera.K
+    return replace(camera, width=width, height=height, K=K, lens=lens)
+
+
+def check_lens(camera: CameraSpec) -> None:
+    """Refuse a lens that cannot be drawn whole.
+
+    Raises:
+        InputError: Values that make no lens, a lens that turns back within its image, or one that
+            sees too far from its axis.
+    """
+    if camera.lens is None:
+        return
+    small = resized(camera, CHECKED_PX, max(round(CHECKED_PX * camera.height / camera.width), 2))
+    rays = rays_of(small)
+    lens, K = _checked(small)
+    corners = np.array([[x, y] for x in (0, small.width) for y in (0, small.height)]) - K[:2, 2]
+    turns = not bool(rays.seen.all())
+    if lens.kind != "opencv":
+        scale = K[[0, 1], [0, 1]] if lens.kind == "fisheye" else np.ones(2)
+        reach = float(np.linalg.norm(corners / scale, axis=1).max())
+        if lens.pixel_to_angle:
+            angle = _value(lens.pixel_to_angle, np.linspace(0.0, reach, TABLE))
+            turns = bool((np.diff(angle[angle < _limit(lens)]) <= 0).any())
+        else:
+            grows = _growing(lens)
+            farthest = float(_value(_radius_of_angle(lens), np.array([grows]))[0])
+            turns = grows < _limit(lens) and farthest < reach
+    if turns:
+        raise InputError(
+            f"camera {camera.name!r}: a {lens.kind} lens that turns back within its image",
+            "correct the coefficients, or set max_angle_deg below where it turns",
+        )
+    _require_cover(camera, rays)
+
+
+def _require_cover(camera: CameraSpec, rays: Rays) -> None:
+    if rays.widest_rad > WIDEST_OF_CUBE_RAD:
+        raise InputError(
+            f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
+            f"set max_angle_deg to at most {np.rad2deg(WIDEST_OF_CUBE_RAD):.0f}; the image is black beyond it",
+        )
+
+
+def _checked(camera: CameraSpec) -> tuple[LensModel, F64]:
+    lens = camera.lens
+    K = camera.K
+    assert lens is not None, "a pinhole is its own lens"
+    numbers = [*lens.coefficients, *lens.pixel_to_angle, *lens.linear, lens.max_angle_rad]
+    _require(
+        bool(np.isfinite(K).all()) and K[0, 0] > 0 and K[1, 1] > 0,
+        camera.name,
+        f"focal lengths {K[0, 0]:.4g}, {K[1, 1]:.4g}",
+    )
+    _require(bool(np.isfinite(numbers).all()), camera.name, "coefficients that are not finite")
+    most = {"opencv": 12, "fisheye": 4, "ftheta": 64}[lens.kind]
+    _require(
+        len(lens.coefficients) <= most,
+        camera.name,
+        f"{len(lens.coefficients)} coefficients, where {lens.kind} has at most {most}",
+    )
+    if lens.kind == "ftheta":
+        _require(bool(lens.coefficients or lens.pixel_to_angle), camera.name, "no polynomial")
+        _require(abs(np.linalg.det(_linear(lens))) > 1e-6, camera.name, f"linear_cde {lens.linear}")
+        focal = _ftheta_focal(lens)
+        _require(focal > 0, camera.name, "a polynomial that does not grow from the axis")
+    return lens, K
+
+
+def _ftheta_focal(lens: LensModel) -> float:
+    """Return pixels per radian on the axis; 0 where the polynomial does not grow there."""
+    given = lens.pixel_to_angle or lens.coefficients
+    slope = given[1] if len(given) > 1 else 0.0
+    if slope <= 0:
+        return 0.0
+    return 1 / slope if lens.pixel_to_angle else slope
+
+
+def _linear(lens: LensModel) -> F64:
+    c, d, e = lens.linear
+    return np.array([[c, d], [e, 1.0]])
+
+
+def _limit(lens: LensModel) -> float:
+    return lens.max_angle_rad if lens.max_angle_rad > 0 else float(WIDEST_OF_CUBE_RAD * 1.2)
+
+
+def _radius_of_angle(lens: LensModel) -> F64:
+    """Return the coefficients, from the constant, of the distance from the middle by the angle."""
+    if lens.kind == "ftheta":
+        return np.array(lens.coefficients)
+    polynomial = np.zeros(2 * len(lens.coefficients) + 2)
+    polynomial[1], polynomial[3::2] = 1.0, lens.coefficients
+    return polynomial
+
+
+def _growing(lens: LensModel) -> float:
+    """Return up to which angle the lens's distance from the middle grows with it."""
+    angles = np.linspace(0.0, _limit(lens), TABLE)
+    falls = np.flatnonzero(np.diff(_value(_radius_of_angle(lens), angles)) <= 0)
+    return float(angles[falls[0]] if len(falls) else angles[-1])
+
+
+def _value(coefficients: Any, x: F64) -> F64:
+    return np.polynomial.polynomial.polyval(x, np.asarray(coefficients))
+
+
+def _inverse(polynomial: F64, values: F64, limit: float, name: str) -> tuple[F64, Bool]:
+    """Solve ``polynomial(x) = value`` on [0, limit], as far as the polynomial grows; the flag says
+    where there is a solution.
+    """
+    table = np.linspace(0.0, limit, TABLE)
+    there = _value(polynomial, table)
+    falls = np.flatnonzero(np.diff(there) <= 0)
+    last = int(falls[0]) if len(falls) else TABLE - 1
+    _require(last > 0, name, "a polynomial that does not grow from the axis")
+    x = np.interp(values, there[: last + 1], table[: last + 1])
+    slope = np.polynomial.polynomial.polyder(polynomial)
+    for _ in range(3):  # Newton, from within half a table step
+        step = (_value(polynomial, x) - values) / np.maximum(_value(slope, x), 1e-9)
+        x = np.clip(x - step, 0.0, table[last])
+    return x, (values >= there[0]) & (values <= there[last])
+
+
+def _distorted(xy: F64, lens: LensModel) -> F64:
+    """Distort ideal image points ``(N, 2)`` by OpenCV's rational, tangential and thin prism terms
+    (calib3d documentation).
+    """
+    given = np.zeros(12)
+    given[: len(lens.coefficients)] = lens.coefficients
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = given
+    x, y = xy.T
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2 * r2
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2 * r2
+    return np.stack([u, v], axis=1)
+
+
+def _opencv_reach(camera: CameraSpec) -> float:
+    """Return how far from the axis, as a slope, the lens model holds, with a margin."""
+    assert camera.lens is not None, "a pinhole is its own lens"
+    x, y = np.meshgrid(np.linspace(0, camera.width, 65), np.linspace(0, camera.height, 65))
+    offset = np.stack([x, y], axis=-1).reshape(-1, 2) - camera.K[:2, 2]
+    focal = float(camera.K[0, 0]), float(camera.K[1, 1])
+    plane, seen = _undistorted(offset / focal, camera.lens, focal)
+    return 1.05 * float(np.linalg.norm(plane[seen], axis=1).max(initial=0.0))
+
+
+def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tuple[F64, Bool]:
+    """Invert `_distorted` by Newton's method with a numerical Jacobian, from the distorted points;
+    the flag says where that is right within `CLOSE_PX`.
+    """
+    xy = given.copy()
+    h = 1e-6
+    with np.errstate(all="ignore"):
+        for _ in range(8):
+            at = _distorted(xy, lens)
+            (a, c), (b, d) = (
+                ((_distorted(xy + step, lens) - at) / h).T for step in ([h, 0.0], [0.0, h])
+            )
+            (p, q), det = (given - at).T, a * d - b * c
+            xy = xy + np.nan_to_num(
+                np.stack([d * p - b * q, a * q - c * p], axis=1) / det[:, None],
+                posinf=0.0,
+                neginf=0.0,
+            ).clip(-0.5, 0.5)
+        missed = np.linalg.norm((_distorted(xy, lens) - given) * focal, axis=1)
+    return xy, missed < CLOSE_PX
+
+
+def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str, turn: F64 = np.eye(3)) -> Lens:
+    """Return the pinhole that shows some of a lens's pixels; ``turn`` has its axes as columns."""
+    local = rays.ray @ turn
+    xy = np.divide(
+        local[:, :2], local[:, 2:], where=local[:, 2:] > 0.05, out=np.zeros_like(local[:, :2])
+    )
+    low = xy[mine].min(0)
+    high = xy[mine].max(0)
+    size = (high - low) * rays.focal
+    shrink = min(1.0, float(np.sqrt(MAX_COVER_PX / max(size[0] * size[1], 1.0))))
+    fx = rays.focal[0] * shrink
+    fy = rays.focal[1] * shrink
+    cover = int(np.ceil(size[0] * shrink)) + 2, int(np.ceil(size[1] * shrink)) + 2
+    K = np.array([[fx, 0.0, 1.0 - low[0] * fx], [0.0, fy, 1.0 - low[1] * fy], [0.0, 0.0, 1.0]])
+    # cv2 counts from the centre of the first pixel
+    place = (xy * [fx, fy] + [K[0, 2], K[1, 2]] - 0.5).astype(np.float32)
+    T = np.eye(4)
+    T[:3, :3] = turn
+    shape = camera.height, camera.width
+    seen = None if mine.all() else mine.reshape(shape)
+    place = place.reshape(*shape, 2)
+    return Lens(camera.width, camera.height, K, cover, place, seen, T_lens_pinhole=T, side=side)
+
+
+def _require(fine: bool, name: str, found: str) -> None:
+    if not fine:
+        raise InputError(f"camera {name!r}: {found}", DO_THIS)

@@ -1,1 +1,0 @@
-"""Where rollouts run: processes of this machine, or a Ray cluster. Results do not depend on it."""

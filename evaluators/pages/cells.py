@@ -1,0 +1,387 @@
+"""Which cells of a run a page replays, and what it replays of them as JSON: an index of the run,
+and one document for each cell.
+
+Changed outcomes come first, then events, then a few quiet ones, the most different drives first.
+"""
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files import real
+from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.types import CameraSpec, RolloutLog
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME
+from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
+from evaluators.pages.drive_data import (
+    Place,
+    Tracks,
+    drive_data,
+    map_data,
+    plans_part,
+    scene_of,
+)
+from evaluators.pages.flips import Flip, baseline_of, find_flips, flip_entries, key_of_entry
+from evaluators.pages.images import (
+    NO_FRAMES,
+    encoded,
+    frame_rows,
+    sources,
+    trust_by_time,
+)
+from evaluators.pages.rollouts import clock_zero_us
+from evaluators.statistics.opening import Run
+
+QUIET_CELLS = 3  # cells in which nothing happened, shown by default
+
+Interest = Literal["flip", "event", "failure", "quiet"]
+ORDER: tuple[Interest, ...] = ("flip", "event", "failure", "quiet")
+
+
+@dataclass(frozen=True)
+class WatchedCell:
+    """The rollouts of one scene, policy and seed, one for each renderer, which are replayed side by
+    side.
+
+    Attributes:
+        policy: The policy; where policies stand side by side, their renderer.
+        take: 0, except where several logs of one renderer have the same scene, policy and seed.
+        rollouts: In the order of the run's renderers; the failed ones too.
+        flips: Changed outcomes among them.
+    """
+
+    scene: str
+    policy: str
+    seed: int
+    take: int
+    rollouts: tuple[Rollout, ...]
+    flips: tuple[Flip, ...]
+    by_policy: bool = False  # one renderer's rollouts, one for each policy
+
+    def side(self, rollout: Rollout) -> str:
+        """Give what a rollout is called beside the others."""
+        return rollout.policy if self.by_policy else rollout.renderer
+
+    @property
+    def id(self) -> str:
+        """Give a name for addresses and elements: letters and digits."""
+        key = repr((self.scene, self.policy, self.seed, self.take))
+        return hashlib.sha256(key.encode()).hexdigest()[:12]
+
+    @property
+    def name(self) -> str:
+        """Give the name for people."""
+        take = f", log {self.take + 1}" if self.take else ""
+        return f"{self.scene}, {self.policy}, seed {self.seed}{take}"
+
+    @property
+    def interest(self) -> Interest:
+        """Say why somebody would look at it."""
+        if self.flips:
+            return "flip"
+        if any(outcomes_of(rollout) for rollout in self.rollouts if rollout.ok):
+            return "event"
+        return "quiet" if all(rollout.ok for rollout in self.rollouts) else "failure"
+
+    @property
+    def apart_m(self) -> float:
+        """Say how different the rollouts are: between the longest and the shortest, and the largest
+        distance from the recorded path.
+        """
+        driven_m, offsets_m = (
+            [r.metrics[name] or 0.0 for r in self.rollouts if r.metrics.get(name) is not None]
+            or [0.0]
+            for name in ("dist_traveled_m", "lateral_distance_m")
+        )
+        return max(driven_m) - min(driven_m) + max(offsets_m)
+
+    @property
+    def watchable(self) -> bool:
+        """Tell whether any of its rollouts ran to its end."""
+        return any(rollout.ok for rollout in self.rollouts)
+
+    def outcomes(self) -> dict[str, str]:
+        """Give the outcome of each rollout in words, by what it is called."""
+        return {
+            self.side(rollout): in_words(outcomes_of(rollout))
+            if has_ended(rollout)
+            else f"failed: {rollout.failure_class or 'unknown'}"
+            for rollout in self.rollouts
+        }
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was asked for; an empty tuple is everything. A scene may be named as when it was driven:
+    smoke/curve is smoke-curve.
+    """
+
+    scenes: Annotated[tuple[str, ...], Flag("Scene to show. Repeatable.", "--scene")] = ()
+    policies: Annotated[tuple[str, ...], Flag("Policy to show. Repeatable.", "--policy")] = ()
+    seeds: Annotated[tuple[int, ...], Flag("Seed to show. Repeatable.", "--seed")] = ()
+    renderers: Annotated[
+        tuple[str, ...], Flag("Renderer to show; all by default. Repeatable.", "--renderer")
+    ] = ()
+
+    @property
+    def axes(self) -> dict[str, tuple[object, ...]]:
+        """Give what was asked for of each axis of a run."""
+        asked = {
+            "scene": self.scenes,
+            "policy": self.policies,
+            "seed": self.seeds,
+            "renderer": self.renderers,
+        }
+        return {axis: names for axis, names in asked.items() if names}
+
+    def takes(self, rollout: Rollout) -> bool:
+        """Tell whether a rollout was asked for."""
+        return all(
+            any(_is_called(getattr(rollout, axis), name) for name in names)
+            for axis, names in self.axes.items()
+        )
+
+
+def _is_called(value: object, name: object) -> bool:
+    return value == name or value == str(name).replace("/", "-")
+
+
+def check_wanted(run: Run, wanted: Wanted) -> None:
+    """Refuse what no rollout of the run has.
+
+    Raises:
+        InputError: Something of that kind was asked for.
+    """
+    for axis, names in wanted.axes.items():
+        known = list(dict.fromkeys(getattr(rollout, axis) for rollout in run.rollouts))
+        for name in names:
+            if not any(_is_called(value, name) for value in known):
+                some = ", ".join(map(str, known[:8]))
+                raise InputError(
+                    f"--{axis} {name}: the run has none; it has {some}", "Name one of these."
+                )
+
+
+def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[WatchedCell]:
+    """List the cells of a run that were asked for, the most telling first.
+
+    Args:
+        run: The run.
+        wanted: What was asked for.
+        arms: Where the run has one renderer, its policies stand side by side.
+    """
+    by_policy = arms and len(run.renderers) == 1 and len(run.policies) > 1
+    fixed, side = ("renderer", "policy") if by_policy else ("policy", "renderer")
+    base = baseline_of(run)
+    sides = run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
+    grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
+    takes: Counter[tuple[str, str, str, int]] = Counter()
+    for rollout in sorted(run.rollouts, key=lambda one: sides.index(getattr(one, side))):
+        if wanted.takes(rollout):
+            take = takes[rollout.cell]
+            takes[rollout.cell] += 1
+            key = (rollout.scene, getattr(rollout, fixed), rollout.seed, take)
+            grouped.setdefault(key, []).append(rollout)
+    flips: dict[tuple[str, str, int], list[Flip]] = {}
+    for flip in find_flips(run)[0]:
+        other = flip.other
+        held = getattr(flip.other, fixed)
+        # a cell shows one policy behind all renderers, or the other way round
+        if getattr(flip.base, fixed) == held and wanted.takes(other):
+            flips.setdefault((other.scene, held, other.seed), []).append(flip)
+    cells = [
+        WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
+        for key, members in grouped.items()
+    ]
+
+    def rank(cell: WatchedCell) -> tuple[int, float, int, str, int, int]:
+        place = run.scenes.index(cell.scene), cell.policy, cell.seed, cell.take
+        return ORDER.index(cell.interest), -cell.apart_m, *place
+
+    return sorted(cells, key=rank)
+
+
+def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted) -> list[WatchedCell]:
+    """Return the cells that a page tries to hold: all that are telling and `QUIET_CELLS` others, or
+    all that were asked for.
+
+    Args:
+        cells: As `cells_of` returns them.
+        wanted: What was asked for.
+    """
+    watchable = [cell for cell in cells if cell.watchable]
+    if wanted.axes:
+        return watchable
+    quiet = [cell for cell in watchable if cell.interest == "quiet"]
+    left_out = {cell.id for cell in quiet[QUIET_CELLS:]}
+    return [cell for cell in watchable if cell.id not in left_out]
+
+
+Logs = Mapping[
+    str, RolloutLog | SimrunError | None
+]  # folder of a rollout -> its log, or why it cannot be read
+
+
+def read_logs(run: Run, cell: WatchedCell) -> Logs:
+    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from;
+    None where neither is there.
+    """
+    return {rollout.path: _read_log(run, rollout) for rollout in cell.rollouts if rollout.ok}
+
+
+def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
+    path = run.file_of(rollout, LOG_NAME)
+    if path is None:
+        stated = run.manifest(rollout).get(
+            "log"
+        )  # as it was named to simrun score, so from the same working directory
+        path = None if stated is None else Path(str(stated))
+    try:
+        return read_log(path) if path is not None and os.path.isfile(path) else None
+    except SimrunError as error:
+        return error  # the page says so in this rollout's place; the others are still shown
+
+
+def read_log(path: Path) -> RolloutLog:
+    """Read a log, or return what was read of it a moment ago: flips share their baseline's, and
+    pages show what flips were found in.
+    """
+    return _log_as_of(path, path.stat().st_mtime_ns if os.path.exists(path) else 0)
+
+
+@lru_cache(maxsize=6)  # two cells behind three renderers
+def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
+    return read_asl(path)
+
+
+def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
+    """Return everything that a page shows of a cell.
+
+    Args:
+        run: The run.
+        cell: One of its cells.
+        logs: Its logs.
+
+    Raises:
+        InputError: A file is damaged, or the run has no map of the scene.
+    """
+    content, recorded = scene_of(run, cell.scene)
+    firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
+    place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
+    tracks = Tracks()
+    drives: list[JsonObject] = []
+    for rollout in cell.rollouts:
+        name = {"renderer": cell.side(rollout)}
+        log = logs.get(rollout.path)
+        if not rollout.ok:
+            drives.append(name | {"failed": f"{rollout.failure_class}: {rollout.failure}"})
+        elif not isinstance(log, RolloutLog):
+            why = (
+                log.message
+                if log is not None
+                else f"{run.manifest(rollout).get('log') or LOG_NAME} is missing"
+            )
+            drives.append(name | {"failed": f"its log cannot be read: {why}"})
+        else:
+            facts = frame_rows(run, rollout)
+            drive = drive_data(run, rollout, log, place, tracks, facts)
+            drive["why"] = run.href(rollout, WHY_NAME) or ""
+            cameras = [encoded(one, place.zero_us) for one in sources(run, rollout, log)]
+            lenses = {camera.name: camera for camera in log.info["cameras"]}
+            for camera in cameras:
+                trust = trust_by_time(facts, camera["name"])
+                by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
+                if by_ms:
+                    camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
+                if camera["name"] in lenses:
+                    camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
+            drives.append(
+                name | drive | {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
+            )
+    keys = {flip.key for flip in cell.flips}
+    entries = [entry for entry in flip_entries(run) if key_of_entry(entry) in keys]
+    ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
+    return {
+        "id": cell.id,
+        "map": map_data(content, recorded, place),
+        "users": tracks.all,
+        "drives": drives,
+        "parts": plans_part(entries, place, cell.by_policy),
+        "end": max([*ends, 1]),
+        "warmup": round(int(content.get("warmup_us") or 0) / 1000),
+        "origin": place.origin.tolist(),
+        "zero_us": place.zero_us,
+    }
+
+
+def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
+    """Return what projects rig coordinates into an image of at most this width: fx, fy, cx, cy,
+    and the mounting, 3 rows of 4.
+    """
+    scale = min(1.0, width_px / camera.width)
+    k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
+
+
+def index_data(
+    run: Run,
+    cells: Sequence[WatchedCell],
+    here: Sequence[WatchedCell],
+    notes: Sequence[str],
+    report: str,
+) -> JsonObject:
+    """Return what a page must know before it shows a cell.
+
+    Args:
+        run: The run.
+        cells: All cells that were asked for, the most telling first.
+        here: Those whose documents the page has.
+        notes: What was left out, one sentence each.
+        report: Address of the run's report, or "".
+    """
+    ids = {cell.id for cell in here}
+    tables = (run.summary.get("metrics") or {}).values()
+    metrics = {}
+    for name in run.table.ordered({*run.table, *(name for table in tables for name in table)}):
+        metric = run.table.shown(name)
+        metrics[name] = {"unit": metric.unit, "help": metric.help, "flag": metric.is_flag}
+    bases = [cell.side(flip.base) for cell in cells for flip in cell.flips]
+    rows = []
+    for cell in cells:
+        flips = [
+            {"renderer": cell.side(flip.other)}
+            | {"was": flip.was, "now": flip.now, "tone": flip.tone}
+            for flip in cell.flips
+        ]
+        rows.append(
+            {
+                "id": cell.id,
+                "scene": cell.scene,
+                "policy": cell.policy,
+                "seed": cell.seed,
+                "take": cell.take,
+                "interest": cell.interest,
+                "outcomes": cell.outcomes(),
+                "flips": flips,
+                "here": cell.id in ids,
+            }
+        )
+    return {
+        "run": real(run.folder).name,
+        "renderers": run.policies if any(cell.by_policy for cell in cells) else run.renderers,
+        "baseline": bases[0] if bases else baseline_of(run),
+        "first_curves": run.table.first_curves(),
+        "metrics": metrics,
+        "cells": rows,
+        "notes": list(notes),
+        "report": report,
+    }

@@ -1,0 +1,216 @@
+"""Write ``report.html``: one file that opens from disk without a network."""
+
+import base64
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import (
+    ChoiceLoader,
+    Environment,
+    FileSystemBytecodeCache,
+    PackageLoader,
+    StrictUndefined,
+)
+from markupsafe import Markup
+
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.atomic import write_text
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.log.run_folder.reader import reporting
+from alpasim_plugin.log.run_folder.rows import Series, series_by_cell
+from alpasim_plugin.log.run_folder.schema import AGAIN, KEYS, WHY_NAME
+from evaluators.metrics.outcomes import has_ended, outcomes_of
+from evaluators.pages import tables
+from evaluators.pages.above import still_map
+from evaluators.pages.boundary import boundary_section
+from evaluators.pages.decision import decision_section
+from evaluators.pages.fixers import pool_text, refused
+from evaluators.pages.flips import colours_of, flip_bases, flip_rows
+from evaluators.pages.gate import gate_section
+from evaluators.pages.overview import TONES, overview_of
+from evaluators.pages.rollouts import SERIES, rollout_block
+from evaluators.pages.worst import worst_change
+from evaluators.statistics.numbers import DASH, listed_counts, percents, plural, short
+from evaluators.statistics.opening import Run, read_run
+
+MAX_SCENE_PLOTS = 24
+OPEN_SCENE_PLOTS = 6
+PLOT_BUDGET_BYTES = 1_500_000
+FLIP_BUDGET_BYTES = 2_000_000
+STYLES = ("theme.css", "report.css")
+SCRIPTS = ("theme.js", "report.js", "above.js", "rollouts.js")
+
+
+def write_report(run_dir: Path | str | Run) -> Path:
+    """Write ``report.html`` into a run folder.
+
+    Args:
+        run_dir: A run folder (docs/architecture.md), or what was read of it. Nothing else is read.
+
+    Returns:
+        Path of the report.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    path = run.folder / "report.html"
+    with reporting(run):
+        text = render_report(run)
+    write_text(path, text)
+    return path
+
+
+def render_report(run: Run) -> str:
+    """Render the report as a string.
+
+    Style sheets and scripts stand inside the page; the hash allows it to run this script and no
+    other.
+    """
+    environment = environment_of("evaluators.pages")
+    style = "\n".join(asset(environment, name) for name in STYLES)
+    script = "\n".join(asset(environment, name) for name in SCRIPTS)
+    return environment.get_template("report.html.j2").render(
+        style=Markup(style),
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        **context(run),
+    )
+
+
+@cache
+def environment_of(*packages: str) -> Environment:
+    """Return the templates of packages, the first that has a name. Compiled templates are kept in
+    the system's folder for temporary files, where it can be written.
+    """
+    compiled = None
+    with suppress(OSError, RuntimeError):
+        compiled = FileSystemBytecodeCache()
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(package) for package in packages]),
+        bytecode_cache=compiled,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals.update(plural=plural, short=short, dash=DASH)
+    environment.filters.update(listed_counts=listed_counts, percents=percents)
+    return environment
+
+
+def asset(environment: Environment, name: str) -> str:
+    """Return the source of a style sheet or a script among the templates."""
+    if environment.loader is None:
+        raise RuntimeError("the template environment has no loader")
+    return environment.loader.get_source(environment, name)[0]
+
+
+def context(run: Run) -> dict[str, Any]:
+    """Collect everything that the template prints."""
+    interesting = by_interest(run)
+    variant_of = colours_of(run)
+    looked_at = interesting[: 2 * MAX_SCENE_PLOTS]
+    series = series_by_cell(run.steps(SERIES, looked_at)) if looked_at else {}
+    views, no_view = scene_views(run, series, looked_at, variant_of)
+    rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
+    pairs = tables.pair_rows(run.summary, run.table)
+    # every column has the colour of its renderer, or of its policy where there is one renderer
+    colours = {}
+    for i, variant in enumerate(run.variants):
+        first = next(iter(run.rollouts_of(variant)), None)
+        colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
+    by_policy = len(run.renderers) == 1 and len(run.policies) > 1
+    flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
+    speeds = [entry.get("stages") or {} for entry in (run.summary.get("speed") or {}).values()]
+    cells = (run.summary.get("failures") or {}).get("cells") or ()
+    return {
+        "run": run,
+        "title": ", ".join(run.renderers) or "empty run",
+        "when": str(run.info.get("started_at") or "")[:16].replace("T", " "),
+        "overview": overview_of(run),
+        "ending_tones": TONES,
+        "shots": worst_change(run),
+        "decision": decision_section(run),
+        "boundary": boundary_section(run.summary.get("boundary")),
+        "gate": gate_section(run),
+        "columns": tables.columns(run),
+        "variant_colour": colours,
+        "flips": flips,
+        "whys": {
+            one.path: page
+            for one in run.rollouts
+            if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))
+        },
+        "more_flips": more_flips,
+        "flip_pairs": flip_pairs,
+        "baseline": " or ".join(base.name for base in flip_bases(run)),
+        "metric_rows": rows,
+        "pair_rows": pairs,
+        "coloured": run.policies if by_policy else run.renderers,
+        "dashed": len(run.policies) > 1 and not by_policy,
+        "policies": run.policies,
+        "views": views,
+        "open_views": OPEN_SCENE_PLOTS,
+        "views_left_out": no_view,
+        "refused": refused,
+        "pool": pool_text(run.summary.get("pool") or {}),
+        "stages": list(dict.fromkeys(name for stages in speeds for name in stages)),
+        "every_rollout": rollout_block(run),
+        "failed": [rollout for rollout in run.rollouts if not rollout.ok],
+        "hints": {tuple(cell[key] for key in KEYS): cell["error"].get("hint") for cell in cells},
+        "command": command_of(run),
+    }
+
+
+def command_of(run: Run) -> str:
+    """Return the command that made a run."""
+    command = run.info.get("command") or ""
+    return command if isinstance(command, str) else shlex.join(map(str, command))
+
+
+def by_interest(run: Run) -> list[str]:
+    """Sort scenes by how much there is to see: events and failures first, then the largest distance
+    from the logged path.
+    """
+
+    def interest(scene: str) -> tuple[int, float]:
+        rollouts = run.by_scene[scene]
+        events = sum(len(outcomes_of(r)) if has_ended(r) else 1 for r in rollouts)
+        far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
+        return events, max(far, default=0.0)
+
+    return sorted(run.by_scene, key=interest, reverse=True)
+
+
+def scene_views(
+    run: Run,
+    series: Series,
+    interesting: list[str],
+    variant_of: Mapping[tuple[str, str], tuple[int, int]],
+) -> tuple[list[JsonObject], list[str]]:
+    """Lay out the most telling scenes within the limits of count and size.
+
+    Returns:
+        The maps (in the order of the run where all are shown at once, else the most telling
+        first), and the scenes not drawn.
+    """
+    drawn: dict[str, JsonObject] = {}
+    spent = 0
+    for scene in interesting:
+        content = run.scene_data(scene)
+        if content is None or len(content["ego_log"]["x_m"]) < 2:
+            continue
+        if len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+            break
+        with parsing(run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
+            drawn[scene] = still_map(scene, content, run.by_scene[scene], series, variant_of)
+        spent += len(json.dumps(drawn[scene]))
+    order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
+    return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]

@@ -1,0 +1,226 @@
+"""Each rollout of a run: when and where its outcomes began, and all of them as columns inside the
+page.
+
+The browser draws the table row by row as it is scrolled, so it may have any length. The page holds
+one compressed block of columns; a row of HTML each would take ten times the room. Numbers are
+rounded to four digits, which the tables of the run are not.
+"""
+
+import base64
+import gzip
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series
+from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
+from evaluators.metrics.outcomes import (
+    OUTCOMES,
+    POLICY_FAULT,
+    has_ended,
+    in_words,
+    outcomes_of,
+    told,
+)
+from evaluators.statistics.opening import Run
+
+COLLISION = (
+    "collision_any",
+    "collision_at_fault",
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+)
+SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
+OTHERS = tuple(
+    name for name in OUTCOMES if name != POLICY_FAULT and not name.startswith("collision")
+)
+SERIES = (
+    *COLLISION,
+    *OTHERS,
+    "eval_relevant",
+    "ego_x_m",
+    "ego_y_m",
+    "ego_yaw_rad",
+    "lateral_bias_m",
+)
+
+
+@dataclass(frozen=True)
+class Event:
+    """The first time of an outcome of one rollout.
+
+    Attributes:
+        kind: "collision", or the name of an outcome that touches nothing.
+        t_s: Seconds since the rollout's first step; None where no step shows the event that the
+            rollout's metric counts.
+        t_us: The same instant on the rollout's own clock; None with ``t_s``.
+        x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or
+            where poses are not logged.
+        side: Which part of the ego was touched, or "".
+    """
+
+    kind: str
+    rollout: Rollout
+    t_s: float | None = None
+    x_m: float | None = None
+    y_m: float | None = None
+    yaw_rad: float | None = None
+    side: str = ""
+    t_us: int | None = None
+
+    @property
+    def what(self) -> str:
+        """Name the event."""
+        if self.kind != "collision":
+            return OUTCOMES[self.kind].words
+        return f"collision ({self.side})" if self.side else "collision"
+
+
+def clock_zero_us(content: Mapping[str, Any], first_us: int) -> int:
+    """Return the instant that the times of a scene count from: its first camera frame.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        first_us: The first logged pose, which counts where the scene does not say when it runs
+            (scored logs of others).
+    """
+    return max(int(content.get("start_us") or 0), first_us)
+
+
+def events_of(rollout: Rollout, series: Series) -> list[Event]:
+    """List the events that the rollout's own metrics count, at most one of each kind.
+
+    Steps that do not count (``eval_relevant`` 0, during warm-up) are passed over, so that the time
+    shown is that of the event counted.
+    """
+    own = series.get(rollout.cell, {})
+    found = []
+    if rollout.flag(*COLLISION):
+        found.append(_event("collision", rollout, own, [m for m in COLLISION if rollout.flag(m)]))
+    shown = {one.name for one in told(outcomes_of(rollout))}
+    return [*found, *(_event(name, rollout, own, [name]) for name in OTHERS if name in shown)]
+
+
+def _event(kind: str, rollout: Rollout, own: Own, metrics: list[str]) -> Event:
+    firsts = {m: t for m in metrics if (t := _first(own, m)) is not None}
+    side = next((SIDES[m] for m in metrics if m in SIDES), "")
+    if not firsts:
+        return Event(kind, rollout, side=side)
+    t_us = min(firsts.values())
+    zero_us = min(int(t[0]) for t, _ in own.values())
+    x_m, y_m, yaw_rad = (_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad"))
+    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side, t_us)
+
+
+def _first(own: Own, metric: str) -> int | None:
+    if metric not in own:
+        return None
+    t_us, value = own[metric]
+    hit = value >= 0.5
+    if "eval_relevant" in own:
+        relevant_t, relevant = own["eval_relevant"]
+        hit &= np.isin(t_us, relevant_t[relevant >= 0.5])
+    return int(t_us[int(np.argmax(hit))]) if hit.any() else None
+
+
+def _at(own: Own, name: str, t_us: int) -> float | None:
+    if name not in own or not own[name][0].size:
+        return None
+    times, values = own[name]
+    return float(values[int(np.argmin(np.abs(times - t_us)))])
+
+
+MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
+MAX_TEXT = 300  # letters of a note
+COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
+
+
+@dataclass(frozen=True)
+class RolloutBlock:
+    """The block of the page.
+
+    Attributes:
+        data: Base64 of the compressed document.
+        shown: Rollouts in it.
+        left_out: Rollouts that are not.
+    """
+
+    data: str
+    shown: int
+    left_out: int
+
+
+def rollout_block(run: Run) -> RolloutBlock:
+    """Pack the rollouts of a run: base64 of compressed JSON.
+
+    The document holds ``renderers``; ``texts``: NAME -> a text a rollout; ``state``: what each
+    ended with and which files it has, as bits; and ``numbers``: metrics with ``name``, ``unit``,
+    what they are, and ``data``, a number a rollout with four digits, null where it is missing.
+    """
+    rollouts = run.rollouts[:MAX_ROLLOUTS]
+    texts = {
+        "scene": [r.scene for r in rollouts],
+        "renderer": [r.renderer for r in rollouts],
+        "policy": [r.policy for r in rollouts],
+        "seed": [str(r.seed) for r in rollouts],
+        "folder": [quote(r.path) for r in rollouts],
+        "outcome": [in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts],
+        "note": [_note(r)[:MAX_TEXT] for r in rollouts],
+    }
+    walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
+    numbers = [walls | {"data": [_short(r.wall_s) for r in rollouts]}]
+    for metric in run.table.ordered(run.metric_names):
+        facts = run.table.shown(metric)
+        numbers.append(
+            {
+                "name": metric,
+                "unit": facts.unit,
+                "percent": facts.in_percent,
+                "headline": facts.is_headline,
+                "flag": facts.is_flag,
+                "data": [_short(r.metrics.get(metric)) for r in rollouts],
+            }
+        )
+    document = {
+        "renderers": run.renderers,
+        "texts": texts,
+        "state": [_state(run, rollout) for rollout in rollouts],
+        "numbers": numbers,
+    }
+    plain = json.dumps(document, separators=(",", ":")).encode()
+    data = base64.b64encode(gzip.compress(plain, mtime=0)).decode()
+    return RolloutBlock(data, len(rollouts), len(run.rollouts) - len(rollouts))
+
+
+def _note(rollout: Rollout) -> str:
+    """Say why a rollout failed, or which one it is a copy of."""
+    if not rollout.ok:
+        return f"{rollout.failure_class or 'unknown cause'}: {rollout.failure}"
+    return f"copied from {rollout.copied_from}" if rollout.copied_from else ""
+
+
+def _short(value: float | None) -> float | None:
+    """Return a number with four digits: what says nothing does not compress."""
+    return None if value is None else float(f"{value:.4g}")
+
+
+def _state(run: Run, rollout: Rollout) -> int:
+    """Return what a rollout ended with, and which files of it are there, as bits."""
+    if not rollout.ok:
+        state = FAILED
+    elif rollout.flag(*COLLISION):
+        state = COLLIDED
+    else:
+        state = OTHERWISE if outcomes_of(rollout) else 0
+    folder = run.folder / rollout.path
+    if rollout.path and os.path.isdir(folder):
+        state |= HAS_FOLDER
+        state |= HAS_CLIP if os.path.isfile(folder / VIDEO_NAME) else 0
+        state |= HAS_WHY if os.path.isfile(folder / WHY_NAME) else 0
+    return state

@@ -1,0 +1,236 @@
+"""Run folders, also unfinished or damaged ones: described by ``run.json`` and ``summary.json``, and
+found below a folder.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.escape import shorten
+from alpasim_plugin.core.escape import terminal as escape
+from alpasim_plugin.core.files.lock import is_locked
+from alpasim_plugin.core.files.reading import read_json_as
+from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.schema import LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
+from alpasim_plugin.log.run_folder.shapes import Summary
+from evaluators.metrics import MetricTable
+from evaluators.statistics.numbers import DASH, finite, interval, printed
+
+CHECK = "simrun check run RUN says what is damaged"
+
+State = Literal["finished", "running", "unfinished", "damaged"]
+STYLES = {"finished": "", "running": "cyan", "unfinished": "yellow", "damaged": "red"}
+PROBLEM_LETTERS = 90
+MARKS = frozenset((RUN_INFO, LOCK))  # the first file of a run folder is its lock
+SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """A run folder in a list.
+
+    Attributes:
+        folder: Its path, as found.
+        state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does
+            any more; ``damaged`` where it cannot be read.
+        problem: Why it is damaged, else empty.
+        info: ``run.json``; empty where it cannot be read.
+        summary: ``summary.json``; empty where the run is not finished.
+    """
+
+    folder: Path
+    state: State
+    problem: str
+    info: JsonView
+    summary: JsonView
+
+    @property
+    def started_at(self) -> datetime:
+        """Give when the run was begun, in UTC where it names no zone; the first day where that is
+        not known.
+        """
+        try:
+            time = datetime.fromisoformat(str(self.info.get("started_at")))
+            return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
+        except ValueError:
+            return datetime.min.replace(tzinfo=UTC)
+
+    @property
+    def rollouts(self) -> tuple[int | None, int]:
+        """Give how many rollouts were planned and failed; None for scored logs that are not
+        finished, and without ``run.json``.
+        """
+        outcome = self.info.get("outcome") if self.state == "finished" else None
+        if outcome:
+            return int(outcome["n_rollouts"]), int(outcome["n_failed"])
+        if not self.info or self.info.get("kind") == "score":
+            return None, 0
+        axes = ("renderers", "policies", "scenes", "seeds")
+        return math.prod(len(self.info.get(axis) or ()) for axis in axes), 0
+
+    @property
+    def variants(self) -> list[tuple[str, str]]:
+        """List renderer and policy of each line of the run."""
+        return [
+            (str(renderer), str(policy))
+            for policy in self.info.get("policies") or ()
+            for renderer in self.info.get("renderers") or ()
+        ]
+
+    def metric(self, metric: str, renderer: str, policy: str) -> JsonView:
+        """Return the entry of a metric in ``summary.json``; empty where it has none."""
+        table = self.summary.get("metrics") or {}
+        alone = renderer if len(self.info.get("policies") or ()) == 1 else ""
+        entries: Mapping[str, JsonView] = (
+            table.get(cell_name(renderer, policy)) or table.get(alone) or {}
+        )
+        return entries.get(metric) or {}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        info = self.info
+        scenes = info.get("scenes") or {}
+        lists = ("renderers", "policies", "seeds", "asked")
+        planned, failed = self.rollouts
+        return {
+            "folder": str(self.folder),
+            "state": self.state,
+            "problem": self.problem,
+            "kind": info.get("kind") or "run",
+            "project": info.get("project") or None,
+            **{name: info.get(name) for name in ("key", "started_at", "version", "preset")},
+            **{name: list(info.get(name) or ()) for name in lists},
+            "scenes": {name: facts.get("content_hash") or "" for name, facts in scenes.items()},
+            "weights": dict(info.get("weights") or {}),
+            "rollouts": planned,
+            "failed": failed if self.state == "finished" else None,
+        }
+
+
+def read_entry(folder: Path) -> RunEntry:
+    """Describe a run folder; what is wrong with it is part of the description."""
+    info: JsonView = {}
+    is_running = is_locked(folder / LOCK)
+    try:
+        info = read_run_json(folder)
+        if not os.path.isfile(folder / SUMMARY):
+            return RunEntry(folder, "running" if is_running else "unfinished", "", info, {})
+        if not os.path.isfile(folder / ROLLOUTS):
+            return RunEntry(folder, "damaged", f"{ROLLOUTS}: missing", info, {})
+        summary: JsonView = read_json_as(Summary, folder / SUMMARY, do_this=CHECK)
+    except InputError as error:
+        if is_running:
+            return RunEntry(folder, "running", "", info, {})
+        return RunEntry(folder, "damaged", error.message, info, {})
+    return RunEntry(folder, "finished", "", info, summary)
+
+
+def find_runs(roots: Sequence[Path]) -> list[RunEntry]:
+    """Describe every run folder below some folders, or those folders themselves, the newest first.
+
+    A folder that a killed run left behind is one too. Links are followed, circles are not. Nothing
+    is searched inside a run folder, so forks inside a run are part of it.
+
+    Args:
+        roots: Folders; one that is reached twice is listed once.
+
+    Raises:
+        InputError: A root is not a folder.
+    """
+    seen: set[str] = set()
+    entries = []
+    for root in roots:
+        if not os.path.isdir(root):
+            raise InputError(
+                f"{root}: not a folder",
+                "name the folder that holds the run folders; simrun run writes them below runs/",
+            )
+        for folder, names, files in os.walk(root, followlinks=True):
+            place = os.path.realpath(folder)
+            if place in seen:
+                names.clear()
+            elif MARKS & {*files}:
+                names.clear()
+                entries.append(read_entry(Path(folder)))
+            seen.add(place)
+            names[:] = [name for name in names if name[0] != "." and name not in SKIPPED]
+    entries.sort(key=lambda entry: str(entry.folder))
+    return sorted(entries, key=lambda entry: entry.started_at, reverse=True)
+
+
+def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) -> Table:
+    """Lay out one run a row, in the order given, named from the folder that holds ``root``; with
+    metrics, its cells have a line for each renderer and policy.
+    """
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("run", overflow="fold")
+    for name in ("begun (UTC)", "commit", "scenes x seeds", "preset", "rollouts"):
+        table.add_column(name)
+    for name in ("renderer", "policy"):
+        table.add_column(name, overflow="fold")
+    for metric in metrics:
+        table.add_column(Text(escape(metric)), no_wrap=True, justify="right")
+    for entry in entries:
+        variants = entry.variants
+        names = [[escape(variant[axis]) for variant in variants] for axis in (0, 1)]
+        texts = [", ".join(dict.fromkeys(column)) for column in names]
+        if metrics:
+            texts = ["\n".join(column) for column in names]
+            for metric in metrics:
+                texts.append("\n".join(value_text(entry, metric, *one) for one in variants))
+        began = str(entry.info.get("started_at") or DASH)[:16].replace("T", " ")
+        project = entry.info.get("project") or {}
+        commit = str(project.get("commit") or DASH)[:7]
+        scenes = entry.info.get("scenes") or {}
+        asked = [str(name) for name in entry.info.get("asked") or scenes]
+        first = (
+            Path(asked[0]).name if asked and Path(asked[0]).is_absolute() else "".join(asked[:1])
+        )
+        more = f" + {len(asked) - 1}" if len(asked) > 1 else ""
+        table.add_row(
+            Text(escape(os.path.relpath(entry.folder, root.parent)), style="bold"),
+            Text(escape(began)),
+            Text(escape(f"{commit}+" if project.get("dirty") else commit)),
+            Text(f"{len(scenes)} x {len(entry.info.get('seeds') or ())} {escape(first)}{more}"),
+            Text(escape(str(entry.info.get("preset") or DASH))),
+            _state(entry),
+            *(Text(text or DASH) for text in texts),
+        )
+    return table
+
+
+def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
+    """Print a metric's mean with its 95 % interval over scenes, both as `summary.json` has them; a
+    dash where there is no mean.
+    """
+    numbers = entry.metric(metric, renderer, policy)
+    mean = finite(numbers.get("mean"))
+    if mean is None:
+        return DASH
+    facts = MetricTable.of_run(entry.info).shown(metric)
+    unit = "%" if facts.in_percent else str(numbers.get("unit") or "")
+    texts = printed(facts, mean, *(interval(numbers.get("ci95_clustered")) or ()))
+    spread = f"({' to '.join(texts[1:])})" if len(texts) > 1 else ""
+    return " ".join(filter(None, (texts[0], unit, spread)))
+
+
+def _state(entry: RunEntry) -> Text:
+    planned, failed = entry.rollouts
+    if entry.state == "finished":
+        return Text(str(planned)) + Text(f", {failed} failed" if failed else "", style="red")
+    text = Text(entry.state, style=STYLES[entry.state])
+    if planned and entry.state != "damaged":
+        text += Text(f", {planned} planned")
+    if entry.problem:
+        text += Text(f"\n{escape(shorten(entry.problem, PROBLEM_LETTERS))}", style="dim")
+    return text

@@ -1,0 +1,136 @@
+"""What the cameras saw at the instant of a run's worst change: the baseline, the variant that
+failed, and a variant that repairs it, side by side.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.types import U8, RolloutLog
+from alpasim_plugin.log.images import smaller
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME
+from evaluators.metrics.outcomes import first_failure, gravity, in_words, outcomes_of
+from evaluators.pages.cells import read_log
+from evaluators.pages.flips import find_flips
+from evaluators.pages.images import Source, jpeg, sources
+from evaluators.pages.overview import variant_name
+from evaluators.statistics.opening import Run
+
+SHOWN = 3
+WIDTH_PX = 420
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The images of a rollout's cameras.
+
+    Attributes:
+        t_s: Seconds since the first camera frame.
+        outcome: How that rollout ended.
+        tone: Colour of the outcome.
+        src: The images as one, a ``data:`` address.
+        link: Where the rollout is shown, relative to the run folder.
+    """
+
+    variant: str
+    scene: str
+    t_s: float
+    outcome: str
+    tone: str
+    src: str
+    link: str | None
+
+
+def worst_change(run: Run) -> list[Shot]:
+    """Return at most three images of one scene and seed at one instant; none where no frames were
+    kept.
+
+    The instant is that of the first event of the rollout that changed for the worse, or else of the
+    gravest failure; without a failure it is the middle of the rollout farthest from its path. What
+    led to an event is shown: after a contact the camera may be inside the other vehicle.
+    """
+    flips, _ = find_flips(run)
+    flip = next((flip for flip in flips if flip.tone != "better"), None)
+    worst = (
+        min((one for one in run.rollouts if one.ok), key=_rank, default=None)
+        if flip is None
+        else flip.other
+    )
+    log = None if worst is None else _log_of(run, worst)
+    if worst is None or log is None:
+        return []
+    failure = first_failure(run.manifest(worst))
+    t_us = int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure["t_us"])
+    chosen = {worst.cell, *(() if flip is None else (flip.base.cell,))}
+    beside = [
+        one
+        for one in run.by_scene[worst.scene]
+        if one.seed == worst.seed and (one.policy == worst.policy or one.renderer == worst.renderer)
+    ]
+    bases = run.info.get("bases") or {}
+    for one in sorted(beside, key=lambda one: bases.get(one.renderer) != worst.renderer):
+        if len(chosen) < SHOWN:
+            chosen.add(one.cell)
+    found = (_shot(run, one, t_us) for one in beside if one.cell in chosen)
+    return [shot for shot in found if shot is not None]
+
+
+def _rank(rollout: Rollout) -> tuple[int, float]:
+    """Return the order of rollouts: the gravest outcome, or else the farthest from its path first."""
+    return gravity(rollout), -(rollout.metrics.get("lateral_distance_m") or 0.0)
+
+
+def _log_of(run: Run, rollout: Rollout) -> RolloutLog | None:
+    path = run.file_of(rollout, LOG_NAME)
+    try:
+        return None if path is None else read_log(path)
+    except SimrunError:
+        return None  # the report says elsewhere what cannot be read
+
+
+def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
+    log = _log_of(run, rollout)
+    cameras = [] if log is None else sources(run, rollout, log)
+    images = [image for image in (_frame_at(one, t_us) for one in cameras) if image is not None]
+    if log is None or not images:
+        return None
+    outcomes = outcomes_of(rollout)
+    # The first camera's image above a row of the others'.
+    first, *others = images
+    rows = [smaller(first, WIDTH_PX)]
+    if others:
+        small = [smaller(image, rows[0].shape[1] // len(others)) for image in others]
+        row = np.zeros((max(map(len, small)), *rows[0].shape[1:]), np.uint8)
+        step = row.shape[1] // len(others)
+        for i, image in enumerate(small):
+            row[: len(image), i * step : i * step + image.shape[1]] = image
+        rows.append(row)
+    return Shot(
+        variant_name(run, rollout.variant),
+        rollout.scene,
+        (t_us - log.render_start_us) * 1e-6,
+        in_words(outcomes),
+        "worse" if outcomes else "better",
+        f"data:image/jpeg;base64,{jpeg(np.concatenate(rows))}",
+        run.href(rollout, WHY_NAME) or run.href(rollout),
+    )
+
+
+def _frame_at(source: Source, t_us: int) -> U8 | None:
+    """Return the newest image ``(H, W, 3)`` at an instant, or the first one; None where the images
+    cannot be decoded.
+    """
+    try:
+        if source.images:
+            before = [image for image in source.images if image.end_us <= t_us]
+            return source.decoded(before[-1] if before else source.images[0])
+        newest = None
+        for taken_us, image in source.filmed():
+            if newest is not None and taken_us > t_us:
+                break
+            newest = image
+        return newest
+    except SimrunError:
+        return None

@@ -1,1 +1,0 @@
-"""Scores of other benchmarks on our logs, from their published definitions."""

@@ -1,0 +1,124 @@
+"""A rolling shutter cut into bands: every pixel once, each at its time, and no more bands than the
+motion needs.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from alpasim_plugin.cameras.shutter import (
+    MOST_BANDS,
+    at_share,
+    bands,
+    bands_of,
+    between,
+    motion_px,
+    rolling,
+)
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
+from tests.camera_builders import ahead
+
+WIDTH = 64
+HEIGHT = 32
+FORWARD = ahead()
+SPEC = CameraSpec(
+    "front", WIDTH, HEIGHT, np.array([[400.0, 0, 32], [0, 400.0, 16], [0, 0, 1]]), FORWARD
+)
+
+
+def asked(
+    start,
+    end,
+    actors=None,
+    along="rows",
+    back=False,
+):
+    """A request from rig poses at shutter start and end."""
+    given = actors or {}
+    exposure = Exposure(
+        rolling(WIDTH, HEIGHT, along, back), {name: pair[0] for name, pair in given.items()}
+    )
+    T = np.stack([start @ FORWARD, end @ FORWARD])
+    return RenderRequest(
+        0, SPEC, T, {name: pair[1] for name, pair in given.items()}, exposure=exposure
+    )
+
+
+FAST = asked(se2(0, 0, 0), se2(0.6, 0, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("along", "back"), [("rows", False), ("rows", True), ("columns", False), ("columns", True)]
+)
+@pytest.mark.parametrize("count", [1, 5, HEIGHT, 3 * WIDTH])
+def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(along, back, count):
+    request = asked(se2(0, 0, 0), se2(0.6, 0, 0.05), along=along, back=back)
+    times = np.full((HEIGHT, WIDTH), np.nan)
+    seen = np.zeros((HEIGHT, WIDTH), int)
+    for band in bands_of(request, count):
+        assert band.exposed is None
+        seen[band.rows, band.columns] += 1
+        times[band.rows, band.columns] = band.T_world_camera[0, 3] / 0.6
+    assert (seen == 1).all()
+    assert np.abs(times - request.exposure.share).max() <= 0.5 / count + 1e-6
+
+
+def test_pixels_that_nobody_looks_at_are_in_no_band_and_a_curved_one_has_a_mask():
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    share = np.clip(v / HEIGHT + 0.2 * np.abs(u - 32) / 32, 0, 1).astype(np.float32)
+    share[:, :5] = np.nan
+    request = replace(FAST, exposure=Exposure(share, {}))
+    whole = np.full((HEIGHT, WIDTH), -1.0)
+    for i, band in enumerate(bands_of(request, 4)):
+        height = band.rows.stop - band.rows.start
+        width = band.columns.stop - band.columns.start
+        band.put(whole, np.full((height, width), float(i)))
+    expected = np.where(np.isnan(share), -1, np.minimum(share * 4, 3).astype(float) // 1)
+    assert_array_equal(whole, expected)
+
+
+def test_a_car_that_stands_on_an_empty_road_needs_one_band_and_a_turning_one_many():
+    still = se2(3, 1, 0.4)
+    assert len(bands(asked(still, still))) == 1
+    slow, fast = (len(bands(asked(still, still @ se2(0.3, 0, turn)))) for turn in (0.0, 0.03))
+    assert 1 < slow < fast <= MOST_BANDS
+    assert len(bands(asked(still, still @ se2(0, 0, 1.5)))) <= MOST_BANDS  # as a request may say
+    assert len(bands(replace(FAST, exposure=None))) == 1
+
+
+def test_a_passing_car_needs_bands_and_one_behind_the_camera_none():
+    still = se2(0, 0, 0)
+    ahead, behind = ((se2(x, 2, 0, 0.8), se2(x + 0.6, 2, 0, 0.8)) for x in (8.0, -20.0))
+    assert len(bands(asked(still, still, {"car": ahead}))) > 5
+    assert len(bands(asked(still, still, {"car": behind}))) == 1
+
+
+def test_motion_is_what_a_near_point_moves_by():
+    request = asked(se2(0, 0, 0), se2(0, 0, 0.01))
+    assert motion_px(request) == pytest.approx(400 * 0.01, rel=0.1)
+    assert motion_px(asked(se2(0, 0, 0), se2(0, 0.3, 0))) == pytest.approx(400 * 0.3 / 8, rel=0.1)
+
+
+def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn():
+    start = se2(2, 0, 0.2)
+    end = se2(4, 8, 0.2 + 0.9 * np.pi)
+    middle = between(np.stack([start]), np.stack([end]), 0.25)[0]
+    assert_allclose(middle, se2(2.5, 2, 0.2 + 0.225 * np.pi), atol=1e-12)
+    assert_array_equal(between(np.stack([start]), np.stack([end]), 1.0)[0], end)
+
+
+def test_road_users_are_where_they_are_at_the_time_of_the_band():
+    request = asked(
+        se2(0, 0, 0),
+        se2(1, 0, 0),
+        {"a": (se2(5, 0, 0), se2(6, 0, 0)), "b": (se2(9, 1, 0), se2(9, 1, 0))},
+    )
+    T, actors = at_share(request, 0.5)
+    assert (T[0, 3], actors["a"][0, 3], actors["b"][0, 3]) == pytest.approx((0.5, 5.5, 9.0))
+
+
+def test_a_picture_of_one_row_is_exposed_at_the_end():
+    assert rolling(4, 1, "rows", False).tolist() == [[1.0]]

@@ -1,0 +1,146 @@
+"""Files appear complete or not at all, and a disk that refuses is an error with four parts."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.files import atomic
+from alpasim_plugin.core.files.atomic import (
+    atomic_file,
+    atomic_folder,
+    write_array,
+    write_bytes,
+    write_json,
+    write_safetensors,
+    write_text,
+)
+
+WRITERS = {
+    "bytes": lambda path, n: write_bytes(path, bytes([n]) * 4),
+    "text": lambda path, n: write_text(path, f"é {n}"),
+    "json": lambda path, n: write_json(path, {"n": n}),
+    "array": lambda path, n: write_array(path, np.full(4, n)),
+    "safetensors": lambda path, n: write_safetensors(
+        path, {"n": torch.full((4,), n)}, {"of": "test"}
+    ),
+}
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_refuses_leaves_the_old_file_and_no_litter(
+    write, number, tmp_path, monkeypatch
+):
+    def full(fd):
+        raise OSError(number, os.strerror(number))
+
+    path = tmp_path / "out"
+    write(path, 1)
+    before = path.read_bytes()
+    monkeypatch.setattr(atomic.os, "fsync", full)
+    with pytest.raises(InfrastructureError) as caught:
+        write(path, 2)
+    assert caught.value.message.startswith(str(path))
+    assert caught.value.exit_code == 4
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    monkeypatch.undo()
+    write(path, 2)
+    assert path.read_bytes() != before
+
+
+def test_what_is_written_is_what_is_read(tmp_path):
+    for name, write in WRITERS.items():
+        write(tmp_path / name, 3)
+    assert (tmp_path / "bytes").read_bytes() == b"\3\3\3\3"
+    assert (tmp_path / "text").read_text(encoding="utf-8") == "é 3"
+    assert json.loads((tmp_path / "json").read_text()) == {"n": 3}
+    np.testing.assert_array_equal(np.load(tmp_path / "array"), [3, 3, 3, 3])
+    assert load_file(tmp_path / "safetensors")["n"].tolist() == [3, 3, 3, 3]
+
+
+def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"run": 1})
+    code = (
+        "import os, signal, sys\n"
+        "from alpasim_plugin.core.files.atomic import atomic_file\n"
+        "with atomic_file(sys.argv[1]) as partial:\n"
+        "    partial.write_text('{\"run\":')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode == -9
+    assert json.loads(path.read_text()) == {"run": 1}
+
+
+@pytest.mark.parametrize("error", [ValueError("no"), KeyboardInterrupt()])
+def test_a_block_that_raises_leaves_the_old_file(error, tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+    with pytest.raises(type(error)), atomic_file(path) as partial:  # noqa: PT012 - the block is what fails
+        partial.write_text("new")
+        raise error
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_block_that_fails_leaves_the_old_folder(tmp_path):
+    folder = tmp_path / "deep" / "a"
+    with atomic_folder(folder) as partial:
+        (partial / "x").write_text("old")
+    for error, seen in (
+        (ValueError("no"), ValueError),
+        (OSError(28, "No space left"), InfrastructureError),
+    ):
+        with pytest.raises(seen), atomic_folder(folder) as partial:  # noqa: PT012 - the block is what fails
+            (partial / "x").write_text("new")
+            raise error
+    assert (folder / "x").read_text() == "old"
+    with atomic_folder(folder) as partial:
+        (partial / "y").write_text("new")
+    assert [path.name for path in folder.iterdir()] == ["y"]
+    assert [path.name for path in folder.parent.iterdir()] == ["a"]
+
+
+def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path, monkeypatch):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "x").write_text("old")
+    rename, refusals = Path.replace, iter([False, True, False])
+
+    def replace(self, target):
+        if next(refusals):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(InfrastructureError, match="Input/output"), atomic_folder(folder) as partial:
+        (partial / "x").write_text("new")
+    assert (folder / "x").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("name", ["array", "safetensors"])
+def test_a_missing_folder_is_named_with_advice(name, tmp_path):
+    with pytest.raises(InfrastructureError, match="No such file or directory") as caught:
+        WRITERS[name](tmp_path / "absent" / "a", 1)
+    assert "exists" in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["loop/a", "file/a", "x" * 300])
+def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_path, name):
+    write_bytes(tmp_path / "new/folder/a", b"a")
+    assert (tmp_path / "new/folder/a").read_bytes() == b"a"
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(InputError):
+        write_bytes(tmp_path / name, b"a")

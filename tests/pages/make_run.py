@@ -1,0 +1,451 @@
+"""Make run folders as the runtime writes them, with drives and pictures made up from a seed, so
+that the report can be tested alone.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy.interpolate import CubicSpline
+
+from alpasim_plugin.log.run_folder.sides import RolloutTable
+from evaluators.pages.flips import find_flips
+from evaluators.statistics.opening import read_run
+from evaluators.statistics.summary import by_policy, censoring, numbers
+
+METRICS = (
+    "collision_any",
+    "collision_at_fault",
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+    "offroad",
+    "offroad_or_collision_at_fault",
+    "lateral_distance_m",
+    "progress",
+    "dist_to_gt_location",
+    "min_distance_to_obstacle_m",
+    "plan_deviation",
+    "dist_traveled_m",
+    "min_ade@1.0s(gt)",
+)
+STAGES = {"render": 0.62, "policy": 0.2, "fixer": 0.0, "log": 0.1, "control": 0.01, "actors": 0.03}
+DT_US = 100_000
+
+
+@dataclass
+class Plan:
+    """What to make."""
+
+    renderers: Sequence[str] = ("clean", "3dgs", "onefixer")
+    policies: Sequence[str] = ("lane-camera",)
+    scenes: Sequence[str] = (
+        "smoke/straight",
+        "urban/left-turn",
+        "hard/narrow-gap-with-parked-cars",
+        "USA_US101-3_3_T-1",
+    )
+    seeds: Sequence[int] = (0, 1, 2)
+    steps: int = 120
+    fail: Sequence[tuple[str, str, int]] = ()  # (renderer, scene, seed)
+    failure: str = "1204 NaN pixels <b>&\nat t = 3.400000 s"
+    invalid: Sequence[str] = (
+        "min_distance_to_obstacle_m",
+    )  # metrics that are invalid in the first scene
+    clips: bool = True
+    flip_frames: bool = False
+    picture_px: tuple[int, int] = (256, 144)
+    harm: dict[str, float] = field(
+        default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45}
+    )
+    rng_seed: int = 7
+
+
+def make_run(folder, plan=None):
+    """Write a run folder and return it."""
+    plan = plan or Plan()
+    rng = np.random.default_rng(plan.rng_seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    maps = {scene: _scene(scene, index, plan) for index, scene in enumerate(plan.scenes)}
+    for scene, content in maps.items():
+        _json(folder / "scenes" / f"{_slug(scene)}.json", content)
+    rows = []
+    steps = []
+    for scene, content in maps.items():
+        for seed in plan.seeds:
+            wander = _smooth(rng, plan.steps) * 0.3  # shared by the renderers: pairs are sharp
+            for renderer in plan.renderers:
+                for policy in plan.policies:
+                    row, series = _rollout(
+                        renderer, policy, scene, seed, content, wander, plan, rng
+                    )
+                    rows.append(row)
+                    steps += series
+                    _files(folder, row, content, plan)
+    _write_rows(folder, rows)
+    _write_steps(folder, steps)
+    _json(folder / "run.json", _run_json(plan, maps))
+    _json(
+        folder / "summary.json",
+        summary_of(rows, plan, RolloutTable.of_files([folder / "rollouts.parquet"])),
+    )
+    if plan.flip_frames:
+        _write_flips(folder, plan)
+    return folder
+
+
+def _write_flips(folder, plan):
+    """Write when plans parted for every flip, as the runtime does from the logs; the second one has
+    no answer.
+    """
+    flips, compared = find_flips(read_run(folder))
+    cells = []
+    for number, flip in enumerate(flips):
+        key = dict(
+            zip(("renderer", "policy", "scene", "seed", "against"), flip.key, strict=True)
+        ) | {"baseline": flip.base.renderer}
+        if number == 1:
+            cells.append(
+                key | {"t_us": None, "reason": "the plans never diverge by more than 0.5 m"}
+            )
+            continue
+        frames = {}
+        for side, (name, rollout) in enumerate(
+            zip(flip.sides, (flip.base, flip.other), strict=True)
+        ):
+            frames[name] = f"flips/{number:03d}-{side}.jpg"
+            (folder / "flips").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / frames[name]), _picture(rollout.renderer, 2, *plan.picture_px))
+        part_us = 1_000_000 + 100_000 * number
+        cells.append(
+            key
+            | {
+                "t_us": part_us,
+                "after_us": part_us,
+                "gap_m": 0.5 + 0.01 * number,
+                "source": "logs",
+                "frames": frames,
+            }
+        )
+    _json(
+        folder / "flips.json",
+        {
+            "threshold_m": 0.5,
+            "horizon_s": 3.0,
+            "n_flips": len(flips),
+            "n_pairs": compared,
+            "cells": cells,
+        },
+    )
+
+
+def _slug(name):
+    return "".join(c if c.isalnum() or c in "._@+-" else "-" for c in name).strip("-.") or "unnamed"
+
+
+def _json(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _scene(scene, index, plan):
+    length_m = 8.0 * plan.steps * 0.1
+    s = np.linspace(-15, length_m + 30, 160)
+    bend = (0.0, 0.014, -0.006, 0.003)[index % 4]
+    yaw = bend * np.clip(s - 30, 0, 90)
+    ds = np.diff(s, prepend=s[0])
+    centre = np.stack(
+        [np.cumsum(np.cos(yaw) * ds) + 1000.0 * index, np.cumsum(np.sin(yaw) * ds) - 400.0], 1
+    )
+    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    lanes = []
+    for lane in range(3):
+        mid = centre + normal * 3.6 * (lane - 0.5 if index % 2 else lane)
+        lanes.append(
+            {
+                "id": f"lane-{lane}",
+                "kind": "vehicle",
+                "centre": np.round(mid, 2).tolist(),
+                "left": np.round(mid + normal * 1.8, 2).tolist(),
+                "right": np.round(mid - normal * 1.8, 2).tolist() if lane or index != 2 else None,
+                "markings": ["dashed_white", "solid_white"],
+            }
+        )
+    mid = np.array(lanes[0]["centre"])
+    edges = [np.round(mid - normal * 2.1, 2).tolist(), np.round(mid + normal * 9.4, 2).tolist()]
+    at = mid[60]
+    ahead = np.array([math.cos(yaw[60]), math.sin(yaw[60])])
+    ring = [
+        (at + normal[60] * a + ahead * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))
+    ]
+    drive = np.stack(
+        [np.interp(np.linspace(0, length_m, plan.steps), s, mid[:, k]) for k in (0, 1)], 1
+    )
+    return {
+        "scene_id": scene,
+        "source": "commonroad" if scene.startswith("USA") else "yaml",
+        "content_hash": f"{index:02d}" * 32,
+        "notes": ["2 signs without a shape left out"],
+        "start_us": 0,
+        "end_us": plan.steps * DT_US,
+        "warmup_us": 500_000,
+        "lanes": lanes,
+        "road_edges": edges,
+        "crosswalks": [ring] if index == 1 else [],
+        "ego_log": {
+            "t_us": [k * DT_US for k in range(plan.steps)],
+            "x_m": np.round(drive[:, 0], 3).tolist(),
+            "y_m": np.round(drive[:, 1], 3).tolist(),
+        },
+        "vehicle": {"length_m": 4.855, "width_m": 1.88, "rear_axle_to_centre_m": 1.4},
+    }
+
+
+def _smooth(rng, n):
+    """Make a wandering curve of about unit size."""
+    knots = rng.normal(0, 1, 9)
+    return np.interp(np.linspace(0, 8, n), np.arange(9), knots) if n < 4 else _cubic(knots, n)
+
+
+def _cubic(knots, n):
+    return np.asarray(CubicSpline(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, n)))
+
+
+def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type: ignore[no-untyped-def]
+    key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed}
+    row = key | {
+        "path": f"rollouts/{_slug(renderer)}/{_slug(policy)}/{_slug(scene)}/{seed}",
+        "wall_s": round(float(rng.uniform(2.0, 6.0)), 3),
+        "frames": plan.steps,
+        "steps": plan.steps,
+        "status": "ok",
+        "failure_class": None,
+        "failure": None,
+    }
+    if (renderer, scene, seed) in plan.fail:
+        row |= {
+            "status": "failed",
+            "failure_class": "renderer",
+            "failure": plan.failure,
+            "frames": 34,
+            "steps": 34,
+        }
+        row |= {m: None for m in METRICS} | {f"{m}_valid": False for m in METRICS}
+        return row, []
+    harm = plan.harm.get(renderer, 0.8) * (1.6 if "hard" in scene else 1.0)
+    t = np.arange(plan.steps)
+    offset = (wander * (0.6 + harm) + _smooth(rng, plan.steps) * 0.12 * harm) * np.clip(
+        (t - 5) / 25, 0, 1
+    )
+    xy = np.stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]], 1)
+    tangent = np.gradient(xy, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    ego = xy + offset[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], 1)
+    off = offset < -1.1
+    hit = offset > 1.6
+    end = min([plan.steps, *(int(np.argmax(flag)) + 1 for flag in (off, hit) if flag.any())])
+    series = {
+        "ego_x_m": ego[:, 0],
+        "ego_y_m": ego[:, 1],
+        "ego_yaw_rad": np.arctan2(tangent[:, 1], tangent[:, 0]),
+        "ego_speed_mps": np.full(plan.steps, 8.0),
+        "lateral_bias_m": offset,
+        "opacity_mean": np.clip(0.995 - 0.04 * harm * np.abs(offset), 0, 1),
+        "plan_deviation": 0.05 + 0.04 * harm * np.abs(offset),
+        "collision_any": hit.astype(float),
+        "collision_at_fault": hit.astype(float),
+        "offroad": off.astype(float),
+        "offroad_or_collision_at_fault": (hit | off).astype(float),
+    }
+    steps = [
+        key | {"t_us": k * DT_US, "metric": m, "value": float(v[k]), "valid": True, "reason": ""}
+        for m, v in series.items()
+        for k in range(plan.steps)
+    ]
+    collided = bool(hit[:end].any())
+    values = {
+        "collision_any": float(collided),
+        "collision_at_fault": float(collided),
+        "collision_front": 0.0,
+        "collision_lateral": float(collided),
+        "collision_rear": 0.0,
+        "offroad": float(off[:end].any()),
+        "offroad_or_collision_at_fault": float(collided or off[:end].any()),
+        "lateral_distance_m": float(np.abs(offset[:end]).mean()),
+        "progress": end / plan.steps,
+        "dist_to_gt_location": float(np.abs(offset[:end]).mean() + 0.4),
+        "min_distance_to_obstacle_m": float(max(0.0, 1.6 - np.abs(offset[:end]).max())),
+        "plan_deviation": float(0.05 + 0.04 * harm + rng.uniform(0, 0.02)),
+        "dist_traveled_m": 0.8 * end,
+        "min_ade@1.0s(gt)": None,
+    }
+    if scene == plan.scenes[0]:
+        values |= dict.fromkeys(plan.invalid)
+        steps += [
+            key
+            | {
+                "t_us": 0,
+                "metric": m,
+                "value": None,
+                "valid": False,
+                "reason": "no other road user within 50 m",
+            }
+            for m in plan.invalid
+        ]
+    steps += [
+        key
+        | {
+            "t_us": 0,
+            "metric": m,
+            "value": None,
+            "valid": False,
+            "reason": "the policy gives no plan of 1.0 s",
+        }
+        for m in ("min_ade@1.0s(gt)",)
+        if values[m] is None
+    ]
+    row["censored"] = {
+        "dropped": "",
+        "steps_total": plan.steps,
+        "steps_warmup": 5,
+        "steps_after_event": plan.steps - end,
+    }
+    row["censored"] |= {"steps_after_drift": 0, "steps_scored": end - 5}
+    row |= {f"{m}_reason": "no other road user within 50 m" for m in plan.invalid}
+    row |= {"min_ade@1.0s(gt)_reason": "the policy gives no plan of 1.0 s"}
+    row |= values | {f"{m}_valid": v is not None for m, v in values.items()}
+    return row, steps
+
+
+def _files(folder, row, content, plan):
+    place = folder / row["path"]
+    place.mkdir(parents=True, exist_ok=True)
+    manifest = {"status": row["status"], "path": row["path"], "events": []}
+    _json(place / "manifest.json", manifest)
+    if plan.clips and row["status"] == "ok" and row["seed"] == plan.seeds[0]:
+        (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
+
+
+def _picture(renderer, k, width, height):
+    image = np.full((height, width, 3), (98, 96, 94), np.uint8)
+    horizon, middle, car = int(height * 0.45), width // 2, width // 14 + k * width // 60
+    image[:horizon] = (230, 205, 175)
+    for x in (0.0, 0.62, 1.3):
+        cv2.line(image, (middle, horizon), (int(x * width), height), (235, 235, 235), 2)
+    image[horizon : horizon + car, middle - car : middle + car] = (60, 40, 130)
+    if renderer == "3dgs":
+        image = cv2.GaussianBlur(image, (0, 0), 1.5 + 1.2 * k)
+    elif renderer == "onefixer":
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
+    return image
+
+
+CELL = dict.fromkeys(("renderer", "policy", "scene"), pa.string()) | {"seed": pa.int64()}
+
+
+def _write(path, rows, fields):
+    pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(CELL | fields)), path)
+
+
+def _write_rows(folder, rows):
+    fields = dict.fromkeys(("status", "failure_class", "failure", "path"), pa.string())
+    fields |= {"wall_s": pa.float64(), "frames": pa.int64(), "steps": pa.int64()}
+    for name in METRICS:
+        fields |= {name: pa.float64(), f"{name}_valid": pa.bool_()}
+    _write(folder / "rollouts.parquet", rows, fields)
+
+
+def _write_steps(folder, steps):
+    fields = {"t_us": pa.int64(), "metric": pa.string(), "value": pa.float64()}
+    _write(folder / "steps.parquet", steps, fields | {"valid": pa.bool_(), "reason": pa.string()})
+
+
+def summary_of(rows, plan, table):
+    """Aggregate as the runtime does."""
+    own = {policy: [r for r in rows if r["policy"] == policy] for policy in plan.policies}
+    failed = [r for r in rows if r["status"] != "ok"]
+    speed = {
+        renderer: {
+            "ms_per_frame_p50": 14.0 + 9.0 * k,
+            "ms_per_frame_mean": 15.0 + 9.5 * k,
+            "ms_per_frame_p95": 19.0 + 13.5 * k,
+            "frames_per_s": 1000 / (15.0 + 9.5 * k),
+            "first_frame_ms": 310.0 + 80 * k,
+            "stages": {
+                s: {
+                    "p50_ms": round(share * (14.0 + 9 * k), 3),
+                    "p95_ms": round(share * (19.0 + 13 * k), 3),
+                    "share": share,
+                }
+                for s, share in STAGES.items()
+                if share
+            },
+        }
+        for k, renderer in enumerate(plan.renderers)
+        if rows
+    }
+    return {
+        "preset": "paper",
+        **(numbers(table, bases={"onefixer": "3dgs"}) if rows else {"metrics": {}}),
+        "censoring": by_policy(own, censoring),
+        "failures": {
+            "n_failed": len(failed),
+            "n_rollouts": len(rows),
+            "by_class": {"renderer": len(failed)},
+            "cells": [_failed(r) for r in failed],
+        },
+        "speed": by_policy(dict.fromkeys(own), lambda _: speed),
+        "pool": {
+            "workers": 2,
+            "threads_per_worker": 1,
+            "frames_per_s_total": 41.2,
+            "wall_s": sum(r["wall_s"] for r in rows) / 2,
+        },
+    }
+
+
+def _failed(row):
+    error = {
+        "message": f"camera front <script>: {row['failure']}",
+        "hint": "run with --set guard=off",
+    }
+    return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
+
+
+def _run_json(plan, maps):
+    return {
+        "schema_version": 1,
+        "command": [
+            "simrun",
+            "run",
+            "--renderer",
+            ",".join(plan.renderers),
+            "--policy",
+            ",".join(plan.policies),
+            "--seeds",
+            "3",
+            "smoke.yaml",
+        ],
+        "version": "0.1.0",
+        "started_at": "2025-03-04T09:12:44+00:00",
+        "preset": "paper",
+        "config": {"preset": "paper", "images": "jpeg", "video": "none", "workers": 2},
+        "scenes": {
+            s: {"source": m["source"], "content_hash": m["content_hash"], "notes": m["notes"]}
+            for s, m in maps.items()
+        },
+        "renderers": list(plan.renderers),
+        "policies": list(plan.policies),
+        "seeds": list(plan.seeds),
+        "hardware": {"cpu": "Example CPU @ 2.6 GHz", "cores": 2, "memory_gib": 16.0, "gpu": None},
+        "versions": {"python": "3.11.9", "numpy": "2.1.0", "torch": "2.11.0"},
+        "left_out": [
+            "cameras: side-left, side-right (no policy takes them)",
+            "actors: 14 never seen by a camera",
+        ],
+    }

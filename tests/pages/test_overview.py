@@ -1,0 +1,233 @@
+"""The first screen of a run: one table, printed in the terminal, report.html, summary.md and
+gate.md.
+"""
+
+import base64
+import dataclasses
+import json
+import re
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.log import encode_image
+from evaluators.metrics import METRICS
+from evaluators.pages import worst
+from evaluators.pages.ci import write_summary_md
+from evaluators.pages.html import write_report
+from evaluators.pages.overview import decided, overview_of, tone_of
+from evaluators.pages.terminal import overview_lines
+from evaluators.statistics.numbers import DASH
+from evaluators.statistics.opening import read_run
+from tests.pages.make_run import Plan, make_run
+
+PRIMARY = METRICS.primary
+
+
+def pair(diff, low, high, verdict, **more):
+    entry = {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01}
+    return entry | {"verdict": verdict, "margin": 0.02, "n_scenes": 3} | more
+
+
+def with_pairs(folder, **tables):
+    """Return a run of one policy with these tables of primary differences."""
+    run = read_run(folder)
+    shown = {
+        name: {variant: {PRIMARY: entry} for variant, entry in table.items()}
+        for name, table in tables.items()
+    }
+    rest = {key: value for key, value in run.summary.items() if not key.startswith("paired")}
+    return dataclasses.replace(run, summary=rest | shown)
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("three"), Plan(steps=40, clips=False))
+
+
+def test_every_rollout_is_counted_once_under_its_variant(usual_run):
+    shown = overview_of(read_run(usual_run))
+    assert [row.n_rollouts for row in shown.rows] == [12] * 6
+    for row in shown.rows:
+        name, *cells = shown.cells(row)
+        counts = [int(cell) for cell in cells[: len(shown.endings)]]
+        assert name == row.name
+        assert sum(counts) == row.n_rollouts
+    assert [row.name for row in shown.rows if row.difference is None] == [
+        "clean/lane-camera",
+        "clean/pure-pursuit",
+    ]
+    lost = [row.endings.get("not run", 0) for row in shown.rows]
+    assert sum(lost) == 4
+    assert all(row.where.endswith("not run") for row in shown.rows if row.endings.get("not run"))
+
+
+def test_terminal_markdown_and_page_print_the_same_cells(three):
+    shown = overview_of(read_run(three))
+    terminal = "\n".join(line.plain for line in overview_lines(shown, 100))
+    markdown = write_summary_md(read_run(three)).read_text()
+    page = re.sub(r"<[^>]*>", " ", write_report(three).read_text())
+    for row in shown.rows:
+        numbers = [cell.replace("\u00a0", " ") for cell in shown.cells(row)]
+        assert re.search(r"\s+".join(map(re.escape, numbers)), terminal)
+        assert " | ".join(numbers).replace("*", "\\*") in markdown
+        assert row.primary in page
+        for name, n in row.endings.items():
+            assert (
+                f"{n} {'end' if name == 'reached the end' and len(row.endings) > 1 else name}"
+                in page
+            )
+    for text in (shown.decision, shown.title):
+        assert text.replace("\u00a0", " ") in " ".join(page.replace("\u00a0", " ").split())
+    assert terminal.count("would decide") <= 1
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_nothing_is_broken_or_wider_than_the_terminal_with_long_names(tmp_path, width):
+    names = [f"drivers.py:PurePursuitWithALongName{letter * 12}" for letter in "abcd"]
+    plan = Plan(("clean",), ("log-replay", *names), seeds=(0,), steps=30)
+    shown = overview_of(read_run(make_run(tmp_path, plan)))
+    lines = [line.plain for line in overview_lines(shown, width)]
+    assert all(len(line) <= width for line in lines)
+    assert all(any(name in line for line in lines) for name in names)
+
+
+@pytest.mark.parametrize("width", [0, 1, 30])
+def test_a_terminal_narrower_than_the_plot_shows_every_difference(three, width):
+    shown = overview_of(read_run(three))
+    lines = [line.plain for line in overview_lines(shown, width)]
+    differences = [row.difference.text for row in shown.rows if row.difference is not None]
+    assert differences
+    assert all(text in "\n".join(lines) for text in differences)
+
+
+def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
+    three,
+):
+    entry = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
+    run = with_pairs(three, paired={"3dgs": entry, "onefixer": entry | {"more_scenes": 180}})
+    shown = overview_of(run)
+    assert [row.difference and row.difference.tone for row in shown.rows] == [
+        None,
+        "unclear",
+        "unclear",
+    ]
+    assert shown.decision.replace("\u00a0", " ").count("with 3 scenes") == 1
+    assert "183" in shown.decision
+    assert "29" not in shown.decision
+
+
+def test_what_is_decided_is_named_beside_what_is_not(three):
+    run = with_pairs(
+        three,
+        paired={
+            "3dgs": pair(0.25, 0.1, 0.4, "worse"),
+            "onefixer": pair(0.0, -0.1, 0.1, "undecided", p_value=1.0),
+        },
+    )
+    shown = overview_of(run)
+    assert [row.difference and row.difference.tone for row in shown.rows] == [
+        None,
+        "worse",
+        "unclear",
+    ]
+    first, second = shown.decision.split(". ")
+    assert first.startswith("3dgs drives worse than clean")
+    assert "onefixer" in second
+    assert decided(()) == ""
+
+
+def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_own_policy(
+    usual_run,
+):
+    shown = overview_of(read_run(usual_run))
+    assert shown.baselines == "clean"
+    assert {row.name for row in shown.rows if row.difference} == {
+        f"{renderer}/{policy}"
+        for renderer in ("3dgs", "onefixer")
+        for policy in ("lane-camera", "pure-pursuit")
+    }
+
+
+def test_a_distance_that_an_event_cut_short_says_so(three):
+    run = read_run(three)
+    ledger = {name: {"steps_after_event": 5 * (name == "3dgs")} for name in run.renderers}
+    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"censoring": ledger}))
+    assert [row.is_cut_short for row in shown.rows] == [False, True, False]
+    assert [shown.cells(row)[-2].endswith("*") for row in shown.rows] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("entry", "tone"),
+    [
+        ({"verdict": "undecided"}, "unclear"),
+        ({"verdict": "undecided", "difference": "worse"}, "worse"),
+        ({"verdict": "non-inferior", "difference": "worse"}, "neutral"),
+        ({"verdict": "non-inferior", "difference": "better"}, "better"),
+        ({"verdict": "worse"}, "worse"),
+    ],
+)
+def test_tone_of_a_difference(entry, tone):
+    assert tone_of(entry) == tone
+
+
+@pytest.mark.parametrize(("failed", "tone"), [({}, "unclear"), ({"off-road": 1}, "worse")])
+def test_the_headline_counts_rollouts_that_do_not_reach_the_end(three, failed, tone):
+    run = read_run(three)
+    entry = {"n_rollouts": 2, "outcomes": {}, "endings": {"end not reached": 2}}
+    table = {"clean/a": entry, "clean/b": entry | {"endings": entry["endings"] | failed}}
+    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"outcomes": table}))
+    assert shown.badge[1] == tone
+    assert f" 4 of {4 + len(failed)}\u00a0rollouts" in shown.badge[0]
+
+
+def test_an_evaluator_declares_no_second_primary_question():
+    with pytest.raises(EvaluatorError, match=f"'{PRIMARY}' is primary"):
+        METRICS.adding({"mine": dataclasses.replace(METRICS.info(PRIMARY), name="mine")})
+
+
+def grey(value):
+    return encode_image(np.full((9, 16, 3), value, np.uint8), "jpeg", 95)
+
+
+def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, monkeypatch):
+    run = read_run(three)
+    first = run.rollouts[0]
+    scene = run.scenes[0]
+    rollouts = []
+    for one in run.rollouts:
+        if (one.scene, one.seed) == (scene, first.seed):
+            hit = float(one.renderer == "3dgs")
+            flags = {"collision_any": hit, "collision_at_fault": hit, "offroad": 0.0}
+            rollouts.append(dataclasses.replace(one, metrics={**one.metrics, **flags}))
+    run = dataclasses.replace(
+        run, rollouts=tuple(rollouts), info=run.info | {"bases": {"onefixer": "3dgs"}}
+    )
+    for one in rollouts:
+        (run.folder / one.path / "rollout.asl").touch()
+        manifest = {"events": [{"metric": "collision_front", "t_us": 3_300_000}]}
+        (run.folder / one.path / "manifest.json").write_text(json.dumps(manifest))
+    images = [
+        SimpleNamespace(camera=camera, end_us=1_000_000 * k, data=grey(level * k))
+        for k in range(6)
+        for camera, level in (("front", 50), ("left", 20))
+    ]
+    log = SimpleNamespace(images=images, render_start_us=500_000)
+    monkeypatch.setattr(worst, "read_log", lambda path: log)
+    shots = worst.worst_change(run)
+    assert [shot.variant for shot in shots] == ["clean", "3dgs", "onefixer"]
+    assert {(shot.scene, round(shot.t_s, 3)) for shot in shots} == {(scene, 2.8)}
+    for shot in shots:
+        data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
+        upper, lower = np.split(cv2.imdecode(data, cv2.IMREAD_COLOR), 2)
+        np.testing.assert_allclose((upper.mean(), lower.mean()), (150.0, 60.0), atol=3)
+
+
+def test_a_missing_number_is_a_dash_and_never_zero(tmp_path):
+    plan = Plan(("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])
+    (row,) = overview_of(read_run(make_run(tmp_path, plan))).rows
+    assert (row.primary, row.distance) == (DASH, DASH)
+    assert row.endings == {"not run": 1}
