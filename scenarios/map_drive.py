@@ -21,7 +21,7 @@ from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.ego_path import grid
 from scenarios.expert import drive
-from scenarios.map_lines import bordered, ground_of
+from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
 from scenarios.map_route import STATION_M, LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
 from scenarios.map_walkers import place_walkers
@@ -37,6 +37,7 @@ DRAWS = 100
 REAR_M = 2.0  # room behind the rear axle where the map begins
 AHEAD_M = 120.0  # the route goes on so far behind the end of the drive
 AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
+DRIVEN_GAP_M = 1.0  # links across wider gaps are not driven
 LONGEST_S = 300.0  # of a drive
 MOST_INSIDE_M, EASED_M = 0.6, 1.5  # in bends: from the middle of the lane, over this length
 YELLOW_AHEAD_S = 4.0  # before the ego, on a free road, would pass the first light of its route
@@ -60,6 +61,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     files = SourceFiles()
     with parsing(path, "repair this map, or use another one"):
         street = READERS[kind](files, path)
+    street, gap_notes = _without_gaps(street)
     graph = LaneGraph(street.lanes)
     with drawn.at("map", "route"):
         way = _way(drawn, spec.map, graph, street)
@@ -122,9 +124,25 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         (),
         street.origin,
         files.content_hash,
-        (*_said(way, goal_m, heads, len(followers)), *street.notes),
+        (*_said(way, goal_m, heads, len(followers)), *gap_notes, *street.notes),
         route=Route(line.xyz[::4], way.lane_ids),
     )
+
+
+def _without_gaps(street: StreetMap) -> tuple[StreetMap, tuple[str, ...]]:
+    """Return a map without the links over which nobody can drive, and notes on links whose lanes do
+    not meet.
+    """
+    notes = list(link_notes(street.lanes))
+    wide = {link for link, gap in gaps_m(street.lanes).items() if gap > DRIVEN_GAP_M}
+    if not wide:
+        return street, tuple(notes)
+    notes.append(f"{len(wide)} links over gaps of more than {DRIVEN_GAP_M:g} m are not driven")
+    lanes = {
+        key: replace(lane, successors=tuple(s for s in lane.successors if (key, s) not in wide))
+        for key, lane in street.lanes.items()
+    }
+    return replace(street, lanes=lanes), tuple(notes)
 
 
 def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:

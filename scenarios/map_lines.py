@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 import shapely
 
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.geometry import arc_lengths, densify, left_of, matrix_from_quat, unit
 from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
@@ -29,6 +30,7 @@ NO_LANES_OF_CARS = (
     "sidewalk",
 )  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
+MEET_M = 0.1  # linked lanes whose ends lie farther apart do not meet
 MIN_HOLE_M2 = 0.5  # smaller holes are seams too
 STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
 
@@ -95,6 +97,39 @@ def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:
             if successor in before:
                 before[successor].append(key)
     return before
+
+
+def gaps_m(lanes: Mapping[str, Lane]) -> dict[tuple[str, str], float]:
+    """Return how far the ends of linked lanes lie apart, metres: the larger distance of the two
+    edges, of lanes without edges that of their centres.
+    """
+    gaps = {}
+    for key, lane in lanes.items():
+        for successor in lane.successors:
+            if successor in lanes:
+                lines = zip(_ending_lines(lane), _ending_lines(lanes[successor]), strict=True)
+                away = [np.linalg.norm(before[-1] - after[0]) for before, after in lines]
+                gaps[key, successor] = float(max(away))
+    return gaps
+
+
+def link_notes(lanes: Mapping[str, Lane]) -> tuple[str, ...]:
+    """Return a note that names the linked lanes which do not meet, the widest gap first; nothing
+    where all do.
+    """
+    gaps = {link: gap for link, gap in gaps_m(lanes).items() if gap > MEET_M}
+    if not gaps:
+        return ()
+    widest_first = sorted(gaps, key=lambda link: (-gaps[link], link))
+    listed = some_of([f"{a} to {b} ({gaps[a, b]:.2f} m)" for a, b in widest_first])
+    return (f"{len(gaps)} links join lanes that lie more than {MEET_M:g} m apart: {listed}",)
+
+
+def _ending_lines(lane: Lane) -> tuple[F64, F64]:
+    """Return the lines of a lane that meet those of a linked one."""
+    if lane.left is None or lane.right is None:
+        return lane.centre, lane.centre
+    return lane.left, lane.right
 
 
 def same_way(lane: Lane, lanes: Mapping[str, Lane], name: str | None) -> str | None:

@@ -36,6 +36,7 @@ from scenarios.opendrive_road import (
     lane_borders,
     lane_key,
     lanes_at,
+    limits_in,
     parse_map,
     placed,
     reference_line,
@@ -261,6 +262,7 @@ def read_lanes(
     left_out: Counter[str] = Counter()
     unlike = []
     apart = []
+    changing: list[str] = []
     for road in odr.roads:
         place = f"{where}, road {road.road_id}"
         for index, section in enumerate(road.sections):
@@ -268,7 +270,7 @@ def read_lanes(
                 left_out["any, in a section without length or geometry"] += len(section.lanes)
                 continue
             with parsing(f"{place}, section {index}", "repair its numbers"):
-                found = _section(road, index, section, T_local_map, left_out)
+                found = _section(road, index, section, T_local_map, left_out, changing)
             lanes.update({one.lane_id: one for one in found})
         ends_m = (one.s_m + one.length_m for one in road.records)
         missing = road.length_m - max(ends_m, default=road.length_m)
@@ -288,6 +290,10 @@ def read_lanes(
         )
     linked, link_notes = following(odr, lanes)
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
+    if changing:
+        notes.append(
+            f"{len(changing)} lanes change their speed limit inside a section, of which the lowest holds all along: {some_of(changing)}"
+        )
     if unlike:
         notes.append(
             f"{len(unlike)} reference lines are not as long as their road: {some_of(unlike)}"
@@ -347,9 +353,15 @@ def _signs_by_type(odr: OdrMap) -> tuple[str, ...]:
 
 
 def _section(
-    road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]
+    road: Road,
+    index: int,
+    section: Section,
+    T_local_map: F64,
+    left_out: Counter[str],
+    changing: list[str],
 ) -> list[Lane]:
-    """Return the lanes of a section.
+    """Return the lanes of a section; lanes whose speed limit changes inside of it are added to
+    ``changing``.
 
     Raises:
         ValueError: Its numbers give no road.
@@ -395,6 +407,9 @@ def _section(
         mark_types = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
         beside_ids = beside_ids[::order]
         left, right = (edge[::turn] for edge in edges)
+        limits = limits_in(lane, road, section)
+        if len(set(limits)) > 1:
+            changing.append(lane_key(road, index, lane.lane_id))
         out.append(
             Lane(
                 lane_key(road, index, lane.lane_id),
@@ -407,7 +422,7 @@ def _section(
                 left_mark_type=mark_types[0],
                 right_mark_type=mark_types[1],
                 is_intersection=road.junction != "-1",
-                speed_limit_mps=road.limit_mps(section.s_m),
+                speed_limit_mps=min((mps for mps in limits if mps is not None), default=None),
             )
         )
     return out

@@ -20,7 +20,7 @@ import scipy
 from numpy.polynomial import Polynomial
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.files.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F64
@@ -146,6 +146,9 @@ def beside(line: F64, t_m: F64) -> F64:
     )
 
 
+Limit = tuple[float, float | None]  # from a place on, metres: speed limit in m/s, None without one
+
+
 @dataclass(frozen=True)
 class OdrLane:
     """A lane of one section. ``widths`` and ``borders`` count s from the road's start."""
@@ -158,6 +161,8 @@ class OdrLane:
     predecessors: tuple[int, ...]
     mark: tuple[str, str] | None  # type and colour of the first road mark of its outer border
     reversed: bool = False  # driven against the usual direction of its side
+    level: bool = False  # it and the lanes outside of it are not banked with the road
+    limits: tuple[Limit, ...] = ()  # of its own, which go before those of the road
 
 
 @dataclass(frozen=True)
@@ -224,11 +229,13 @@ class Road:
     predecessor: RoadLink | None
     signals: tuple[RoadSignal, ...] = ()
     crosswalks: tuple[F64, ...] = ()  # rings (N, 2) of s and t
-    limits: tuple[tuple[float, float | None], ...] = ()  # from a place on: speed limit in m/s
+    limits: tuple[Limit, ...] = ()
 
-    def limit_mps(self, s_m: float) -> float | None:
-        """Return the speed limit at a place."""
-        return next((mps for start_m, mps in self.limits[::-1] if start_m <= s_m), None)
+    @property
+    def has_level_lanes(self) -> bool:
+        """Return whether superelevation leaves out some lanes."""
+        lanes = (lane for section in self.sections for lane in section.lanes)
+        return len(self.superelevation) > 0 and any(lane.level for lane in lanes if lane.lane_id)
 
 
 @dataclass(frozen=True)
@@ -294,7 +301,8 @@ def parse_map(where: Path | str, root: Element) -> OdrMap:
             for junction in root.findall("junction")
             for one in junction.findall("connection")
         )
-    notes = [
+    notes = _odd_sides(elements)
+    notes += [
         f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
         for tag in sorted({child.tag for child in root} - KNOWN)
     ]
@@ -323,6 +331,25 @@ def parse_map(where: Path | str, root: Element) -> OdrMap:
     }
     geo_reference = (root.findtext(".//geoReference") or "").strip()
     return OdrMap(tuple(roads), connections, geo_reference, controllers, tuple(notes))
+
+
+def _odd_sides(elements: Mapping[str, Element]) -> list[str]:
+    """Return a note on lanes whose number belongs to the other side of the reference line: the
+    number counts, since the reference lines of netconvert's left-hand junctions follow it.
+    """
+    sides = {"left": 1, "right": -1}
+    odd = [
+        f"{lane.get('id')} of road {road_id}"
+        for road_id, road in elements.items()
+        for side, sign in sides.items()
+        for lane in road.findall(f"lanes/laneSection/{side}/lane")
+        if int(lane.get("id", "0")) * sign < 0
+    ]
+    if not odd:
+        return []
+    return [
+        f"{len(odd)} lanes stand under a side that is not that of their number, which is followed: {some_of(odd)}"
+    ]
 
 
 def _road(
@@ -382,6 +409,26 @@ def _road(
     )
 
 
+def limits_in(lane: OdrLane, road: Road, section: Section) -> list[float | None]:
+    """Return the speed limits in m/s that hold on a lane of a section, in the order of the road;
+    None stands for a part without a limit.
+    """
+    starts = [start for start, _ in (*road.limits, *lane.limits)]
+    places = {section.s_m, *(s for s in starts if section.s_m < s < section.end_m)}
+    return [
+        _limit_at(lane.limits, s_m) if _has_begun(lane.limits, s_m) else _limit_at(road.limits, s_m)
+        for s_m in sorted(places)
+    ]
+
+
+def _has_begun(limits: Sequence[Limit], s_m: float) -> bool:
+    return any(start_m <= s_m for start_m, _ in limits)
+
+
+def _limit_at(limits: Sequence[Limit], s_m: float) -> float | None:
+    return next((mps for start_m, mps in limits[::-1] if start_m <= s_m), None)
+
+
 def _limit_mps(speed: Element | None) -> float | None:
     text = "" if speed is None else speed.get("max", "")
     if speed is None or text in ("", "no limit", "undefined"):
@@ -425,6 +472,11 @@ def _section(element: Element, start_m: float, end_m: float) -> Section:
                     if mark is None
                     else (mark.get("type", "none"), mark.get("color", "standard")),
                     one.get("direction") == "reversed",
+                    one.get("level") == "true",
+                    tuple(
+                        (start_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
+                        for limit in one.findall("speed")
+                    ),
                 )
             )
     return Section(start_m, end_m, tuple(lanes))
@@ -538,8 +590,29 @@ def road_points(road: Road, line: F64, s_m: F64, t_m: F64, T_local_map: F64) -> 
     """Return points ``(N, 3)`` in the local frame, at signed distances ``(N,)`` from the reference
     line ``(N, 3)`` at arc lengths ``(N,)``.
     """
-    height = cubics_at(road.elevation, s_m) + t_m * np.tan(cubics_at(road.superelevation, s_m))
+    slope = np.tan(cubics_at(road.superelevation, s_m))
+    height = cubics_at(road.elevation, s_m) + _banked_t(road, s_m, t_m) * slope
     return transform_points(T_local_map, np.column_stack([beside(line, t_m), height]))
+
+
+def _banked_t(road: Road, s_m: F64, t_m: F64) -> F64:
+    """Return the signed distances ``(N,)`` up to which the road is banked: those of points on a
+    level lane, or outside of one, end at the inner border of that lane.
+    """
+    if not road.has_level_lanes:
+        return t_m
+    low_t = np.full(len(s_m), -np.inf)
+    high_t = np.full(len(s_m), np.inf)
+    starts = np.array([section.s_m for section in road.sections])
+    owner = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(starts) - 1)
+    for i in np.unique(owner):
+        rows = owner == i
+        for lane, inner_t, _ in lane_borders(road, road.sections[i], s_m[rows]):
+            if lane.level and lane.lane_id < 0:
+                low_t[rows] = np.maximum(low_t[rows], inner_t)
+            elif lane.level:
+                high_t[rows] = np.minimum(high_t[rows], inner_t)
+    return np.clip(t_m, low_t, high_t)
 
 
 def lane_key(road: Road, section: int, lane_id: int) -> str:

@@ -3,6 +3,7 @@ drives and their readers.
 """
 
 import os
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -207,7 +208,9 @@ def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:
                 f"source {spec.name!r}, {path}: a {type(record).__name__}",
                 "make the reader return a scenarios.recorded.RecordedLog",
             )
-    return record
+    from scenarios.map_lines import link_notes  # takes a while to import
+
+    return replace(record, notes=(*record.notes, *link_notes(record.lane_map.lanes)))
 
 
 def source_digest(kind: str) -> str | None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from scenarios.load import load_scenario
+from scenarios.map_lines import link_notes
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
 
@@ -173,3 +175,63 @@ def test_what_is_not_read_of_a_map_is_said():
     )
     for word in ("include", "virtual", "offset"):
         assert any(word in note for note in notes)
+
+
+def banked(*lanes):
+    """Return the map of a road that is banked by 0.1 rad, with its lanes on the right."""
+    made = road("1", section(0, *lanes))
+    bank = '<lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/></lateralProfile>'
+    return read(made.replace("<lanes>", f"{bank}<lanes>"))[0].lanes
+
+
+def test_a_level_lane_and_those_outside_of_it_are_not_banked():
+    slope = np.tan(0.1)
+    lanes = banked(lane(-1), lane(-2, more='level="true"'), lane(-3))
+    assert lanes["1.0.-1"].right[:, 2] == pytest.approx(-3.5 * slope)
+    for key in ("1.0.-2", "1.0.-3"):
+        assert lanes[key].left[:, 2] == pytest.approx(-3.5 * slope)
+        assert lanes[key].right[:, 2] == pytest.approx(-3.5 * slope)
+    assert banked(lane(-1))["1.0.-1"].right[:, 2] == pytest.approx(-3.5 * slope)
+    assert banked(lane(-1, more='level="true"'))["1.0.-1"].right[:, 2] == pytest.approx(0.0)
+
+
+def test_a_limit_of_a_lane_goes_before_that_of_its_road():
+    slow = lane(-1).replace("</lane>", '<speed sOffset="0" max="30" unit="km/h"/></lane>')
+    late = lane(-2).replace("</lane>", '<speed sOffset="20" max="20" unit="km/h"/></lane>')
+    made = road("1", section(0, slow, late, lane(-3)))
+    made = made.replace("<planView>", '<type s="0" type="town"><speed max="10"/></type><planView>')
+    lane_map, notes = read(made)
+    limits = {key: one.speed_limit_mps for key, one in lane_map.lanes.items()}
+    assert limits == pytest.approx({"1.0.-1": 30 / 3.6, "1.0.-2": 20 / 3.6, "1.0.-3": 10.0})
+    assert [note for note in notes if "change their speed limit" in note and "1.0.-2" in note]
+
+
+def test_linked_lanes_that_do_not_meet_are_named():
+    def pair(x):
+        first = road("1", section(0, lane(-1, None, -1)), after="road:2:start")
+        return read(first, road("2", section(0, lane(-1, -1)), x=x, before="road:1:end"))[0].lanes
+
+    (note,) = link_notes(pair(53.0))
+    assert "1.0.-1 to 2.0.-1 (3.00 m)" in note
+    assert link_notes(pair(50.05)) == ()
+
+
+def test_ways_do_not_lead_over_gaps_and_the_run_names_them(tmp_path):
+    first = road("1", section(0, lane(-1, None, -1)), after="road:2:start")
+    second = road("2", section(0, lane(-1, -1)), x=53, before="road:1:end")
+    path = tmp_path / "map.xodr"
+    path.write_text(f"<OpenDRIVE>{first}{second}</OpenDRIVE>")
+    scenario = load_scenario(path, 1)
+    assert len(scenario.route.lane_ids) == 1
+    notes = " ".join(scenario.notes)
+    assert "1.0.-1 to 2.0.-1 (3.00 m)" in notes
+    assert "are not driven" in notes
+
+
+def test_lanes_under_the_side_that_is_not_of_their_number_are_named():
+    made = road("1", section(0, lane(-1)))
+    swapped = made.replace("right>", "left>")
+    lanes, notes = read(swapped)
+    assert lanes.lanes["1.0.-1"].right[0, 1] == pytest.approx(-3.5)
+    assert any("-1 of road 1" in note for note in notes)
+    assert not read(made)[1]
