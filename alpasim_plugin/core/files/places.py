@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.printing import warn
 
-PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).resolve().parents[2]
 CACHE = "SIMRUN_CACHE"
 KERNELS = "NUMBA_CACHE_DIR"
 INTERPRETED = "NUMBA_DISABLE_JIT"
