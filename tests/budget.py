@@ -108,7 +108,7 @@ def sizes(rev: str | None = None) -> dict[str, Size]:
 
 def command_line_of_the_core() -> tuple[int, int]:
     """Return how many verbs and options the core's command line has."""
-    from tests.cli.test_verbs import CORE, options_of
+    from tests.cli.verb_options import CORE, options_of
 
     verbs = {path[0] for path in CORE}
     return len(verbs), sum(len(options_of(command)) for command in CORE.values())

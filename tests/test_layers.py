@@ -3,15 +3,12 @@ what stands after it. Folders inside a room have an order too.
 """
 
 import ast
-import gc
 import re
-from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import pytest
 
-REPO = Path(__file__).resolve().parents[1]
+from tests.source_modules import PACKAGES, modules
+
 A = "alpasim_plugin."
 
 # What every room may import. Within it, too, a folder imports only those before it.
@@ -60,45 +57,7 @@ FACES = ("evaluators",)
 AFTER_THE_STAGES = (A + "runs", A + "alpasim", A + "gym", A + "cli")
 # Rooms that register themselves by entry points, as another distribution does. Nobody imports them.
 PLUG_INS = (A + "block_fixers", A + "lab")
-PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "simrun")
 ROOMS = (*BASE, *STAGES, *FACES, *AFTER_THE_STAGES, *PLUG_INS)
-
-
-@dataclass(frozen=True)
-class Module:
-    """One source file, read and parsed once for all rules."""
-
-    path: Path
-    name: str
-    lines: int
-    nodes: tuple[ast.AST, ...]
-    top: tuple[ast.stmt, ...]
-
-
-def name_of(path):
-    parts = list(path.relative_to(REPO).with_suffix("").parts)
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-@cache
-def modules():
-    found = []
-    gc.disable()  # collections while a million nodes are made take as long as making them
-    for path in (
-        p
-        for package in PACKAGES
-        for p in sorted((REPO / package).rglob("*.py"))
-        if not p.name.endswith("_pb2.py")
-    ):
-        text = path.read_text()
-        tree = ast.parse(text)
-        found.append(
-            Module(
-                path, name_of(path), len(text.splitlines()), tuple(ast.walk(tree)), tuple(tree.body)
-            )
-        )
-    gc.enable()
-    return tuple(found)
 
 
 def room_of(module):

@@ -4,7 +4,7 @@ import ast
 import re
 from collections import Counter
 
-from tests.test_layers import PACKAGES, modules
+from tests.source_modules import PACKAGES, REPO, modules
 
 # Module -> why a user would wait a fifth longer without it. `goes`: it is on its way out.
 ALLOWED: dict[str, str] = {}
@@ -214,3 +214,24 @@ def test_one_place_chooses_by_device_and_sends_tensors_of_the_host_without_waiti
         if asks_for_the_device(node) or (isinstance(node, ast.Call) and makes_the_host_wait(node))
     }
     assert found == set()
+
+
+def test_no_file_of_tests_is_imported_by_another():
+    """Builders that several files use lie in modules without tests: who moves a test or runs one
+    file alone then changes nothing else.
+    """
+    imports = []
+    for path in sorted((REPO / "tests").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                continue
+            imports += [
+                f"{path.relative_to(REPO)} imports {name}"
+                for name in names
+                if re.match(r"tests\.(\w+\.)*test_\w+$", name)
+            ]
+    assert imports == []

@@ -16,7 +16,7 @@ import yaml
 from alpasim_plugin.alpasim.bridge import build as building
 from alpasim_plugin.alpasim.bridge.client import main
 from tests.alpasim.service_cases import CAMERA
-from tests.alpasim.test_wire_generated import environment
+from tests.alpasim.wire_environment import environment
 
 # AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio
 # 1.62.3.

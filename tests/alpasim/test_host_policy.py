@@ -34,7 +34,7 @@ from tests.alpasim.service_cases import (
     pinhole,
     request,
 )
-from tests.alpasim.test_server_lenses import ftheta
+from tests.alpasim.wire_lenses import ftheta
 
 EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode

@@ -7,7 +7,7 @@ import pytest
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.log.images import decode_image
-from tests.alpasim.test_sensorsim_local import SCENE, ask
+from tests.alpasim.local_service import SCENE, ask
 from tests.examples import first_of
 
 

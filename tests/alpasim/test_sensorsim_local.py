@@ -12,19 +12,14 @@ from alpasim_plugin.core.types import RenderRequest
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.log.images import decode_image
-from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import Stub
 from alpasim_plugin.renderers.gaussian import CleanRenderer
-from alpasim_plugin.runs.cameras import recorded_requests
 from scenarios.load import load_scenario
-from tests.alpasim.service_cases import answers, channel_to, hosted, pinhole
+from tests.alpasim.local_service import SCENE, H, W, ask
+from tests.alpasim.service_cases import answers, channel_to, hosted
 
 pytestmark = pytest.mark.slow
-
-SCENE = "smoke/lead_car"
-W = 64
-H = 36
 
 
 @pytest.fixture(scope="module")
@@ -32,16 +27,6 @@ def served():
     made = assemble(Settings(renderer="clean", scenes=[SCENE]))
     with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
         yield Stub(channel, "SensorsimService"), made
-
-
-def ask(t_s=1.0, spec=None):
-    """Return the request for the recorded pose after a time, with the moving cars."""
-    scenario = load_scenario(SCENE)
-    (request,) = recorded_requests(scenario, scenario.start_us + int(t_s * 1e6))
-    asked = wire_render_request(scenario.scene_id, request, "png")
-    asked.resolution_w, asked.resolution_h = W, H
-    asked.camera_intrinsics.CopyFrom(spec or pinhole(W, H, "front"))
-    return asked
 
 
 def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(

@@ -12,6 +12,7 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import Stub
+from tests.alpasim.server_histories import SLOWLY_APART
 from tests.alpasim.service_cases import (
     CAMERA,
     HEIGHT,
@@ -26,7 +27,6 @@ from tests.alpasim.service_cases import (
     picture,
     trust_every_frame,
 )
-from tests.alpasim.test_server_history import SLOWLY_APART
 
 EMPTY = common_pb2.Empty()
 JPEG = sensorsim_pb2.JPEG

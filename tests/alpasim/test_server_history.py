@@ -9,6 +9,7 @@ from alpasim_plugin.alpasim.server.history import HistoryTree, apart, on_line
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
+from tests.alpasim.server_histories import SLOWLY_APART
 from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 
 
@@ -41,14 +42,6 @@ def interleaved(drives, seed):
     return out
 
 
-SLOWLY_APART = (
-    {},
-    {},
-    {"aside_mps": 0.05},
-    {"aside_mps": 0.5},
-    {"brake_mps2": 8.0},
-    {"brake_mps2": 3.0, "aside_mps": 0.3},
-)
 FAST_APART = ({}, {}, {"aside_mps": 1.5}, {"aside_mps": -1.2}, {"brake_mps2": 8.0})
 
 

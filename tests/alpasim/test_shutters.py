@@ -26,7 +26,7 @@ from alpasim_plugin.log.wire import sensorsim_pb2
 from alpasim_plugin.runs.cameras import recorded_requests
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
-from tests.alpasim.test_server_lenses import distorted, fisheye, ftheta
+from tests.alpasim.wire_lenses import distorted, fisheye, ftheta
 from tests.examples import first_of
 
 SCENE = "smoke/lead_car"

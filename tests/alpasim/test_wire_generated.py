@@ -5,11 +5,11 @@ project allows, beside AlpaSim's own.
 import json
 import subprocess
 import sys
-import venv
 
 import pytest
 
 from tests.alpasim import compile_protos as compiling
+from tests.alpasim.wire_environment import environment
 
 PROTOS = compiling.PROTOS
 WIRE = PROTOS.parent
@@ -44,14 +44,6 @@ def copied(folder):
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(source.read_bytes())
     return folder
-
-
-def environment(folder, *requirements):
-    """Make a virtual environment with some packages; return its Python."""
-    venv.create(folder, with_pip=True)
-    python = folder / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "-q", *requirements], check=True)
-    return python
 
 
 def test_checked_in_modules_belong_to_the_checked_in_sources():

@@ -7,7 +7,7 @@ import shlex
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from tests.docs.test_commands import parse
+from tests.docs.parsed_commands import parse
 
 
 def run_tests_of(file):

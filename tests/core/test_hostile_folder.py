@@ -2,9 +2,7 @@
 
 import json
 import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -12,9 +10,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.subprocesses import OURS, SAFE_PATH, own_path_only
+from tests.core.hostile_commands import DRIVE, simrun
 from tests.examples import first_of
 
-REPO = Path(__file__).resolve().parents[2]
 # What libraries of ours import if it is there, and what Python itself imports when it starts a
 # worker.
 BAITS = (
@@ -31,17 +29,6 @@ BAITS = (
     "usercustomize",
     "IPython",
     "readline",
-)
-SCRIPT = f"import sys\nsys.path.append({str(REPO)!r})\nfrom alpasim_plugin.cli.main import main\nif __name__ == '__main__':\n    main()\n"
-DRIVE = (
-    "run",
-    "--renderer",
-    "clean",
-    "--images",
-    "none",
-    "--no-report",
-    "--seeds",
-    "2",
 )
 POLICY = """
 import with_me
@@ -79,28 +66,6 @@ def hostile(tmp_path):
         "".join(f"[{group}]\nevil = evil:Evil\n" for group in groups)
     )
     return tmp_path
-
-
-def simrun(folder, *arguments):
-    """Run a command in a folder by a script that lies elsewhere, as the installed one does."""
-    script = folder.parent / "bin" / "simrun"
-    script.parent.mkdir(exist_ok=True)
-    script.write_text(SCRIPT)
-    environment = {
-        key: value
-        for key, value in os.environ.items()
-        if key not in ("PYTHONPATH", "PYTHONSAFEPATH")
-    }
-    command = [sys.executable, str(script), *arguments]
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-    )
 
 
 def ran(folder):

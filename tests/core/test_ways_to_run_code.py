@@ -15,7 +15,7 @@ import torch
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_FOLDER
-from tests.core.test_hostile_folder import DRIVE, simrun
+from tests.core.hostile_commands import DRIVE, simrun
 
 
 class Bait:

@@ -17,47 +17,22 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.main import PANELS, load_verb, verbs, with_verb
+from alpasim_plugin.cli.main import PANELS, verbs
 from alpasim_plugin.log import write_mp4
 from tests.docs.commands import (
     LONGER,
-    NO_COMMAND,
     NOTHING_FITTED,
     OTHER,
     SHORT,
-    SIMRUN,
     commands,
     lines_of,
     pages,
 )
+from tests.docs.parsed_commands import needing_the_checkout, not_understood
 
 REPO = Path(__file__).resolve().parents[2]
 COMMANDS = [one for one in commands(REPO, pages(REPO)) if not one.is_of_lab]
 RUN = [command for command in COMMANDS if not command.why_not_run]
-
-
-def parse(words):
-    """Parse a command line as `simrun` does, without running it."""
-    args = with_verb(words)
-    command = load_verb(args[0])
-    name, *rest = args
-    while hasattr(command, "commands"):
-        name, *rest = rest
-        command = command.commands[name]
-    command.make_context(name, rest)
-
-
-def not_understood(some):
-    """Return a line for every command that the command line refuses to parse."""
-    refused = []
-    for one in some:
-        if any(re.search(pattern, " ".join(one.words)) for pattern in NO_COMMAND):
-            continue
-        try:
-            parse(list(one.words))
-        except Exception as error:  # click's own errors have a class per cause
-            refused.append(f"{one}: {error}")
-    return refused
 
 
 def test_every_command_of_the_pages_is_understood():
@@ -70,25 +45,6 @@ def test_every_verb_is_on_a_page():
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages(REPO))
     own = [verb for group in PANELS.values() for verb in group]
     assert [verb for verb in own if not re.search(rf"simrun {verb}\b", text)] == []
-
-
-def needing_the_checkout(some):
-    """Return a line for every command of some pages that works in a checkout only."""
-    needs = []
-    for page in some:
-        if page.parent.name == "experiments":
-            continue
-        for line in lines_of(page):
-            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or (
-                "suites/first" in line and ".venv/bin" in line
-            )
-            is_command = SIMRUN.match(line) or OTHER.match(line)
-            is_bound = re.search(
-                r"\.venv/bin/simrun|configs/|pip install[^|&;]* alpasim-onefixer", line
-            )
-            if is_command and is_bound and not is_setup:
-                needs.append(f"{page.name}: {line}")
-    return needs
 
 
 def test_commands_do_not_need_the_checkout_nor_an_index():

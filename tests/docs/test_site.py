@@ -4,7 +4,7 @@ import re
 from types import SimpleNamespace
 
 from docs.scripts.site import on_page_markdown
-from tests.docs.test_pages import LINK, without_code
+from tests.docs.page_links import LINK, without_code
 
 
 def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo):

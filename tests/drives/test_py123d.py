@@ -13,9 +13,9 @@ from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.drives.build import import_drive
 from alpasim_plugin.drives.opening import read_source
 from scenarios.load import load_scenario
+from tests.drives.opened_drives import assert_is_the_street, opened
 from tests.drives.py123d_log import ORIGIN, TYPES, write_py123d
 from tests.drives.street import COUNT
-from tests.drives.test_readers import assert_is_the_street, opened
 
 pytestmark = pytest.mark.slow
 

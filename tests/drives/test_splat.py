@@ -16,7 +16,7 @@ from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.drives.street import COUNT, STEP_M, Street, write_colmap, write_transforms
-from tests.gaussians.test_packed_files import write_splat
+from tests.gaussians.packed_writers import write_splat
 
 pytestmark = pytest.mark.slow
 

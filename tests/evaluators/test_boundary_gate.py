@@ -5,7 +5,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from evaluators.statistics.boundary_gate import boundary_verdict, more_that_fails
 from evaluators.statistics.gate import GateSpec, load_gate
-from tests.evaluators.test_gate import rows, table_of
+from tests.evaluators.gate_tables import rows, table_of
 
 ENDS = [4.0, 14.0]
 TABLE = table_of([*rows("clean", 1), *rows("3dgs", 1)])

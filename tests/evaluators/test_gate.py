@@ -4,11 +4,9 @@ import itertools
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.statistics.gate import (
     GateSpec,
     MetricRule,
@@ -17,8 +15,8 @@ from evaluators.statistics.gate import (
     shipped_gates,
 )
 from evaluators.statistics.verdicts import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
+from tests.evaluators.gate_tables import SCENES, add, rows, table_of
 
-SCENES = 14
 RULES = {
     "lateral_distance_m": MetricRule(margin=0.1),
     "progress": MetricRule(margin=0.05),
@@ -30,44 +28,9 @@ RULES = {
 Rows = list[dict[str, Any]]
 
 
-def rows(renderer="3dgs", scenes=SCENES, seeds=1, policy="p"):
-    """Rows of one renderer, the same for each."""
-    rng = np.random.Generator(np.random.Philox(9))
-    made = []
-    for scene, seed in itertools.product(range(scenes), range(seeds)):
-        values = {
-            "lateral_distance_m": 0.3 + 0.2 * rng.random(),
-            "progress": 0.9,
-            "collision_any": 0.0,
-            "collision_at_fault": 0.0,
-            "offroad": 0.0,
-            "wrong_lane": 0.0,
-            "img_is_black": 0.0,
-        }
-        names = {"renderer": renderer, "policy": policy, "scene": f"s{scene:03d}", "seed": seed}
-        valid = {f"{name}_valid": True for name in values}
-        made.append(names | {"status": "ok", "failure_class": None} | values | valid)
-    return made
-
-
-def table_of(made):
-    return RolloutTable.of_table(pa.Table.from_pylist(made))
-
-
 def judged(run, spec, stored=None, name="", **fields):
     base = None if stored is None else table_of(stored)
     return check_gate(table_of(run), spec, base, name, **fields)
-
-
-def add(change, metric="lateral_distance_m", where=slice(None)):
-    """Return a change of one metric in some of the rows."""
-
-    def changed(candidate):
-        for row in candidate[where]:
-            row[metric] += change
-        return candidate
-
-    return changed
 
 
 def invalid(metric, where=slice(None)):

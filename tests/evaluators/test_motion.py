@@ -9,7 +9,7 @@ from alpasim_plugin.core.types import Signal
 from evaluators import reduce_rollout, score
 from evaluators.metrics.motion import safe_distance_m
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, scored, track
-from tests.evaluators.test_benchmarks import CRUISE, N, braking
+from tests.evaluators.motions import CRUISE, N, braking
 
 
 def test_a_hard_stop_that_touches_nothing_is_an_event_with_its_time():

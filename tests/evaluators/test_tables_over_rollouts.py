@@ -17,25 +17,7 @@ from evaluators.statistics.intervals import (
     normal_half_width,
 )
 from evaluators.statistics.summary import numbers
-
-
-def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
-    """Rows from a table of values: one row of it per scene, one column per seed; None is
-    invalid.
-    """
-    return [
-        {
-            "renderer": renderer,
-            "policy": "p",
-            "scene": f"scene-{i}",
-            "seed": k,
-            "status": status,
-            metric: value,
-            f"{metric}_valid": value is not None,
-        }
-        for i, scene in enumerate(values)
-        for k, value in enumerate(scene)
-    ]
+from tests.evaluators.rollout_rows import rows_of
 
 
 def entry(values, metric="route_distance_m"):

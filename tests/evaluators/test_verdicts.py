@@ -8,7 +8,7 @@ from alpasim_plugin.log.run_folder.sides import Side
 from evaluators import METRICS, paired
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import holm, sign_flip, verdict
-from tests.evaluators.test_tables_over_rollouts import rows_of
+from tests.evaluators.rollout_rows import rows_of
 
 
 def pair(base, other, metric="route_distance_m", margin=None):

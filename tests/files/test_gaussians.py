@@ -20,10 +20,10 @@ from alpasim_plugin.gaussians.fit.photographs import read_points
 from alpasim_plugin.gaussians.raster.rasterize import rasterize
 from alpasim_plugin.gaussians.sh import sh_basis
 from tests.gaussians.gaussian_scenes import covariances
-from tests.gaussians.test_packed_files import body_streams, write_compressed
-from tests.gaussians.test_packed_files import write_spz as plain_spz
-from tests.gaussians.test_ply_files import NAMES, element, make_cloud, write_elements
-from tests.gaussians.test_sog import write_sog
+from tests.gaussians.packed_writers import body_streams, write_compressed
+from tests.gaussians.packed_writers import write_spz as plain_spz
+from tests.gaussians.ply_writers import NAMES, element, make_cloud, write_elements
+from tests.gaussians.sog_writer import write_sog
 
 
 def model(path, more=None, comments="", without=""):

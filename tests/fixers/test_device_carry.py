@@ -14,7 +14,7 @@ from alpasim_plugin.fixers import device_carry, ground
 from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, upload_image
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
-from tests.fixers.test_ground import K, recorded, rig, street
+from tests.fixers.ground_cases import K, recorded, rig, street
 
 BOXES = {"car": Box(4.0, 2.0, 1.5), "van": Box(5.0, 2.2, 2.5)}
 

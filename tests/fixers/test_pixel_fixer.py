@@ -13,54 +13,16 @@ from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_header, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import render_share
-from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
-from alpasim_plugin.fixers.pixel_fixer import PixelFixer
+from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from tests.block_fixers.fixer_cases import small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
-
-FRAMES = moving_picture(12)  # the last ones through a recording of the network
-MAPS = maps_of(FRAMES)
-SIZES = PixelSizes((8, 12, 16), (0, 1, 1, 1, 1), 8, 4)
-
-
-def generator():
-    """Return a network that changes frames and depends on its past."""
-    torch.manual_seed(5)
-    net = PixelGenerator(SIZES)
-    with torch.no_grad():
-        net.write.weight.mul_(6)
-    return net
+from tests.fixers.pixel_cases import FRAMES, MAPS, SIZES, at, run, session, write_bundle
 
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory):
     return write_bundle(tmp_path_factory.mktemp("pixel") / "small.safetensors")
-
-
-def write_bundle(path):
-    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
-    assert isinstance(settings, PixelFixerSettings)
-    save_bundle(
-        path, {"generator": generator().state_dict()}, settings, trained=True, note="9 updates"
-    )
-    return path
-
-
-def at(bundle, *overrides):
-    settings = fixer_settings(
-        "onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides]
-    )
-    assert isinstance(settings, PixelFixerSettings)
-    return settings
-
-
-def session(bundle, *overrides, seed=0):
-    return PixelFixer(at(bundle, *overrides), "scene", seed)
-
-
-def run(fixer, frames, maps=()):
-    return [out for i, frame in enumerate(frames) for out in fixer.step([frame], maps[i : i + 1])]
 
 
 def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle):

@@ -2,12 +2,10 @@
 bytes.
 """
 
-import gzip
 import struct
 
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -17,7 +15,6 @@ from alpasim_plugin.gaussians import read_ply
 from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
-    _ROW,
     read_compressed_ply,
     read_splat,
     read_spz,
@@ -27,6 +24,7 @@ from alpasim_plugin.gaussians.files.packed import (
 from alpasim_plugin.gaussians.files.ply import read_ply_header
 from alpasim_plugin.gaussians.sh import C0, rotate_sh
 from tests.examples import examples
+from tests.gaussians.packed_writers import BOUNDS, body_streams, write_compressed, write_spz
 
 
 @pytest.fixture
@@ -66,31 +64,7 @@ def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker):
 
 # --- compressed PLY, worked by hand
 
-BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
-
-
-def write_compressed(
-    path,
-    n,
-    chunks,
-    packed,
-    sh=b"",
-    n_sh=0,
-):
-    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n" + "".join(
-        f"property float {b}\n" for b in BOUNDS
-    )
-    head += f"element vertex {n}\n" + "".join(
-        f"property uint packed_{p}\n" for p in ("position", "rotation", "scale", "color")
-    )
-    if n_sh:
-        head += f"element sh {n}\n" + "".join(f"property uchar f_rest_{i}\n" for i in range(n_sh))
-    bounds = struct.pack("<12f", 0, 10, 20, 2, 12, 22, -3, -3, -3, -1, -1, -1)
-    path.write_bytes(
-        head.encode() + b"end_header\n" + bounds * chunks + struct.pack("<4I", *packed) * n + sh
-    )
-    return path
 
 
 def test_packed_bits_are_spread_over_the_chunk(tmp_path):
@@ -131,17 +105,6 @@ def test_left_out_component_is_restored_in_its_place(largest):
 # --- .splat
 
 
-def write_splat(path, cloud):
-    """Write a cloud as ``.splat``: constant colours in 8 bits, rotations in 7 bits and sign."""
-    rgb = 0.5 + C0 * np.asarray(cloud.sh, np.float64)[:, 0]
-    rgba = np.column_stack([rgb, cloud.opacities])
-    rows = np.zeros(len(cloud), _ROW)
-    rows["position"], rows["scale"] = cloud.means, cloud.scales
-    rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
-    rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, np.float64) * 128 + 128), 0, 255)
-    path.write_bytes(rows.tobytes())
-
-
 def test_splat_bytes_worked_by_hand(tmp_path):
     row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 128, 192, 128, 64, 128)
     (tmp_path / "a.splat").write_bytes(row)
@@ -159,26 +122,6 @@ def test_splat_of_broken_size_is_refused(tmp_path, size):
 
 
 # --- SPZ, worked by hand
-
-
-def body_streams(version, n, degree):
-    rng = np.random.default_rng(7)
-    sizes = [9 * n, n, 3 * n, 3 * n, (3 if version < 3 else 4) * n, 3 * n * ((degree + 1) ** 2 - 1)]
-    return [rng.integers(0, 256, size, dtype=np.uint8).tobytes() for size in sizes]
-
-
-def write_spz(path, version, n, degree, streams, claim=None):
-    head = struct.pack("<IIIBBB", 0x5053474E, version, n if claim is None else claim, degree, 12, 0)
-    if version == 4:
-        used = streams if degree else streams[:5]
-        packed = [zstandard.ZstdCompressor().compress(s) for s in used]
-        table = b"".join(
-            struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, used, strict=True)
-        )
-        path.write_bytes(head + struct.pack("<BI12x", len(used), 32) + table + b"".join(packed))
-    else:
-        path.write_bytes(gzip.compress(head + b"\0" + b"".join(streams)))
-    return path
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])

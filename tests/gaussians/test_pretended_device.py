@@ -14,6 +14,7 @@ from alpasim_plugin.alpasim.server.caches import SceneEntry
 from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.cameras.shutter import rolling
 from alpasim_plugin.core.devices import CapturedFunction, share_card, sizes_of, upload_together
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import (
     OPACITY_MEAN,
     RECORDED_SHARE,
@@ -34,7 +35,7 @@ from alpasim_plugin.renderers.rolling import camera_at, draw_requests
 from tests.examples import first_of, first_rows_of
 from tests.fixers.views import line, marked
 from tests.gaussians.gaussian_scenes import LSB
-from tests.gaussians.test_scene_graph import SKY, blobs, camera, node, se2
+from tests.gaussians.graph_scenes import SKY, blobs, camera, node
 
 pytest.importorskip("triton", reason="Triton is not installed")
 

@@ -18,7 +18,6 @@ from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasteriz
 from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.examples import first_of
-from tests.gaussians import test_rasterize_gradient
 from tests.gaussians.gaussian_scenes import (
     HARD,
     LSB,
@@ -29,6 +28,8 @@ from tests.gaussians.gaussian_scenes import (
     splats,
 )
 from tests.gaussians.gradient_scenes import assert_close, kernel_gradients, numeric_gradients
+from tests.gaussians.hard_gradients import HARD as HARD_GRADIENTS
+from tests.gaussians.hard_gradients import TOLERANCE
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
@@ -143,10 +144,10 @@ def test_a_window_shows_what_the_whole_image_does():
     np.testing.assert_allclose(part.rgb, whole.rgb[8:40, 16:80], atol=1e-4)
 
 
-@pytest.mark.parametrize("make", first_of(test_rasterize_gradient.HARD))
+@pytest.mark.parametrize("make", first_of(HARD_GRADIENTS))
 def test_the_gradient_of_a_hard_case_is_that_of_the_reference(make):
     found, _ = kernel_gradients(make(), TileCompositor("cpu"))
-    assert_close(found, numeric_gradients(make()), test_rasterize_gradient.TOLERANCE)
+    assert_close(found, numeric_gradients(make()), TOLERANCE)
 
 
 def test_bad_devices_are_refused():

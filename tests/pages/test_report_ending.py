@@ -5,7 +5,7 @@ import dataclasses
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.pages.terminal import next_command
 from evaluators.statistics.opening import read_run
-from tests.docs.test_commands import parse
+from tests.docs.parsed_commands import parse
 from tests.pages.make_run import Plan, make_run
 
 

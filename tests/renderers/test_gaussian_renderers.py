@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from alpasim_plugin.core.geometry import quat_from_yaw, se3
+from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import (
     BackgroundFile,
     Behaviour,
-    RenderRequest,
     Trajectory,
 )
 from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
 from tests.gaussians.scene_maps import parked, straight
+from tests.renderers.requests import request
 
 
 @pytest.fixture(scope="module")
@@ -32,24 +32,6 @@ def scenario():
         )
     )
     clear_cache()
-
-
-def request(scenario, index=8, left_m=0.0, t_us=None):
-    T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
-    T[:3, 3] += left_m * T[:3, 1]
-    camera = scenario.cameras[0]
-    pose = T @ camera.T_rig_camera
-    actors = {a.actor_id: se3(a.track.xyz[0], a.track.quat[0]) for a in scenario.actors}
-    return RenderRequest(
-        int(scenario.ego_log.t_us[index]) if t_us is None else t_us,
-        camera,
-        np.stack([pose, pose]),
-        actors,
-    )
-
-
-def psnr(a, b):
-    return float(10 * np.log10(255.0**2 / np.mean((a.rgb.astype(float) - b.rgb) ** 2)))
 
 
 def test_frame_has_the_shapes_types_and_ranges_of_the_contract(scenario):

@@ -43,7 +43,7 @@ from alpasim_plugin.renderers.reconstruction_key import (
     reconstruction_key,
 )
 from tests.gaussians.scene_maps import camera_spec, line, parked, road_lanes, straight, with_camera
-from tests.renderers.test_gaussian_renderers import psnr, request
+from tests.renderers.requests import psnr, request
 
 ACTORS = (parked("ahead", 19.0, -1.8), parked("never-seen", -30.0, -1.8))
 FITTED = Degradation("reconstruction", share=0.4)

@@ -24,7 +24,7 @@ from alpasim_plugin.runs.run import execute_run
 from policies.simple import ConstantVelocity
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY, Darker, Grey
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 DARKER = "tests.runs.grey_renderer:Darker"
 SEES = f"{__name__}:SeesAfterAll"

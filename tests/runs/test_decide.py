@@ -27,7 +27,7 @@ from evaluators.statistics.opening import read_run
 from scenarios.suite import ScenarioRef, expand
 from tests.runs.grey_policy import BY_GREY
 from tests.runs.grey_renderer import GREY
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 DARKER = GREY.replace("Grey", "Darker")
 SHORT = ("timing.duration_us=700000", "timing.warmup_us=100000")

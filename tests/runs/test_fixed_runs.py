@@ -15,7 +15,7 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from alpasim_plugin.runs.summary import speed
 from scenarios.suite import expand
-from tests.runs.test_runs import Announced, comparable
+from tests.runs.short_runs import Announced, comparable
 
 pytestmark = pytest.mark.slow
 

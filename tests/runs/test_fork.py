@@ -19,7 +19,7 @@ from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
 from tests.examples import first_of
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 pytestmark = pytest.mark.slow
 

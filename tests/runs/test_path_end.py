@@ -20,7 +20,7 @@ from alpasim_plugin.runs.score_logs import check_complete
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY, Grey
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 FAST = f"{__name__}:Fast"
 

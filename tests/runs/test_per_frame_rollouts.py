@@ -12,8 +12,8 @@ from alpasim_plugin.core.types import Latency
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.loop import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
+from tests.runs.fixed_drives import Zigzag, assert_same_pictures, drive, rendered
 from tests.runs.grey_renderer import Grey
-from tests.runs.test_fixed_rollouts import Zigzag, assert_same_pictures, drive, rendered
 
 SMALL = ("weights.bundle=null", "generator.widths=[8,8,8]", "untrained=random", "uses_map=false")
 

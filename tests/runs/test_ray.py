@@ -14,7 +14,7 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
-from tests.runs.test_runs import SHORT, Announced, comparable, plan_of
+from tests.runs.short_runs import SHORT, Announced, comparable, plan_of
 
 KILLER = "tests.runs.broken_policies:KillsItsProcess"
 

@@ -8,7 +8,7 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import execute_run
 from scenarios.suite import expand
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
 SHORT = "timing.duration_us=800000"

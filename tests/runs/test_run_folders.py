@@ -19,7 +19,7 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import default_folder, execute_run
 from scenarios.suite import expand
 from tests.examples import first_of
-from tests.runs.test_runs import Announced, comparable
+from tests.runs.short_runs import Announced, comparable
 
 CELL = "rollouts/clean/constant-velocity/smoke-straight/0"
 

@@ -3,7 +3,7 @@ nothing is driven again.
 """
 
 from alpasim_plugin.runs.run import execute_run
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 
 def run(of, root):

@@ -12,7 +12,7 @@ from alpasim_plugin.runs.self_test import (
     gate_against,
 )
 from evaluators.statistics.gate import GateSpec, MetricRule
-from tests.evaluators.test_gate import add, rows, table_of
+from tests.evaluators.gate_tables import add, rows, table_of
 
 
 def trial(margin, is_broken, change, limit=None):

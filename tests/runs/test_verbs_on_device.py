@@ -16,7 +16,7 @@ from alpasim_plugin.drives import build
 from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.log.video import VideoWriter
-from tests.alpasim.test_sensorsim_local import SCENE, ask
+from tests.alpasim.local_service import SCENE, ask
 from tests.drives.street import write_transforms
 from tests.pretended_device import pretended_device, traffic
 

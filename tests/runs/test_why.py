@@ -22,7 +22,7 @@ from evaluators.statistics.opening import read_run
 from scenarios.suite import expand
 from tests.runs.faulty_policies import CAUSES, FAULTS
 from tests.runs.grey_renderer import GREY
-from tests.runs.test_runs import Announced
+from tests.runs.short_runs import Announced
 
 HERE = "tests.runs.test_why"
 OTHER_CAMERA = "tests.runs.faulty_policies:OtherCamera"

@@ -19,7 +19,7 @@ from scenarios.opendrive_road import parse_map
 from scenarios.opendrive_signals import traffic_lights
 from scenarios.street_map import with_cycles
 from tests.examples import first_of
-from tests.files.test_opendrive import lane, road, section
+from tests.files.opendrive_text import lane, road, section
 
 
 def light(i, s, more="", kind="1000001", t=-5.0):

@@ -25,7 +25,7 @@ from alpasim_plugin.log.run_folder.writer import write_parquet
 from scenarios.load import load_scenario
 from tests.core.files.past_failures import png_header
 from tests.gaussians.gaussian_scenes import random_cloud
-from tests.gaussians.test_packed_files import write_splat
+from tests.gaussians.packed_writers import write_splat
 from tests.log.make_rollout import write_rollout
 from tests.scenarios.make_commonroad import write_commonroad
 from tests.scenarios.make_usdz import write as write_usdz

@@ -8,7 +8,7 @@ import pytest
 
 from alpasim_plugin.lab.bench import roofline
 from alpasim_plugin.runs.gpu_work import COUNTED
-from tests.gaussians.test_scene_graph import blobs
+from tests.gaussians.graph_scenes import blobs
 from tests.pretended_device import pretended_device
 
 SMALL = ["blocks=1", "width=32", "head_width=16", "mlp_width=32", "text_width=8", "context_width=8"]

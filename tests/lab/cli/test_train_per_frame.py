@@ -11,28 +11,8 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
+from tests.lab.cli.small_training import FEW, SIZES
 from tests.lab.training.pair_files import make
-
-SIZES = [
-    "--set",
-    "fixer.generator.widths=[8,8,8]",
-    "--set",
-    "fixer.generator.detail=8",
-    "--set",
-    "fixer.generator.hidden=4",
-]
-FEW = [
-    "--streams",
-    "2",
-    "--frames",
-    "2",
-    "--crop",
-    "48x32",
-    "--precision",
-    "fp32",
-    "--threads",
-    "1",
-]
 
 
 @pytest.fixture

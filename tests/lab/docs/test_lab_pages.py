@@ -7,9 +7,9 @@ import re
 import pytest
 
 from alpasim_plugin.cli.main import verbs
-from tests.docs import test_pages as core
+from tests.docs import page_links as core
 from tests.docs.commands import LAB, LAB_VERBS, commands, lab_pages, pages
-from tests.docs.test_commands import needing_the_checkout, not_understood
+from tests.docs.parsed_commands import needing_the_checkout, not_understood
 
 
 @pytest.fixture

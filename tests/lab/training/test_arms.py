@@ -23,7 +23,11 @@ from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 from tests.block_fixers.fixer_cases import SMALL_DIT, fixer, run_blocks
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
-from tests.lab.training.test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture
+from tests.lab.training.generator_runs import (
+    FORM,
+    clips_of,  # noqa: F401 - data is a fixture
+    data,  # noqa: F401 - data is a fixture
+)
 
 pytestmark = pytest.mark.slow
 

@@ -2,15 +2,19 @@
 nothing else.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.fixers.semantic_map.style import COLOURS
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
-from tests.fixers.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
+from tests.fixers.views import CAR, EMPTY, PIN, at, line
 
 LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other": "dog"}
 

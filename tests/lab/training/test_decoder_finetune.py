@@ -15,7 +15,13 @@ from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.trainer import Schedule
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
-from tests.lab.training.test_generator import FORM, brightness, clips_of, data, run_of  # noqa: F401 - data is a fixture
+from tests.lab.training.generator_runs import (
+    FORM,
+    brightness,
+    clips_of,  # noqa: F401 - data is a fixture
+    data,  # noqa: F401 - data is a fixture
+    run_of,
+)
 
 RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
 

@@ -22,10 +22,14 @@ from alpasim_plugin.lab.training.processes import join_ranks
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe
 from tests.examples import first_of
-from tests.lab.training.test_generator import brightness, data, run_of  # noqa: F401 - data is a fixture
-from tests.lab.training.test_pixel_training import Streams
-from tests.lab.training.test_pixel_training import run_of as per_frame_run
-from tests.lab.training.test_trainer import batch, trainer
+from tests.lab.training.generator_runs import (
+    brightness,
+    data,  # noqa: F401 - data is a fixture
+    run_of,
+)
+from tests.lab.training.pixel_runs import Streams
+from tests.lab.training.pixel_runs import run_of as per_frame_run
+from tests.lab.training.trainer_cases import batch, trainer
 from tests.pretended_device import pretended_device, traffic
 
 

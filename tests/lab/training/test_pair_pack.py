@@ -17,7 +17,7 @@ from alpasim_plugin.lab.training.pair_pack import (
     write_pack,
 )
 from alpasim_plugin.lab.training.pair_store import PairDataset
-from tests.lab.cli.test_train_per_frame import FEW, SIZES
+from tests.lab.cli.small_training import FEW, SIZES
 from tests.lab.training.pair_files import make
 
 

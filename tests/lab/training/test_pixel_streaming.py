@@ -8,7 +8,7 @@ from alpasim_plugin.fixers.network.pixel_generator import noise_key, pixel_noise
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from tests.examples import first_of
 from tests.fixers.clip_cases import SIZE, pixels
-from tests.fixers.test_pixel_fixer import FRAMES, MAPS, generator, run, session, write_bundle
+from tests.fixers.pixel_cases import FRAMES, MAPS, generator, run, session, write_bundle
 
 
 def scaled(images):

@@ -2,11 +2,10 @@
 frames, resumed runs are equal.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
@@ -22,51 +21,10 @@ from alpasim_plugin.lab.training.pixel_rollout import (
     choice_term,
     pixel_losses,
 )
-from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
-from alpasim_plugin.lab.training.pixel_variants import pixel_variant
-from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
+from alpasim_plugin.lab.training.pixel_run import train_per_frame
+from alpasim_plugin.lab.training.trainer import STATE_FILE
+from tests.lab.training.pixel_runs import FRAMES, SMALL, Streams, run_of
 from tests.pretended_device import pretended_device
-
-SMALL = (
-    "generator.widths=[8,8,8]",
-    "generator.detail=8",
-    "generator.hidden=4",
-    "weights.bundle=null",
-)
-FRAMES = 3
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Like `training.streams.StreamBatch`."""
-
-    render: Tensor
-    opacity: Tensor
-    map: Tensor
-    target: Tensor
-    fresh: Tensor
-    road_users: Tensor
-    references: Tensor | None = None
-
-
-class Streams:
-    """Two streams whose renders are darker than the truth; one starts anew at every third
-    update.
-    """
-
-    batch = 2
-
-    def update(self, i, slots=(0, 1)):
-        source = torch.Generator().manual_seed(i)
-        target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
-        opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
-        users = torch.rand(opacity.shape, generator=source) < 0.1
-        fresh = torch.tensor([i % 3 == 0, i == 0])
-        whole = target * 0.5 - 0.4, opacity, target.roll(1, 2), target, fresh, users
-        return Batch(*(part[list(slots)] for part in whole))
-
-    def facts(self):
-        return {"streams": "dark"}
 
 
 def sample(seed=0, t=0.4):
@@ -159,21 +117,6 @@ def test_gradients_pass_through_the_last_k_frames(horizon, reaches):
     reached = [i for i in range(FRAMES) if bool(gradient[:, i].any())]
     assert len(reached) - 1 == reaches
     assert not found.state.hidden.requires_grad
-
-
-def run_of(steps=4, decay_from=3, variant="V9", **changes):
-    settings = fixer_settings("onefixer", SMALL)
-    assert isinstance(settings, PixelFixerSettings)
-    schedule = Schedule(
-        steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from
-    )
-    return PixelRun(
-        settings,
-        Streams(),
-        pixel_variant(variant).weighted(0, 0.25, 0.25, 0.01, horizon=4),
-        schedule,
-        **changes,
-    )
 
 
 def weights(path):
