@@ -14,7 +14,8 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files import content_of, file_sha256
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.geometry import speeds
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
@@ -72,6 +73,14 @@ def load_scenario(
     """
     document = open_document(find(path_or_name), source)
     drawn = draw(document, seed, overrides)
+    # The scenario file enters as the resolved specification; everything else that is read, by its
+    # content.
+    with Inputs() as inputs:
+        return _loaded(drawn, source, inputs)
+
+
+def _loaded(drawn: Drawn, source: str | None, inputs: Inputs) -> Scenario:
+    """Read what a specification names, and make the scenario of it."""
     cameras = given_cameras(drawn)
     default = drawn.spec.vehicle or VehicleSpec()
     if drawn.spec.road is not None:
@@ -84,6 +93,10 @@ def load_scenario(
         drive = recorded_drive(drawn, source)
     check_record(drive, drawn.document.path)
     scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))
+    for path in scenario.shown_files:
+        content_of(path)
+    inputs.setting("scene", scenario.content_hash)
+    scenario = replace(scenario, content_hash=inputs.key, files=inputs.files)
     if cameras is not None:
         check_mounts(drawn, cameras, scenario.vehicle)
     check_scenario(scenario, drawn.document.path)

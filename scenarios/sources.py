@@ -10,6 +10,7 @@ from pathlib import Path
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import contents, parsing, real
 from alpasim_plugin.core.files.config import Document, load_yaml
+from alpasim_plugin.core.files.inputs import unrecorded
 from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
 from scenarios.recorded import RecordedLog
@@ -220,6 +221,7 @@ def source_digest(kind: str) -> str | None:
 
 @lru_cache(maxsize=16)
 def _source(kind: str) -> tuple[PartSpec, Source]:
-    spec = resolve("source", kind)
-    source: Source = build(spec)
+    with unrecorded():  # the code of a source is its digest, and it is remembered here
+        spec = resolve("source", kind)
+        source: Source = build(spec)
     return spec, source

@@ -10,8 +10,10 @@ images are HWC uint8 sRGB.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal, Protocol, Self, TypeVar, cast
 
 import numpy as np
@@ -531,6 +533,8 @@ class Scenario:
     stop_at_path_end: bool = (
         True  # a rollout ends where the recorded path does, unless the recorded car stands there
     )
+    # what the loader read beside the scenario file: path -> digest of the content
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(sorted(self.cameras, key=_camera_order)))
@@ -539,6 +543,20 @@ class Scenario:
         """Return the time between the frames of a camera that a policy asks for."""
         own = {camera.name: camera.interval_us for camera in self.cameras}
         return sensor.interval_us or own.get(sensor.camera, 0) or self.rates.camera_us
+
+    @property
+    def shown_files(self) -> list[str]:
+        """Give the paths of what renderers and fixers read: Gaussians of the background and of
+        actors, the files of a model, photographs.
+        """
+        paths = [] if self.background is None else [self.background.path]
+        paths += [actor.appearance for actor in self.actors if actor.appearance is not None]
+        if self.model is not None:
+            inside = (
+                Path(folder, name) for folder, _, names in os.walk(self.model) for name in names
+            )
+            paths += sorted(str(path) for path in inside)
+        return paths + [photograph.path for photograph in self.recording]
 
     @property
     def scene(self) -> Scene:

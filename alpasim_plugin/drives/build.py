@@ -2,7 +2,6 @@
 Read `import_drive` downwards.
 """
 
-import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,10 +14,12 @@ import numpy as np
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import read_bytes, read_json, read_json_object
+from alpasim_plugin.core.files import content_of, read_json, read_json_object
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.files.images import PNG
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
@@ -125,8 +126,13 @@ def import_drive(
     require_device(device)
     tell = report or (lambda stage, done, all: None)
     with working_folder(out) as work:
-        drive = checked(read_source(folder), folder)
-        key = key_of(drive, camera_height_m, lane_map)
+        with Inputs() as inputs:
+            drive = checked(read_source(folder), folder)
+            enter(drive, inputs)
+            inputs.setting("camera height", camera_height_m)
+            inputs.setting("map", None if lane_map is None else content_of(lane_map))
+            inputs.setting("device", device.partition(":")[0])
+        key = inputs.key
         if os.path.exists(out):
             return finished(out, key)
         return _built(drive, folder, work, key, camera_height_m, lane_map, tell, device)
@@ -254,19 +260,13 @@ def write_folder(
     return quality
 
 
-def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
-    """Return what identifies an import: the images by size and time of change, their poses and
-    lenses, and the options.
+def enter(drive: SourceDrive, inputs: Inputs) -> None:
+    """Enter what an import takes from a drive beside the files that name its photographs: these,
+    and the name of the scene, which is that of its folder.
     """
-    facts: list[object] = [drive.kind, camera_height_m, lane_map and read_bytes(lane_map)]
-    for one in drive.photographs:
-        status = one.file.stat() if os.path.isfile(one.file) else None
-        changed = status and (status.st_size, status.st_mtime_ns)
-        lens = one.lens.K.tolist(), one.lens.distortion.tolist()
-        facts.append(
-            (str(one.file), changed, one.camera, one.t_us, one.T_world_camera.tolist(), lens)
-        )
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
+    inputs.setting("scene", drive.scene_id)
+    for photograph in drive.photographs:
+        content_of(photograph.file)
 
 
 def finished(out: Path, key: str) -> JsonObject:
@@ -278,20 +278,23 @@ def finished(out: Path, key: str) -> JsonObject:
         )
     if read_json(out / KEY_FILE).get("key") != key:
         raise InputError(
-            f"{out}: it holds another import",
+            f"{out}: it holds another import: of other files, other options or an older simrun",
             "name another folder, or remove this one first",
         )
     return read_json(out / "quality.json")
 
 
 def begin(work: Path, key: str) -> None:
-    """Make the working folder, or keep that of the same import; another one's is removed."""
+    """Make the working folder, or keep that of the same import by the same code; another one's is
+    removed.
+    """
+    stated = {"key": key, "code": package_digest()}
     if os.path.exists(work) and (
-        not os.path.isfile(work / KEY_FILE) or read_json_object(work / KEY_FILE).get("key") != key
+        not os.path.isfile(work / KEY_FILE) or read_json_object(work / KEY_FILE) != stated
     ):
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
-    write_json(work / KEY_FILE, {"key": key})
+    write_json(work / KEY_FILE, stated)
 
 
 def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:

@@ -10,13 +10,14 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, read_json_object
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.drives.build import (
     Report,
     begin,
+    enter,
     finished,
-    key_of,
     shown_photographs,
     working_folder,
     write_folder,
@@ -72,15 +73,22 @@ def import_splat(
     """
     tell = report or (lambda stage, done, total: None)
     with working_folder(out) as work:
-        drive = read_source(poses, need_files=False)
-        has_photographs = all(os.path.isfile(photograph.file) for photograph in drive.photographs)
-        drive = checked(drive, poses, has_photographs)
-        tell("reading the model", 0, 1)
-        cloud, kept = read_gaussians(file)
-        if kept.n_kept == 0:
-            raise InputError(f"{file}: {kept}", "Give a file with at least one drawable Gaussian.")
-        cloud, frame_notes = _in_frame(file, cloud, poses, drive)
-        key = key_of(drive, None, file if os.path.isfile(file) else None)
+        with Inputs() as inputs:
+            drive = read_source(poses, need_files=False)
+            has_photographs = all(
+                os.path.isfile(photograph.file) for photograph in drive.photographs
+            )
+            drive = checked(drive, poses, has_photographs)
+            enter(drive, inputs)
+            tell("reading the model", 0, 1)
+            cloud, kept = read_gaussians(file)
+            if kept.n_kept == 0:
+                raise InputError(
+                    f"{file}: {kept}", "Give a file with at least one drawable Gaussian."
+                )
+            cloud, frame_notes = _in_frame(file, cloud, poses, drive)
+            inputs.setting("model", file.name)
+        key = inputs.key
         if os.path.exists(out):
             return finished(out, key)
         size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"

@@ -5,7 +5,6 @@ the code), and keep its files.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import cycle, islice
@@ -16,8 +15,9 @@ import numpy as np
 
 from alpasim_plugin.core.detail import halvings
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.files import content_of
 from alpasim_plugin.core.files.arrays import read_npz
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -151,7 +151,8 @@ def fit_cpu_s(scenario: Scenario, pinholes: int) -> float:
 # what it imports decides, with the scene and the recipe, what the model is
 
 # What neither the frames of the logged drive nor the fit depend on. The source's hash is left out
-# because everything it stands for is here, the path of a background file because its bytes are.
+# because everything it stands for is here, the paths of files because their content is.
+_FILES = frozenset({"path", "appearance"})  # fields that name a file
 _NO_MATTER = frozenset(
     {
         "source",
@@ -166,7 +167,8 @@ _NO_MATTER = frozenset(
         "notes",
         "alpasim_map",
         "behaviour",
-        "path",
+        "model",
+        "files",
         "source_part",
         "stop_at_path_end",
         "varied",
@@ -184,15 +186,16 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
 
     Raises:
         TypeError: A value of another type.
-        InputError: The scenario's background file cannot be read.
+        InputError: A file that the scenario shows cannot be read.
     """
-    digest = hashlib.blake2b(digest_size=16)
     clear = replace(scenario, environment=scenario.environment.in_clear_day)
-    content = [package_digest(), _content(recipe), _content(clear)]
-    digest.update(json.dumps(content, sort_keys=True).encode())
-    if scenario.background is not None:
-        digest.update(bytes.fromhex(file_sha256(scenario.background.path)))
-    return digest.hexdigest()
+    with Inputs() as inputs:
+        inputs.setting("code", package_digest())
+        inputs.setting("recipe", _content(recipe))
+        inputs.setting("scene", _content(clear))
+        for path in scenario.shown_files:
+            content_of(path)
+    return inputs.key[:32]
 
 
 def model_key(scenario: Scenario, device: str) -> str | None:
@@ -213,8 +216,12 @@ def _content(value: object) -> object:
         return [value.dtype.str, value.shape, digest]
     if is_dataclass(value):
         named = {field.name: getattr(value, field.name) for field in fields(value)}
-        kept = {name: part for name, part in named.items() if name not in _NO_MATTER}
-        return [type(value).__name__, _content(kept)]
+        kept = {
+            name: content_of(part) if name in _FILES and part is not None else _content(part)
+            for name, part in named.items()
+            if name not in _NO_MATTER
+        }
+        return [type(value).__name__, kept]
     if isinstance(value, Mapping):
         return {name: _content(part) for name, part in value.items()}
     if isinstance(value, list | tuple):

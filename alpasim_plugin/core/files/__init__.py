@@ -4,6 +4,7 @@ failure an error that names the file.
 Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module
 reads what:
 
+- `inputs`: nothing itself; it records what a maker reads through the others.
 - `files`: bytes, text, JSON (with limits, and of a stated shape), XML, the check of a path that a
   library opens itself, and gzip, zstd and zip, decompressed to a stated size at most.
 - `arrays`: NumPy files, by their header against the file's size, and headers and checkpoints of
@@ -17,6 +18,7 @@ used.
 
 from alpasim_plugin.core.files.reading import (
     check_regular,
+    content_of,
     contents,
     file_sha256,
     inside,
@@ -35,6 +37,7 @@ from alpasim_plugin.core.files.reading import (
 
 __all__ = [
     "check_regular",
+    "content_of",
     "contents",
     "file_sha256",
     "inside",

@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files.inputs import ABSENT, content_digest, note_absent, note_opened
 from alpasim_plugin.core.files.limits import (
     ARCHIVE_BYTES,
     DEPTH,
@@ -47,7 +48,8 @@ def open_regular(
 ) -> Iterator[BufferedReader]:
     """Open a regular file for reading, after checking its kind and size on the open file itself.
 
-    A pipe, socket or device is refused without waiting for its other end.
+    A pipe, socket or device is refused without waiting for its other end. The file enters the
+    records that are open (`alpasim_plugin.core.files.inputs`).
 
     Args:
         path: File.
@@ -61,6 +63,8 @@ def open_regular(
         # Without O_NONBLOCK the open of a pipe waits for a writer, for ever.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        if isinstance(error, FileNotFoundError):
+            note_absent(path)
         raise InputError(
             f"{path}: no such file that can be opened: {getattr(error, 'strerror', error)}", do_this
         ) from error
@@ -76,6 +80,7 @@ def open_regular(
                 "give a smaller file",
             )
         try:
+            note_opened(path, stream)
             yield stream
         except OSError as error:
             raise InputError(f"{path}: it cannot be read: {error.strerror}", do_this) from error
@@ -136,6 +141,20 @@ def file_sha256(path: Path | str, do_this: str = CHECK_PATH) -> str:
     """Return the SHA-256 of a file's content in hexadecimal; see `open_regular`."""
     with open_regular(path, ARCHIVE_BYTES, do_this) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def content_of(path: Path | str) -> str:
+    """Return the SHA-256 of a file's content, which is remembered while the file's size and time of
+    change stay, or `ABSENT` where there is no such file; it enters the open records.
+
+    Raises:
+        InputError: There is something that cannot be read; see `open_regular`.
+    """
+    if not os.path.exists(path):
+        note_absent(path)
+        return ABSENT
+    with open_regular(path, ARCHIVE_BYTES) as stream:
+        return content_digest(stream)
 
 
 def read_text(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_PATH) -> str:

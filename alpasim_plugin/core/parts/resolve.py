@@ -21,6 +21,7 @@ from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.core.parts.source import (
     absolute_target,
     classes_of,
+    code_files,
     file_of,
     is_target,
     load,
@@ -404,6 +405,7 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
         note=note_of(spec, declared),
         trained=declared.trained,
         files={str(paths[key]): sha for key, sha in shas.items()},
+        code={path: sha for module in modules for path, sha in code_files(module).items()},
         metrics=dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
         controller=str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
         is_blind=spec.kind == "policy" and not getattr(factory, "sensors", True),

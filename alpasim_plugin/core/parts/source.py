@@ -49,44 +49,90 @@ def package_digest() -> str:
 
 
 def code_digest(file: str | Path) -> str:
-    """Return a SHA-256 over simrun, and over a module that is not simrun's with all that it imports
-    beside it.
-
-    Installed third-party libraries and the standard library are left out: ``run.json`` lists the
-    versions of those that matter.
+    """Return a SHA-256 over simrun, and over a module that is not simrun's with the `code_files` of
+    it.
 
     Args:
         file: Source file of the part's module.
     """
+    hashed = hashlib.sha256(package_digest().encode())
+    modules = code_files(file)
+    if not modules:
+        return package_digest()
+    for content in modules.values():
+        hashed.update(bytes.fromhex(content))
+    return hashed.hexdigest()
+
+
+def code_files(file: str | Path) -> dict[str, str]:
+    """Return the digest of a module that is not simrun's and of all that it imports, by path; of
+    simrun's own none.
+
+    Modules count wherever Python finds them: beside the file, on ``PYTHONPATH``, in a package that
+    is installed editable. Installed third-party libraries and the standard library are left out:
+    ``run.json`` lists the versions of those that matter.
+    """
     path = os.path.realpath(file)
     if Path(os.path.relpath(path, OWN_ROOT)).parts[0] in OWN_PACKAGES:
-        return package_digest()
-    hashed = hashlib.sha256(package_digest().encode())
-    for module in sorted(reached(path)):
-        hashed.update(bytes.fromhex(file_sha256(module)))
-    return hashed.hexdigest()
+        return {}
+    return {module: file_sha256(module) for module in sorted(_reached(path, everywhere=True))}
 
 
 def reached(file: str | Path) -> set[str]:
     """Return the paths of a module and of all that it imports below the folder of its outermost
     package; of installed ones only those of its own package.
     """
-    start = os.path.realpath(file)
+    return _reached(os.path.realpath(file), everywhere=False)
+
+
+def _reached(start: str, everywhere: bool) -> set[str]:
+    """Return the paths of a module and of what it imports; ``everywhere`` follows modules that lie
+    elsewhere and are not installed as well.
+    """
     root = top_folder(start)
     own = Path(os.path.relpath(start, root)).parts[0].removesuffix(".py")
     is_shared = not INSTALLED.isdisjoint(Path(root).parts)
+    folders: dict[str, str | None] = {}  # first name of a module that lies elsewhere -> its root
     seen: set[str] = set()
-    todo = [start]
+    todo = [(start, root)]
     while todo:
-        path = todo.pop()
+        path, base = todo.pop()
         if path in seen:
             continue
         seen.add(path)
-        for module in _imports(path, root):
-            if module[0] == own or not (is_shared or _is_installed(module[0], root)):
-                files = (module_file(root, module[:n]) for n in range(1, len(module) + 1))
-                todo += [file for file in files if file is not None]
+        for module in _imports(path, base):
+            name = module[0]
+            lies_here = base == root and (
+                name == own or not (is_shared or _is_installed(name, root))
+            )
+            folder: str | None = root if lies_here else None
+            if not lies_here and everywhere:
+                if name not in folders:
+                    folders[name] = _folder_elsewhere(name)
+                folder = folders[name]
+            if folder is not None:
+                files = (module_file(folder, module[:n]) for n in range(1, len(module) + 1))
+                todo += [(found, folder) for found in files if found is not None]
     return seen
+
+
+def _folder_elsewhere(name: str) -> str | None:
+    """Return the folder from which Python imports a user's module, on ``PYTHONPATH`` or installed
+    editable; None for simrun, installed libraries, the standard library, and what is not there.
+    """
+    if name in OWN_PACKAGES or name in sys.stdlib_module_names:
+        return None
+    try:
+        spec = importlib.util.find_spec(name)
+    except ValueError:  # a module that was made, not found: __main__
+        return None
+    places = [] if spec is None else [spec.origin or "", *(spec.submodule_search_locations or ())]
+    place = next((os.path.realpath(text) for text in places if os.path.exists(text)), None)
+    if place is None or not INSTALLED.isdisjoint(Path(place).parts):
+        return None
+    is_package = spec is not None and spec.submodule_search_locations is not None
+    inner = place if os.path.isdir(place) else os.path.dirname(place)
+    return os.path.dirname(inner) if is_package else inner
 
 
 def top_folder(file: str) -> str:

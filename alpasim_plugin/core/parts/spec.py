@@ -84,6 +84,7 @@ class PartSpec:
         note: What it is in a few words: "trained", "untrained (identity)".
         trained: Whether its weights were learned; None where it has none.
         files: SHA-256 of every file that it declares, by path.
+        code: SHA-256 of its source files, by path; of simrun's own parts none.
         metrics: An evaluator's own metrics.
         controller: A policy's controller.
         is_blind: A policy whose class declares that it has no camera (``sensors = ()``).
@@ -99,6 +100,7 @@ class PartSpec:
     note: str = ""
     trained: bool | None = None
     files: Mapping[str, str] = field(default_factory=dict)
+    code: Mapping[str, str] = field(default_factory=dict)
     metrics: Mapping[str, MetricInfo] = field(default_factory=dict)
     controller: str = ""
     is_blind: bool = False
@@ -111,6 +113,17 @@ class PartSpec:
         own = getattr(self.settings, "name", "") or self.name
         return f"{own}, {self.note}" if self.note else own
 
+    @property
+    def unseen(self) -> str:
+        """Say what may change the part and is in no key; empty for simrun's own parts."""
+        if self.digest is None:
+            return (
+                "what the remote part does: it has no digest, and is driven again unless --resume"
+            )
+        if self.code:
+            return "files that its code opens by itself and does not declare in `files`; installed libraries"
+        return ""
+
     def as_dict(self) -> dict[str, Any]:
         """Return everything for ``run.json``."""
         return {
@@ -120,6 +133,8 @@ class PartSpec:
             "digest": self.digest,
             "trained": self.trained,
             "files": dict(self.files),
+            "code": dict(self.code),
+            "unseen": self.unseen,
             "settings": None if self.settings is None else self.settings.model_dump(mode="json"),
         }
 
