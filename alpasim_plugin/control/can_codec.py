@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import check_regular
 from alpasim_plugin.core.files.config import load_yaml, validate
 from alpasim_plugin.core.lazy import require_library
 
@@ -207,6 +208,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         InputError: cantools is missing, the file is not a database that it accepts, or the map
             names what the database lacks or what cannot be sent.
     """
+    check_regular(database)
     cantools = require_library("cantools", str(database), "Install the extra [can], or cantools.")
     try:
         # Real databases have overlapping signals in messages that nobody uses here; the map's own

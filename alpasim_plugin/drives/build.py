@@ -126,13 +126,7 @@ def import_drive(
     require_device(device)
     tell = report or (lambda stage, done, all: None)
     with working_folder(out) as work:
-        with Inputs() as inputs:
-            drive = checked(read_source(folder), folder)
-            enter(drive, inputs)
-            inputs.setting("camera height", camera_height_m)
-            inputs.setting("map", None if lane_map is None else content_of(lane_map))
-            inputs.setting("device", device.partition(":")[0])
-        key = inputs.key
+        drive, key = read_inputs(folder, camera_height_m, lane_map, device)
         if os.path.exists(out):
             return finished(out, key)
         return _built(drive, folder, work, key, camera_height_m, lane_map, tell, device)
@@ -258,6 +252,21 @@ def write_folder(
         ),
     )
     return quality
+
+
+def read_inputs(
+    folder: Path, camera_height_m: float | None, lane_map: Path | None, device: str
+) -> tuple[SourceDrive, str]:
+    """Return the drive that an import reads, and the key of the import: everything that was read,
+    and the options.
+    """
+    with Inputs() as inputs:
+        drive = checked(read_source(folder), folder)
+        enter(drive, inputs)
+        inputs.setting("camera height", camera_height_m)
+        inputs.setting("map", None if lane_map is None else content_of(lane_map))
+        inputs.setting("device", device.partition(":")[0])
+    return drive, inputs.key
 
 
 def enter(drive: SourceDrive, inputs: Inputs) -> None:

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing
-from alpasim_plugin.core.files.limits import BODY_M
+from alpasim_plugin.core.files import check_regular, parsing
+from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, BODY_M
 from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
@@ -124,6 +124,7 @@ def _modality(
 ) -> tuple[JsonObject, list[pa.ChunkedArray]]:
     """Return the metadata of a file and columns of it, which stay on the disk until they are used."""
     path = folder / f"{key}.arrow"
+    check_regular(path, ARCHIVE_BYTES, DO_THIS)
     with parsing(path, DO_THIS, "no Arrow file of py123d"):
         table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
         table.validate(full=True)
@@ -198,6 +199,7 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
 
 def _film(path: Path) -> list[bytes]:
     """Return the frames of a film as JPEG."""
+    check_regular(path, ARCHIVE_BYTES, DO_THIS)
     frames: list[bytes] = []
     film = cv2.VideoCapture(str(path))
     while True:

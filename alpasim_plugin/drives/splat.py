@@ -1,7 +1,7 @@
 """Make a scenario of a trained model of Gaussians, and of the poses of a drive through it."""
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, check_motion, place
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud, require_rigid
+from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud, placed_cloud, require_rigid
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -73,22 +73,12 @@ def import_splat(
     """
     tell = report or (lambda stage, done, total: None)
     with working_folder(out) as work:
-        with Inputs() as inputs:
-            drive = read_source(poses, need_files=False)
-            has_photographs = all(
-                os.path.isfile(photograph.file) for photograph in drive.photographs
-            )
-            drive = checked(drive, poses, has_photographs)
-            enter(drive, inputs)
-            tell("reading the model", 0, 1)
-            cloud, kept = read_gaussians(file)
-            if kept.n_kept == 0:
-                raise InputError(
-                    f"{file}: {kept}", "Give a file with at least one drawable Gaussian."
-                )
-            cloud, frame_notes = _in_frame(file, cloud, poses, drive)
-            inputs.setting("model", file.name)
-        key = inputs.key
+        tell("reading the model", 0, 1)
+        trained, key = read_inputs(file, poses)
+        drive = trained.drive
+        cloud = trained.cloud
+        kept = trained.kept
+        has_photographs = trained.has_photographs
         if os.path.exists(out):
             return finished(out, key)
         size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"
@@ -98,7 +88,7 @@ def import_splat(
         notes = (
             f"the model is {file.name}: {size}",
             *kept.notes,
-            *frame_notes,
+            *trained.notes,
             quality,
             "the sky is black: a model of Gaussians has none",
         )
@@ -125,6 +115,44 @@ def import_splat(
             views["fitted"] = _blank_views(drive, placed)
         roads = corridor(placed.ego, placed.ground)
         return write_folder(work, drive, placed, roads, model, shown, views, {}, tell)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """A trained model as it was read, with its drive.
+
+    Attributes:
+        drive: Poses and, where they are there, photographs.
+        cloud: The model in the frame of the poses.
+        kept: How many of its Gaussians were usable.
+        notes: What was assumed of its frame.
+        has_photographs: Whether all photographs are there.
+    """
+
+    drive: SourceDrive
+    cloud: GaussianCloud
+    kept: CleanReport
+    notes: tuple[str, ...]
+    has_photographs: bool
+
+
+def read_inputs(file: Path, poses: Path) -> tuple[TrainedModel, str]:
+    """Return the model that an import reads, and the key of the import: everything that was read.
+
+    Raises:
+        InputError: See `import_splat`.
+    """
+    with Inputs() as inputs:
+        drive = read_source(poses, need_files=False)
+        has_photographs = all(os.path.isfile(photograph.file) for photograph in drive.photographs)
+        drive = checked(drive, poses, has_photographs)
+        enter(drive, inputs)
+        inputs.setting("model", file.name)
+        cloud, kept = read_gaussians(file)
+        if kept.n_kept == 0:
+            raise InputError(f"{file}: {kept}", "Give a file with at least one drawable Gaussian.")
+        cloud, notes = _in_frame(file, cloud, poses, drive)
+    return TrainedModel(drive, cloud, kept, notes, has_photographs), inputs.key
 
 
 def _in_frame(

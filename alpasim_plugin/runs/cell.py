@@ -14,8 +14,10 @@ import cv2
 
 from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.control import Controller
-from alpasim_plugin.core.errors import FaultOfPart, SimrunError
+from alpasim_plugin.core.errors import FaultOfPart, InfrastructureError, SimrunError
+from alpasim_plugin.core.files import content_of, places, real, some_of
 from alpasim_plugin.core.files.atomic import disk_error
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.files.places import require_kernels
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
@@ -44,6 +46,7 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
 from alpasim_plugin.log.schema import session_uuid
+from alpasim_plugin.runs.changes import changed_inputs
 from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.lenses import LensRenderer
@@ -132,11 +135,13 @@ def run_cell(
     """
     folder = root / cell.folder
     with _writing_manifest(cell, options, folder) as manifest:
-        scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
-        with parts_print_to_stderr(folder / OUTPUT_NAME):
+        planned = _scenario(cell) if load is None else load(cell.ref)
+        scenario = replace(planned, stop_at_path_end=cell.stops_at_path_end)
+        with parts_print_to_stderr(folder / OUTPUT_NAME), Inputs() as inputs:
             parts = builder(cell, options, scenario, threads)
             announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
+        manifest["inputs"] = _not_planned(inputs, cell, scenario, root)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
         if _wants_film(options.video, manifest):
@@ -144,6 +149,27 @@ def run_cell(
             if not manifest["has_camera"]:
                 _render_film(cell, options, scenario, folder, threads)
     return manifest
+
+
+def _not_planned(inputs: Inputs, cell: Cell, scenario: Scenario, root: Path) -> dict[str, str]:
+    """Return what a rollout read that its key does not hold, by path: a later command reuses the
+    rollout only while these files are as they were.
+
+    What lies in the cache is named by its content, and what the rollout itself wrote or removed is
+    no input.
+    """
+    held = {*scenario.files}
+    for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller):
+        if part is not None:
+            held |= {str(real(path)) for path in (*part.files, *part.code)}
+    written = [real(root), real(places.cache())]
+    return {
+        path: content
+        for path, content in inputs.files.items()
+        if path not in held
+        and not any(Path(path).is_relative_to(folder) for folder in written)
+        and content_of(path) == content
+    }
 
 
 def is_copied(manifest: JsonView) -> bool:
@@ -182,7 +208,7 @@ def copy_cell(
         manifest |= {"copied_from": original["path"], "session_uuid": session, "stage_ms": {}}
         if _wants_film(options.video, manifest):
             with parts_print_to_stderr(folder / OUTPUT_NAME):
-                _render_film(cell, options, _scenario(cell.ref), folder, threads)
+                _render_film(cell, options, _scenario(cell), folder, threads)
     return manifest
 
 
@@ -231,6 +257,7 @@ def _begun(cell: Cell) -> JsonObject:
         **cell.names,
         "path": cell.folder.as_posix(),
         "rollout_key": cell.rollout_key,
+        "made_of": dict(cell.made_of),
         "score_key": cell.score_key,
     }
 
@@ -314,7 +341,7 @@ def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: JsonObje
     table; return the new manifest.
     """
     folder = root / cell.folder
-    manifest = manifest | _score(folder, cell, options, _scenario(cell.ref))
+    manifest = manifest | _score(folder, cell, options, _scenario(cell))
     manifest |= {"score_key": cell.score_key, "preset": options.preset}
     write_manifest(folder, manifest)
     return manifest
@@ -328,16 +355,16 @@ def find_rollout_state(
 ) -> tuple[Action, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
-    A rollout with another content key is driven again; so are those with a part that has no digest
-    unless ``reuse_undigested`` is set, and failed ones, except where the policy is at fault: the
-    same policy would fail again. One that was driven without the
+    A rollout with another content key is driven again; so is one that read a file beside it which is
+    another one now, one with a part that has no digest unless ``reuse_undigested`` is set, and a
+    failed one, except where the code of a part alone is at fault: the same code would fail again. One that was driven without the
     ``video`` that is asked for now is driven again as well.
     """
     state = inspect_rollout(root, cell.folder.as_posix())
     manifest = state.manifest
     if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
         return "drive", state
-    if manifest["status"] != "ok" and not manifest.get("final"):
+    if changed_inputs(manifest) or (manifest["status"] != "ok" and not manifest.get("final")):
         return "drive", state
     if cell.undigested and not reuse_undigested:
         return "drive", state
@@ -353,6 +380,17 @@ def find_rollout_state(
     if state.action == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state
     return state.action, state
+
+
+def kept_failure(cell: Cell, manifest: JsonView) -> str:
+    """Say that a failure is kept, and what would drive the rollout again."""
+    parts = [cell.policy, cell.renderer.base, cell.renderer.fixer]
+    files = [path for part in parts if part is not None for path in (*part.code, *part.files)]
+    edit = f"an edit of {some_of(files, 3)}" if files else "another version of simrun"
+    return (
+        f"{cell.folder.as_posix()}: failed before with this code and these files, not driven again; "
+        f"{edit} drives it again, and so does removing {manifest['path']}"
+    )
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> JsonObject:
@@ -375,8 +413,25 @@ def _closing(part: Policy | Controller) -> Iterator[None]:
     part.close()
 
 
+def _scenario(cell: Cell) -> Scenario:
+    """Return the scene of a rollout, as it was planned.
+
+    Raises:
+        InfrastructureError: The scenario file, or a file that it names, was changed since.
+    """
+    scenario = _kept_scenario(cell.ref, cell.content_hash)
+    if scenario.content_hash != cell.content_hash:
+        _kept_scenario.cache_clear()
+        raise InfrastructureError(
+            f"{cell.ref.path}: the scene is not the one that was planned: a file of it was changed",
+            "give the same command again: it drives the scene as it is now",
+        )
+    return scenario
+
+
 @lru_cache(maxsize=4)
-def _scenario(ref: ScenarioRef) -> Scenario:
+def _kept_scenario(ref: ScenarioRef, content_hash: str) -> Scenario:
+    """Return a scene, read once for each content."""
     return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.files.stage import shown_in
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
@@ -24,13 +24,16 @@ from alpasim_plugin.runs.cell import (
     failed_manifest,
     find_rollout_state,
     is_copied,
+    kept_failure,
     rescore_cell,
     run_cell,
 )
+from alpasim_plugin.runs.changes import reasons, sentence
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import Lost, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
+NOTHING: JsonView = {}
 OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
 Job = tuple[Cell, JsonObject | None]  # with the manifest of the rollout that it is a copy of
 Done = Iterator[tuple[Cell, JsonObject]]
@@ -102,6 +105,7 @@ def execute(
     how: HowToRun,
     on_done: OnDone,
     notify: Callable[[str], None],
+    held: JsonView = NOTHING,
 ) -> list[JsonObject]:
     """Run every unfinished rollout and return all manifests in the plan's order.
 
@@ -115,12 +119,16 @@ def execute(
         root: Its folder.
         how: Workers, checks, limits.
         on_done: Called with each manifest.
-        notify: Called with one line for each damaged rollout.
+        notify: Called with one line for each damaged rollout, one that says what is driven again and
+            why, and one for each failure that is kept.
+        held: What ``run.json`` said before; it names the files of what is driven again.
     """
     manifests: dict[Path, JsonObject] = {}
     todo = []
     copies = []  # with the rollout that each is a copy of
     originals: dict[tuple[str, str, int], Cell] = {}
+    n_again = 0
+    causes: list[str] = []
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
         original = cell
@@ -136,12 +144,20 @@ def execute(
                 continue
         if action == "drive" or state.manifest is None:
             todo.append(cell)
+            why = [] if state.manifest is None else reasons(cell, state.manifest, held, plan)
+            n_again += bool(why)
+            causes += why
             continue
         manifest = state.manifest
+        if manifest["status"] != "ok":
+            notify(kept_failure(cell, manifest))
         if action == "score":
             manifest = rescore_cell(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
+
+    if n_again:
+        notify(sentence(n_again, causes))
 
     def take(done: Done) -> None:
         for cell, manifest in done:

@@ -5,7 +5,7 @@ keys.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
@@ -25,6 +25,8 @@ from evaluators import resolve_evaluators
 from evaluators.metrics.presets import DEFAULT, preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
+
+SIMRUN = "simrun"  # its code, among what a rollout is made of
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ class Cell:
     seed: int
     ref: ScenarioRef
     evaluators: tuple[PartSpec, ...]
-    rollout_key: str  # digest of everything that determines the log
+    made_of: Mapping[str, str | None]  # digest by name of everything that determines the log
+    content_hash: str  # of the scene
+    rollout_key: str  # digest of ``made_of``
     score_key: str  # digest of rollout_key and of everything that determines the scores
     # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
     stops_at_path_end: bool = True
@@ -222,15 +226,20 @@ def make_plan(
             controller = moving[policy.name]
             if controller.name == "perfect":
                 make_controller(controller.name, scenario.vehicle)  # refuses friction
-            content = {
+            parts = {
                 f"renderer {renderer.name}": renderer.digest,
                 f"policy {policy.name}": policy.digest,
                 f"controller {controller.name}": controller.digest,
                 f"source of {scenario.scene_id}": sources[scenario.source_part],
             }
-            rollout_key = digest(
-                [loop, scenario.content_hash, content, seed, options.images, options.device]
-            )
+            made_of = parts | {
+                SIMRUN: loop,
+                f"scene {scenario.scene_id}": scenario.content_hash,
+                "seed": str(seed),
+                "--images": options.images,
+                "--device": options.device,
+            }
+            rollout_key = digest(made_of)
             cells.append(
                 Cell(
                     renderer,
@@ -240,10 +249,12 @@ def make_plan(
                     seed,
                     ref,
                     evaluators,
+                    made_of,
+                    scenario.content_hash,
                     rollout_key,
                     digest([rollout_key, *scoring]),
                     scenario.stop_at_path_end and stops,
-                    tuple(part for part, known in content.items() if known is None),
+                    tuple(part for part, content in parts.items() if content is None),
                 )
             )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)

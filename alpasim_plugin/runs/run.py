@@ -197,7 +197,7 @@ def execute_run(
         known = held.get("policy_checks") or {}
         try:
             checks = check_policies(plan, known, how, progress.noticed)
-            manifests = execute(plan, root, how, on_done(progress), progress.noticed)
+            manifests = execute(plan, root, how, on_done(progress), progress.noticed, held)
             wall_s = time.perf_counter() - began
             more: JsonObject = {
                 "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))},
@@ -360,6 +360,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
             "code": {"loop": package_digest()[:12], "scoring": package_digest()[:12]},
             "metrics": table_of(parts).as_dict(),
+            "unseen": {f"{part.kind} {part.name}": part.unseen for part in parts if part.unseen},
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),
@@ -387,6 +388,7 @@ def _scene_facts(scenario: Scenario, ref: ScenarioRef, device: str) -> JsonObjec
         "source": scenario.source,
         "ref": vars(ref) | {"path": str(Path(ref.path).absolute())},
         "content_hash": scenario.content_hash,
+        "files": dict(scenario.files),
         "seed": scenario.seed,
         "varied": {key: list(values) for key, values in scenario.varied.items()},
         "duration_s": (scenario.end_us - scenario.start_us) * 1e-6,

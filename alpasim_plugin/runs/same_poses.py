@@ -3,12 +3,16 @@
 import base64
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.files import read_json_object
 from alpasim_plugin.core.files.atomic import write_json
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.parts import RendererSpec
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import encode_image, read_asl
 from alpasim_plugin.log.debug import WIDTH_PX
@@ -28,7 +32,8 @@ def store_same_poses(
     plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
 ) -> None:
     """Write ``same_poses.json`` for the first failures of a run with several renderers: by renderer,
-    time and JPEG of each image in base64, of the policy's first camera.
+    time and JPEG of each image in base64, of the policy's first camera. A file that was made of the
+    same log and renderers is kept.
 
     A renderer that works in blocks of frames, or that fails, is left out.
     """
@@ -37,7 +42,8 @@ def store_same_poses(
     for manifest in failures[:MOST_FAILURES] if len(plan.renderers) > 1 else ():
         cell = cells[manifest["path"]]
         path = root / cell.folder / SAME_POSES
-        if os.path.exists(path):
+        key = images_key(plan, cell, manifest, manifests)
+        if _key_in(path) == key:
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
         failed_us = int((first_failure(manifest) or {})["t_us"])
@@ -45,7 +51,42 @@ def store_same_poses(
         for spec in plan.renderers:
             if spec.name != cell.renderer.name:
                 shown[spec.name] = _images(plan, cell, spec, log, failed_us, threads)
-        write_json(path, {name: images for name, images in shown.items() if images})
+        images = {name: images for name, images in shown.items() if images}
+        write_json(path, {"key": key, "images": images})
+
+
+def images_key(
+    plan: RunPlan,
+    cell: Cell,
+    manifest: Mapping[str, Any],
+    manifests: Sequence[Mapping[str, Any]],
+) -> str:
+    """Return the key of the images of a failure: of the log, of what the other renderers are, and of
+    the rollouts of those that have no digest.
+    """
+    inputs = Inputs()
+    inputs.setting("simrun", package_digest())
+    inputs.setting("scene", cell.content_hash)
+    inputs.setting("device", plan.options.device)
+    inputs.setting("log", manifest["files"][LOG_NAME]["sha256"])
+    inputs.setting("renderers", {spec.name: spec.digest for spec in plan.renderers})
+    remote = {spec.name for spec in plan.renderers if spec.digest is None}
+    driven = [
+        (other["path"], other["files"].get(LOG_NAME, {}).get("sha256"))
+        for other in manifests
+        if other["renderer"] in remote and other["scene"] == cell.scene
+    ]
+    inputs.setting("rollouts of remote renderers", driven)
+    return inputs.key
+
+
+def _key_in(path: Path) -> str | None:
+    """Return the key of the images in a file; None where there are none, or it is damaged."""
+    if not os.path.exists(path):
+        return None
+    with suppress(InputError):
+        return str(read_json_object(path).get("key"))
+    return None
 
 
 def _images(

@@ -219,7 +219,7 @@ def same_poses(run: Run, rollout: Rollout) -> dict[str, dict[int, bytes]]:
     with parsing(path, "Delete the file; the page is made without it.", "no images of renderers"):
         return {
             name: {int(t_us): base64.b64decode(image) for t_us, image in images}
-            for name, images in read_json(path).items()
+            for name, images in read_json(path)["images"].items()
         }
 
 

@@ -95,7 +95,7 @@ def _plain(value: object) -> object:
 
 @contextmanager
 def unrecorded() -> Iterator[None]:
-    """Enter nothing that the block reads into the records that are open: it is no input, or it
+    """Enter nothing that the block, or a function decorated so, reads into the records that are open: it is no input, or it
     enters as a setting.
     """
     token = _open.set(())

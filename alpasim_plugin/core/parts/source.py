@@ -21,6 +21,7 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import file_sha256, read_bytes
+from alpasim_plugin.core.files.inputs import unrecorded
 from alpasim_plugin.core.parts.blame import raised
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
@@ -38,6 +39,7 @@ _served: dict[str, str] = {}  # module -> file, of modules that no folder on Pyt
 
 
 @lru_cache(maxsize=1)
+@unrecorded()  # code enters a record as its digest
 def package_digest() -> str:
     """Return a SHA-256 over all source files of simrun, with their names: its version."""
     hashed = hashlib.sha256()
@@ -64,6 +66,7 @@ def code_digest(file: str | Path) -> str:
     return hashed.hexdigest()
 
 
+@unrecorded()
 def code_files(file: str | Path) -> dict[str, str]:
     """Return the digest of a module that is not simrun's and of all that it imports, by path; of
     simrun's own none.

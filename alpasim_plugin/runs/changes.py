@@ -1,0 +1,94 @@
+"""Why a rollout that was driven before is driven again: what of its making is another one now, by
+name.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from alpasim_plugin.core.files import content_of, some_of
+from alpasim_plugin.core.files.inputs import ABSENT
+from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.runs.plan import SIMRUN, Cell, RunPlan
+
+OLDER = "it was driven by another version of simrun"
+SHOWN_FILES = 3
+
+
+def changed_inputs(manifest: JsonView) -> dict[str, str]:
+    """Return the files that a rollout read beside what its key holds and that are others now: the
+    content at present by path.
+    """
+    before: Mapping[str, str] = manifest.get("inputs") or {}
+    now = {path: content_of(path) for path in before}
+    return {path: content for path, content in now.items() if content != before[path]}
+
+
+def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> list[str]:
+    """Say why a rollout is driven again that another command, or an earlier one, drove; nothing where
+    all that it was made of is as it was.
+
+    Args:
+        cell: The rollout as it is planned now.
+        manifest: Of what was driven.
+        held: ``run.json`` of that time; empty where it is not known.
+        plan: The run.
+    """
+    changed = _file_changes(manifest.get("inputs") or {}, changed_inputs(manifest))
+    before: Mapping[str, str | None] | None = manifest.get("made_of")
+    if before is None:
+        return [OLDER]
+    now = cell.made_of
+    if before.get(SIMRUN) != now[SIMRUN]:
+        return [OLDER]
+    for name in now:
+        if name not in before:
+            changed.append(f"{name} is new")
+        elif before[name] != now[name]:
+            changed += _files_of(name, held, plan) or [f"{name} is another one"]
+    return changed
+
+
+def sentence(count: int, found: Sequence[str]) -> str:
+    """Say how many rollouts are driven again, and why."""
+    rollouts = "1 rollout is" if count == 1 else f"{count} rollouts are"
+    causes = list(dict.fromkeys(found))
+    return f"{rollouts} driven again: {some_of(causes, SHOWN_FILES)}"
+
+
+def _files_of(name: str, held: JsonView, plan: RunPlan) -> list[str]:
+    """Name the files by which a scene or a part differs from what ``run.json`` states of it."""
+    kind, _, own = name.partition(" ")
+    if kind == "scene":
+        facts: JsonView = (held.get("scenes") or {}).get(own) or {}
+        return _file_changes(facts.get("files") or {}, plan.scenarios[own].files)
+    stated: JsonView = held.get("parts") or {}
+    found: list[str] = []
+    for part in plan.parts:
+        if not _is_part_of(f"{part.kind} {part.name}", kind, own, plan):
+            continue
+        facts = stated.get(f"{part.kind} {part.name}") or {}
+        for key, now in (("code", part.code), ("files", part.files)):
+            if key in facts:
+                found += _file_changes(facts[key], now)
+    return found
+
+
+def _is_part_of(part: str, kind: str, own: str, plan: RunPlan) -> bool:
+    """Tell whether a part is what a rollout is made of under a name; a renderer has two."""
+    if kind != "renderer":
+        return part == f"{kind} {own}"
+    spec = next(spec for spec in plan.renderers if spec.name == own)
+    parts = [spec.base] if spec.fixer is None else [spec.base, spec.fixer]
+    return part in {f"{one.kind} {one.name}" for one in parts}
+
+
+def _file_changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Name what happened to files: edited, gone, or read for the first time."""
+    said = []
+    for path, content in now.items():
+        if path not in before:
+            said.append(f"{path} was not read before")
+        elif content == ABSENT != before[path]:
+            said.append(f"{path} is gone")
+        elif content != before[path]:
+            said.append(f"{path} was edited")
+    return said
