@@ -27,9 +27,9 @@ from alpasim_plugin.runs.same_poses import images_key
 from scenarios import cameras
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
+from tests.drives.splat_model import poses_of, street_cloud
 from tests.drives.street import RIG_FROM_CAMERA, edited
-from tests.drives.test_splat import poses_of, street_cloud
-from tests.gaussians.test_sog import write_sog
+from tests.gaussians.sog_writer import write_sog
 
 SCENE = """version: 1
 road: {segments: [{kind: straight, length_m: 200}]}
