@@ -213,3 +213,32 @@ def test_no_global_random_generator_is_used():
             ):
                 wrong.append(f"{module.path}:{node.lineno}: import random")
     assert wrong == []
+
+
+TARGET = re.compile(r"((?:alpasim_plugin|evaluators|policies|scenarios)(?:\.\w+)+)(?::\w+)?")
+
+
+def named_modules(module):
+    """Return the modules of the project that a source file names in strings."""
+    texts = (
+        node.value
+        for node in module.nodes
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+    return {match[1] for text in texts if (match := TARGET.fullmatch(text))}
+
+
+def test_no_room_names_a_module_of_a_later_room_in_a_string():
+    """Parts are registered by the room that has them; whoever names one in a string imports it."""
+    wrong = []
+    for module in modules():
+        room = room_of(module.name)
+        if room is None:
+            continue
+        allowed = {None, room, *may_import(room)}
+        wrong += [
+            f"{module.name} names {name}"
+            for name in sorted(named_modules(module))
+            if room_of(name) not in allowed
+        ]
+    assert wrong == []

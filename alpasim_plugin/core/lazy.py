@@ -65,6 +65,11 @@ def installed(group: str) -> Mapping[str, EntryPoint]:
     return {point.name: point for point in _points(group, _search_path())}
 
 
+def installed_points(group: str) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a group; a name that two packages claim stands in it twice."""
+    return _points(group, _search_path())
+
+
 def installed_names(group: str, taken: Mapping[str, str]) -> dict[str, str]:
     """Return what installed packages register in a group: name to ``package.module:attribute``.
     Nothing of theirs is imported.

@@ -9,7 +9,7 @@ from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, complete
-from alpasim_plugin.core.parts.spec import BUILTIN
+from alpasim_plugin.core.parts.registry import entries
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig
@@ -70,7 +70,7 @@ def check_policies(
         InputError: A scenario lacks a camera of a policy.
         PolicyError: No policy of the run can be made and says which cameras it uses.
     """
-    shipped = {target for target, _ in BUILTIN["policy"].values()}
+    shipped = {part.target for part in entries("policy").values() if part.is_shipped}
     scenarios = list(plan.scenarios.values())
     found: JsonObject = {}
     todo = []

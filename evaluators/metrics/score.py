@@ -13,7 +13,7 @@ import numpy.typing as npt
 from alpasim_plugin.core.errors import EvaluatorError, SimrunError
 from alpasim_plugin.core.interfaces import Evaluator
 from alpasim_plugin.core.parts import PartSpec, build, names, resolve
-from alpasim_plugin.core.parts.spec import BUILTIN
+from alpasim_plugin.core.parts.registry import entries
 from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
@@ -39,8 +39,8 @@ def resolve_plugins() -> tuple[PartSpec, ...]:
     """Resolve the evaluators of other packages alone."""
     return tuple(
         resolve("evaluator", name)
-        for name in names("evaluator")
-        if name not in BUILTIN["evaluator"]
+        for name, part in entries("evaluator").items()
+        if not part.is_shipped
     )
 
 

@@ -1,8 +1,8 @@
 """Parts by name: what can be named, what a name stands for, and what identifies it.
 
 A name is resolved once, into a `PartSpec` that carries the part's identity; a worker process only
-builds it. Built-in parts (`alpasim_plugin.core.parts.spec`), parts of installed packages (entry
-points) and ``package.module:Class`` go the same way.
+builds it. Shipped parts and those of other packages register by entry points
+(`alpasim_plugin.core.parts.registry`); ``package.module:Class`` goes the same way.
 """
 
 from alpasim_plugin.core.interfaces import complete

@@ -17,7 +17,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.files.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.interfaces import Declaration, require_methods
-from alpasim_plugin.core.lazy import installed, installed_names
+from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.parts.registry import RegisteredPart, default_settings, entries
 from alpasim_plugin.core.parts.source import (
     absolute_target,
     classes_of,
@@ -30,7 +31,6 @@ from alpasim_plugin.core.parts.source import (
     split_address,
 )
 from alpasim_plugin.core.parts.spec import (
-    BUILTIN,
     KINDS,
     MODES,
     KindName,
@@ -40,33 +40,12 @@ from alpasim_plugin.core.parts.spec import (
 )
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A named part."""
-
-    name: str
-    target: str  # package.module:attribute
-    help: str
-
-
 def names(kind: KindName) -> dict[str, str]:
-    """Return every known name of a kind with one line of help, built-in names first."""
+    """Return every registered name of a kind with one line of help, shipped parts first."""
     return {name: entry.help for name, entry in entries(kind).items()}
 
 
-def entries(kind: KindName) -> Mapping[str, Entry]:
-    """Return every known part of a kind by name, built-in ones first.
-
-    Raises:
-        InputError: Two packages claim one name.
-    """
-    taken = {name: target for name, (target, _) in BUILTIN[kind].items()}
-    others = installed_names(KINDS[kind].group, taken)
-    known = {name: Entry(name, *part) for name, part in BUILTIN[kind].items()}
-    return known | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
-
-
-def find(kind: KindName, name: str) -> Entry:
+def find(kind: KindName, name: str) -> RegisteredPart:
     """Return the part with a name.
 
     Raises:
@@ -202,8 +181,9 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
         factory.check_address(address)
     overrides = (*at_steps, *overrides)
     model: Any = getattr(factory, "settings_model", None)
-    if model is None and kind == "fixer":
-        model = load("alpasim_plugin.fixers.settings:FixerSettings", kind)
+    if model is None:
+        default = default_settings(kind)
+        model = None if default is None else load(default, kind)
     if model is None:
         settings = None
     elif hasattr(model, "load"):
@@ -365,7 +345,8 @@ def _declares_nothing(kind: KindName, target: str) -> bool:
     Those behind an address have: they are remote.
     """
     return kind in PLAIN_KINDS and any(
-        target == shipped for name, (shipped, _) in BUILTIN[kind].items() if "://" not in name
+        part.target == target and part.is_shipped and not part.is_addressed
+        for part in entries(kind).values()
     )
 
 
