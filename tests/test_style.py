@@ -134,6 +134,7 @@ READERS = {
     "alpasim_plugin.gaussians.files.ply": "large arrays, of a stream from `open_regular`",
     "alpasim_plugin.cli.new": "templates inside the package",
     "alpasim_plugin.alpasim.bridge.build": "sources inside the package",
+    "alpasim_plugin.core.kernel_sources": "sources inside the package",
 }
 READING = {"open", "os.open", "np.load", "np.fromfile", "np.memmap", "cv2.imread", "pq.ParquetFile"}
 

@@ -12,10 +12,9 @@ from itertools import product
 import cv2
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.core.kernels import inlined_kernel, kernel
+from alpasim_plugin.core.kernels import inlined_kernel, kernel, vector_kernel
 from alpasim_plugin.fixers.network.pixel_generator import sparse_source
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
@@ -170,7 +169,7 @@ def _enlarged_rows(coarse: np.ndarray, side: int, rows: slice) -> np.ndarray:
     return own.reshape(*own.shape[:2], -1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@vector_kernel
 def _blend(
     repaired, references, weight, offset_px, correction, finer, scale, first_row, out, recorded
 ):
@@ -280,7 +279,7 @@ def _blend(
             recorded[i, x, 0] = max(one - over, zero)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@vector_kernel
 def _stretched(coarse, before, after, share, out):
     """Write rows of pixels between coarser ones; see `_between`."""
     for c in range(len(out)):

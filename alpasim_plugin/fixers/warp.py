@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.kernels import float_kernel
+from alpasim_plugin.core.kernels import float_kernel, inlined_float_kernel
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
@@ -247,7 +246,7 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
                 held[row, column] = _held(surfaces[then], distance[column], free_share)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined_float_kernel
 def _held(surface, rz, free_share):
     """Return how well it holds that a point at depth ``rz`` of the recorded camera is shown by its
     pixel of depth ``surface``.

@@ -1,7 +1,7 @@
 """Where files go that nobody named: one choice, made when the package is imported, before numba is.
 
 cache    $SIMRUN_CACHE; the user's cache folder (`platformdirs`); a private temporary folder
-kernels  $NUMBA_CACHE_DIR; beside their source; numba below the cache
+kernels  $NUMBA_CACHE_DIR; in the package's __pycache__; numba below the cache
 
 Kernels are pickles, which run code when they are read. So a folder that nobody named must be this
 user's own: ``sudo`` leaves the home of another user in the environment.
@@ -36,7 +36,7 @@ def cache() -> Path:
 
 def kernels() -> Path:
     """Return the folder of compiled kernels, as `prepare` left it."""
-    return Path(os.environ.get(KERNELS) or PACKAGE)
+    return Path(os.environ.get(KERNELS) or PACKAGE / "__pycache__" / "kernels")
 
 
 def prepare() -> None:

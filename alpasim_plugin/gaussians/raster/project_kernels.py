@@ -6,7 +6,6 @@
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
 import numpy as np
-from numba import njit
 
 from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.gaussians.constants import (
@@ -56,7 +55,7 @@ from alpasim_plugin.gaussians.constants import (
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.sh import C0, sh_terms
 
-_sh_terms = njit(cache=True, nogil=True)(sh_terms)
+_sh_terms = kernel(sh_terms)
 # Boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw.
 MARGIN_PX = 0.01
 _CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0

@@ -1,0 +1,106 @@
+"""Machine code of kernels is that of the sources as they are now, and an edit elsewhere compiles
+nothing.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.core.kernel_sources import ROOT, sources_digest, sources_of
+
+KERNEL = """
+import constants
+from alpasim_plugin.core.kernels import kernel
+from shapes import SIDE as EDGE, area
+from words import TITLE
+
+HALF = EDGE // 2
+
+@kernel
+def size(x):
+    return x * HALF + constants.TILE + helped(x)
+
+@kernel
+def helped(x):
+    return x * other.COUNT
+
+import other
+
+def heading():
+    return TITLE
+"""
+FILES = {
+    "kern.py": KERNEL,
+    "constants.py": "TILE = 16\n",
+    "shapes.py": "from inner import BASE\nfrom unused import NOTHING\nSIDE = BASE\ndef area():\n    return NOTHING\n",
+    "inner.py": "BASE = 4\n",
+    "other.py": "COUNT = 1\n",
+    "words.py": "TITLE = 'size'\n",
+    "unused.py": "NOTHING = 0\n",
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_a_kernel_is_made_of_the_constants_and_kernels_that_it_uses(folder):
+    used = {os.path.basename(path) for path in sources_of(str(folder / "kern.py"), folder)}
+    assert used == {"kern.py", "constants.py", "shapes.py", "inner.py", "other.py"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_edit_of_what_a_kernel_uses_makes_another_folder_and_no_other_edit_does(folder, name):
+    file = str(folder / "kern.py")
+    before = sources_digest(file)
+    (folder / name).write_text(f"{FILES[name]}# edited\n")
+    is_used = name not in ("words.py", "unused.py")
+    assert (sources_digest(file) != before) == is_used
+
+
+def test_kernels_of_simrun_know_the_size_of_a_tile_and_not_the_command_line():
+    used = sources_of(str(ROOT / "alpasim_plugin/gaussians/raster/binning.py"))
+    names = {os.path.relpath(path, ROOT / "alpasim_plugin") for path in used}
+    assert "gaussians/constants.py" in names
+    assert not any(name.startswith(("cli", "runs", "core/errors")) for name in names)
+
+
+def test_every_kernel_is_made_in_one_place():
+    """A kernel that calls ``njit`` by itself would be kept under the name of its own file alone."""
+    makers = {"alpasim_plugin/core/kernels.py"}
+    calling = {
+        str(path.relative_to(ROOT))
+        for package in ("alpasim_plugin", "policies", "scenarios", "evaluators")
+        for path in (ROOT / package).rglob("*.py")
+        if "njit" in path.read_text() or "cache=True" in path.read_text()
+    }
+    assert calling == makers
+
+
+def test_a_constant_that_was_changed_in_another_file_is_the_one_that_is_computed_with(folder):
+    script = "import sys; sys.path.insert(0, sys.argv[1]); import kern; print(kern.size(0))"
+    kept = folder / "kept"
+
+    def computed():
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(folder)],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(kept), "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return int(done.stdout), {path: path.stat().st_mtime_ns for path in kept.rglob("*.nbc")}
+
+    first, code = computed()
+    assert (first, computed()) == (16, (16, code))
+    (folder / "words.py").write_text("TITLE = 'other'\n")
+    assert computed() == (16, code)
+    (folder / "constants.py").write_text("TILE = 8\n")
+    assert computed()[0] == 8
+    assert len(list(Path(kept).iterdir())) == 2
