@@ -14,7 +14,7 @@ from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy
-    from alpasim_plugin.runs.cell import make_renderer
+    from alpasim_plugin.runs.renderer import make_renderer
     from alpasim_plugin.runs.rollout import run_rollout
     from policies.base import make_policy
     from scenarios.load import load_scenario
@@ -61,7 +61,7 @@ __getattr__ = lazy_names(
     {
         "load_scenario": "scenarios.load",
         "make_policy": "policies.base",
-        "make_renderer": ".runs.cell",
+        "make_renderer": ".runs.renderer",
         "run_rollout": ".runs.rollout",
         "serve_policy": ".alpasim.server.driver_service",
     },

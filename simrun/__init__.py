@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         SensorSpec,
         Trajectory,
     )
-    from alpasim_plugin.runs.cell import make_renderer
+    from alpasim_plugin.runs.renderer import make_renderer
     from alpasim_plugin.runs.rollout import run_rollout
     from evaluators import (
         aggregate,
@@ -62,7 +62,7 @@ HOMES = {
         "Trajectory",
         "U8",
     ],
-    "alpasim_plugin.runs.cell": ["make_renderer"],
+    "alpasim_plugin.runs.renderer": ["make_renderer"],
     "alpasim_plugin.runs.rollout": ["run_rollout"],
     "evaluators": [
         "aggregate",

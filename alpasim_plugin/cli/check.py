@@ -21,8 +21,8 @@ from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.tables import again
 from evaluators import reduce_rollout, score

@@ -21,8 +21,8 @@ from alpasim_plugin.core.types import Actor, Box, Scenario, Trajectory
 from alpasim_plugin.log.run_folder.writer import scene_as_json
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.renderer import make_renderer
 from evaluators.pages.birdseye import chord_angle, drawn_map
 
 MOMENTS = 5  # that are shown, evenly from the first frame to the end

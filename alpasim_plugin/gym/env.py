@@ -33,8 +33,8 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.gym.reward import Instant, Reward, Scorer
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import Loop
 from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario

@@ -4,25 +4,23 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 
-from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.errors import FaultOfPart, InfrastructureError, SimrunError
 from alpasim_plugin.core.files import content_of, places, real, some_of
 from alpasim_plugin.core.files.atomic import disk_error
 from alpasim_plugin.core.files.inputs import Inputs
-from alpasim_plugin.core.files.places import require_kernels
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
+from alpasim_plugin.core.parts import RendererSpec, build, complete
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.asl import copy_log
@@ -48,10 +46,9 @@ from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.changes import changed_inputs
 from alpasim_plugin.runs.film import write_film
-from alpasim_plugin.runs.guards import checked_frames
-from alpasim_plugin.runs.lenses import LensRenderer
 from alpasim_plugin.runs.plan import Cell, RunOptions
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
@@ -433,58 +430,3 @@ def _scenario(cell: Cell) -> Scenario:
 def _kept_scenario(ref: ScenarioRef, content_hash: str) -> Scenario:
     """Return a scene, read once for each content."""
     return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
-
-
-def make_renderer(
-    name: str | RendererSpec,
-    scenario: Scenario,
-    seed: int = 0,
-    device: str = "cpu",
-    threads: int | None = None,
-    overrides: Sequence[str] = (),
-) -> Renderer:
-    """Build one rollout's renderer.
-
-    Args:
-        name: A renderer, or a fixer over one, as `alpasim_plugin.core.parts.resolve_renderer` takes
-            it; or its resolved spec.
-        scenario: What is rendered.
-        seed: The rollout's seed, for temporal noise and the fixer's noise.
-        device: ``cpu`` or ``cuda``.
-        threads: Threads of the CPU rasteriser and of a fixer's torch; None keeps their settings.
-        overrides: ``KEY=VALUE`` of the fixer's settings, where ``name`` is a string.
-
-    Raises:
-        InputError: Unknown name, device or setting, or weights that are missing or wrong.
-        RendererError: The device does not work.
-        InfrastructureError: Kernels cannot be compiled: no folder can be written.
-    """
-    require_kernels()
-    spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
-    cover = LensCover(scenario.cameras)
-    drawn = cover.drawn(scenario)
-    session = {"seed": seed, "device": device, "threads": threads}
-    built: Renderer = build(spec.base, scenario=drawn, **session)
-    from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
-
-    base = in_weather(built, drawn, seed)
-    if spec.fixer is None:
-        has_lens = any(camera.lens is not None for camera in scenario.cameras)
-        return LensRenderer(base, cover) if has_lens else base
-    from alpasim_plugin.fixers.loop import fixed_renderer
-    from alpasim_plugin.fixers.settings import FixerSettings
-
-    fixer = spec.fixer
-    settings = spec.fixer.settings
-    assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
-
-    recorded = base.recorded() if settings.references else ()
-    return fixed_renderer(
-        partial(checked_frames, base, on_device=True),
-        lambda: build(fixer, scene_id=scenario.scene_id, **session),
-        settings,
-        scenario,
-        threads,
-        recorded,
-        cover,
-    )

@@ -38,8 +38,8 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import (
     compositor_of,
 )
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, transparent_splats
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario

@@ -19,9 +19,9 @@ from alpasim_plugin.log.debug import WIDTH_PX
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
 from alpasim_plugin.runs.cameras import logged_request
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.plan import Cell, RunPlan
+from alpasim_plugin.runs.renderer import make_renderer
 from evaluators.metrics.outcomes import first_failure
 
 MOST_FAILURES = 3

@@ -27,8 +27,8 @@ from alpasim_plugin.log.wire import (
     sensorsim_pb2,
 )
 from alpasim_plugin.log.wire.services import Stub, handlers
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.score_logs import scenario_finder
 from scenarios.load import load_scenario

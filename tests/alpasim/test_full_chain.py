@@ -20,8 +20,8 @@ from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import SERVICE_PATHS
 from alpasim_plugin.log.wire.services import OPTIONS, handlers, methods
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.score_logs import scenario_finder
 from evaluators import reduce_rollout, score

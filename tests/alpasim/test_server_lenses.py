@@ -18,7 +18,7 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import sensorsim_pb2
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.renderer import make_renderer
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import pinhole
 from tests.alpasim.wire_lenses import distorted, fisheye, ftheta

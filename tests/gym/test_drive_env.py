@@ -14,8 +14,8 @@ from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Plan
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import score
 from policies.base import make_policy

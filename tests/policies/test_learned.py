@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.geometry import inverse, se2, transform_points
 from alpasim_plugin.core.types import EgoState, Observation
-from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from policies.conformance import STRAIGHT, canned_scenario, observations

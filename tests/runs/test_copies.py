@@ -15,10 +15,11 @@ from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.video import read_mp4
 from alpasim_plugin.runs.cameras import recorded_requests
-from alpasim_plugin.runs.cell import make_renderer, run_cell
+from alpasim_plugin.runs.cell import run_cell
 from alpasim_plugin.runs.film import Film
 from alpasim_plugin.runs.fork import SwitchedRenderer
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.reports import shown_at
 from alpasim_plugin.runs.run import execute_run
 from policies.simple import ConstantVelocity

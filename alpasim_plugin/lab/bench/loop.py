@@ -26,9 +26,9 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.renderers.gaussian import clear_cache
-from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.provenance import hardware, versions
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from policies.base import make_policy
 from scenarios.load import load_scenario

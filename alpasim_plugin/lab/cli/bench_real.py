@@ -26,7 +26,7 @@ from alpasim_plugin.lab.bench.real import (
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
-from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.renderer import make_renderer
 from scenarios.load import load_scenario
 
 EPILOG = """
