@@ -41,7 +41,7 @@ from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
 from scenarios.schema import VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
-from scenarios.suite import find
+from scenarios.suite import ScenarioRef, find
 from scenarios.variation import Drawn, draw
 
 RECORDED_STREETS = ("usdz", "drive")  # sources whose street is recorded, whatever renders it
@@ -106,6 +106,24 @@ def _loaded(drawn: Drawn, source: str | None, inputs: Inputs) -> Scenario:
     return scenario
 
 
+def scene_id_of(ref: ScenarioRef) -> str:
+    """Return the id of a scene; of a scenario file without building it.
+
+    Raises:
+        InputError: Anything wrong with the input.
+    """
+    path = find(ref.path)
+    if path.suffix not in (".yaml", ".yml"):
+        return load_scenario(ref.path, ref.seed, ref.overrides, ref.source).scene_id
+    drawn = draw(open_document(path, ref.source), ref.seed, ref.overrides)
+    return _with_seed(drawn, drawn.spec.scene_id or drawn.scene_id)
+
+
+def _with_seed(drawn: Drawn, scene_id: str) -> str:
+    """Return the id of a scene, which names a seed that is another one than its file's."""
+    return f"{scene_id}-seed{drawn.spec.seed}" if drawn.reseeded else scene_id
+
+
 def code_digest_of(scenario: Scenario) -> str | None:
     """Return what identifies the code that made a scenario: this package's, and that of its source;
     None where it has no digest.
@@ -135,7 +153,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
     )
     lane_map = drive.lane_map if recorded else with_default_markings(drive.lane_map)
     return Scenario(
-        scene_id=f"{scene_id}-seed{spec.seed}" if drawn.reseeded else scene_id,
+        scene_id=_with_seed(drawn, scene_id),
         source=drive.source,
         seed=spec.seed,
         lane_map=lane_map,

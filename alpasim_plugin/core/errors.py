@@ -67,15 +67,30 @@ class RendererError(InfrastructureError):
     failure_class: ClassVar[str] = "renderer"
 
 
+FAULTS_OF_CODE = (
+    AssertionError,
+    AttributeError,
+    NameError,
+    NotImplementedError,
+    TypeError,
+    UnboundLocalError,
+    ZeroDivisionError,
+)
+
+
 class FaultOfPart(SimrunError):
     """A part of the user's own raised, or broke its contract."""
 
     @property
     def is_final(self) -> bool:
-        """Tell whether another try must end in the same way: yes, unless a file, memory or a
-        package was missing.
+        """Tell whether another try with the same code and files must end in the same way: what the
+        part returned broke its contract, or it raised what only wrong code raises.
+
+        Anything else that it raised may come from the world outside: a file that was corrected
+        since, a full card, a peer that is lost, a deadline. Libraries derive their errors from
+        Python's, so that the class itself counts and no base of it.
         """
-        return not isinstance(self.__cause__, OSError | MemoryError | ImportError)
+        return self.__cause__ is None or type(self.__cause__) in FAULTS_OF_CODE
 
 
 class RendererFault(FaultOfPart, RendererError):

@@ -354,14 +354,18 @@ def find_rollout_state(
 
     A rollout with another content key is driven again; so is one that read a file beside it which is
     another one now, one with a part that has no digest unless ``reuse_undigested`` is set, and a
-    failed one, except where the code of a part alone is at fault: the same code would fail again. One that was driven without the
+    failed one, except where the code of a part alone is at fault: the same code would fail again.
+    What a remote part did wrong is never kept. One that was driven without the
     ``video`` that is asked for now is driven again as well.
     """
     state = inspect_rollout(root, cell.folder.as_posix())
     manifest = state.manifest
     if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
         return "drive", state
-    if changed_inputs(manifest) or (manifest["status"] != "ok" and not manifest.get("final")):
+    has_failed = manifest["status"] != "ok"
+    if has_failed and (cell.undigested or not manifest.get("final")):
+        return "drive", state
+    if changed_inputs(manifest):
         return "drive", state
     if cell.undigested and not reuse_undigested:
         return "drive", state

@@ -14,21 +14,22 @@ from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, Inpu
 from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
-from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.parts import PartSpec, require_installed
 from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
-from alpasim_plugin.log.run_folder.manifests import read_manifest
+from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
 from alpasim_plugin.runs.loop_state import PathEnd
+from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.scoring import tabulate
 from evaluators import score
 from evaluators.alpasim import ScoredRollout
 from evaluators.metrics.presets import Preset
-from scenarios.load import load_scenario
-from scenarios.suite import load_suite
+from scenarios.load import load_scenario, scene_id_of
+from scenarios.suite import ScenarioRef, load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id
 
 UNKNOWN = "unknown"  # renderer or policy that a log does not name
@@ -156,7 +157,7 @@ def _score(
         "warnings": list(rollout.warnings),
     }
     # A wrong --scene is an error of the command, not of the log.
-    scene = scenes.of(rollout.scene_id).scene
+    scene = scenes.of(rollout.scene_id, log).scene
     cameras = {image.camera for image in rollout.images}
     if os.path.exists(log.parent / MANIFEST) and preset.image_camera not in cameras:
         preset = replace(preset, image_camera=None)  # our runs name their cameras as they like
@@ -298,101 +299,161 @@ def exit_code(
 
 
 class KnownScenes:
-    """Finds scenes in files and folders; each is read once, on first use.
+    """Finds scenes in files, suites and folders; each is read on first use.
+
+    A log of a run folder is scored in the scene that was driven: with the overrides and the seed
+    that the run states, of the content that it states.
 
     Args:
-        places: Scenes (anything that ``simrun run`` drives), or folders of them.
+        places: Scenes (anything that ``simrun run`` drives), suites, or folders of them.
 
     Raises:
-        InputError: A place without scenes, or two AlpaSim scenes with one id.
+        InputError: A place without scenes, or two scenes with one id.
     """
 
     def __init__(self, places: Sequence[str | Path]) -> None:
         self.places = [str(place) for place in places]
-        self._archives: dict[str, Path] = {}
-        self._others: list[str] = []
-        self._read: dict[str, LoggedScene | Scenario] = {}
-        self._own: dict[str, str] = {}  # file -> id of its scene
-        for place in self.places:
-            for path in _scene_files(place):
-                if not path.endswith(".usdz"):
-                    self._others.append(path)
-                    continue
-                scene_id = usdz_scene_id(Path(path))
-                before = self._archives.setdefault(scene_id, Path(path))
-                if real(before) != real(Path(path)):
-                    raise InputError(
-                        f"{before} and {path}: both have the id {scene_id!r}", "Remove one of them."
-                    )
+        self._refs = refs_by_id(self.places)
+        self._read: dict[ScenarioRef, Scenario | LoggedScene] = {}
+        self._used: dict[str, Scenario | LoggedScene] = {}
 
-    def of(self, scene_id: str) -> LoggedScene | Scenario:
+    def of(self, scene_id: str, log: Path | None = None) -> LoggedScene | Scenario:
         """Return the scene with an id.
 
+        Args:
+            scene_id: As the log names it.
+            log: The log; None returns the scene that the last log with this id was scored in.
+
         Raises:
-            InputError: None of the places has it, or it cannot be read.
+            InputError: None of the places has it, it cannot be read, or it is not what was driven.
         """
-        if scene_id not in self._read and scene_id in self._archives:
-            record = read_usdz(self._archives[scene_id], needs_map=False)
-            scene = Scene(
-                record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
+        if log is None and scene_id in self._used:
+            return self._used[scene_id]
+        stated = None if log is None else _stated_scene(log, scene_id)
+        ref = self._ref(scene_id, None if stated is None else ref_of(stated["ref"]))
+        if ref not in self._read:
+            self._read[ref] = _read_scene(ref, is_ours=stated is not None)
+        found = self._read[ref]
+        if stated is not None and found.content_hash != stated["content_hash"]:
+            raise InputError(
+                f"scene {scene_id!r}: {ref.path} is not what was driven: its content has changed",
+                "give the scenario as it was driven, or run again",
             )
-            self._read[scene_id] = LoggedScene(
-                scene,
-                record.source,
-                record.content_hash,
-                record.notes,
-                record.actors,
-                record.world_origin,
+        if self._used.setdefault(scene_id, found).content_hash != found.content_hash:
+            raise InputError(
+                f"scene {scene_id!r}: the logs were driven in two scenes with this id",
+                "score the runs one by one",
             )
-        elif scene_id not in self._read:
-            self._search(scene_id)
-        if scene_id not in self._read:
-            known = sorted({*self._archives, *self._read})
+        return found
+
+    def _ref(self, scene_id: str, driven: ScenarioRef | None) -> ScenarioRef:
+        """Return how to load the scene with an id, of what is given; of a run as it was driven.
+
+        Raises:
+            InputError: None of the places has it.
+        """
+        seeded = SEEDED.fullmatch(scene_id)
+        given = self._refs.get(scene_id)
+        if given is None and driven is not None:
+            paths = {real(ref.path): ref for ref in self._refs.values()}
+            given = paths.get(real(driven.path))
+        if given is None and seeded and seeded["own"] in self._refs:
+            given = replace(self._refs[seeded["own"]], seed=int(seeded["seed"]))
+        if given is None:
+            known = sorted(self._refs)
             raise InputError(
                 f"scene {scene_id!r}: not among the {len(known)} scenes of {', '.join(self.places)}: {some_of(known)}",
                 "name the log's scene with --scene, or a folder that holds it",
             )
-        return self._read[scene_id]
-
-    def _search(self, scene_id: str) -> None:
-        """Read scenario files until one has the id, or the id of another seed of it."""
-        seeded = SEEDED.fullmatch(scene_id)
-        for path in self._others:
-            if path not in self._own:
-                scenario = load_scenario(path)
-                self._own[path] = scenario.scene_id
-                self._read[scenario.scene_id] = scenario
-            if seeded and self._own[path] == seeded["own"]:
-                scenario = load_scenario(path, int(seeded["seed"]))
-                self._read[scenario.scene_id] = scenario
-            if scene_id in self._read:
-                return
+        if driven is None:
+            return given
+        require_installed([driven.source], f"scene {scene_id!r}")
+        return replace(given, seed=driven.seed, overrides=driven.overrides, source=driven.source)
 
 
-def _scene_files(place: str) -> list[str]:
-    """Return the scene files of a path, a folder or a shipped name."""
+def _stated_scene(log: Path, scene_id: str) -> JsonView | None:
+    """Return what the run of a log states of the scene that was driven; None for a log of another
+    program.
+    """
+    root = next((folder for folder in real(log).parents if os.path.exists(folder / RUN_INFO)), None)
+    if root is None or not os.path.exists(log.parent / MANIFEST):
+        return None
+    stated: JsonView = read_run_json(root)["scenes"].get(scene_id) or {}
+    has_path = "path" in (stated.get("ref") or {})
+    return stated if has_path and "content_hash" in stated else None
+
+
+def _read_scene(ref: ScenarioRef, is_ours: bool) -> Scenario | LoggedScene:
+    """Return a scene; AlpaSim's own for a log of AlpaSim, which needs no map of ours."""
+    if is_ours or not ref.path.endswith(".usdz"):
+        return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+    record = read_usdz(Path(ref.path), needs_map=False)
+    scene = Scene(
+        record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
+    )
+    return LoggedScene(
+        scene,
+        record.source,
+        record.content_hash,
+        record.notes,
+        record.actors,
+        record.world_origin,
+    )
+
+
+def refs_by_id(places: Sequence[str]) -> dict[str, ScenarioRef]:
+    """Return how to load each scene of files, suites, folders and shipped names, by its id.
+
+    Raises:
+        InputError: A scene cannot be read, or two have one id.
+    """
+    found: dict[str, ScenarioRef] = {}
+    for place in places:
+        for ref in _refs_of(place):
+            scene_id = (
+                usdz_scene_id(Path(ref.path)) if ref.path.endswith(".usdz") else scene_id_of(ref)
+            )
+            before = found.setdefault(scene_id, ref)
+            if replace(before, path=str(real(before.path))) != replace(
+                ref, path=str(real(ref.path))
+            ):
+                raise InputError(
+                    f"{_named_ref(before)} and {_named_ref(ref)}: both have the scene id {scene_id!r}",
+                    "give one of them another id, or name one alone",
+                )
+    return found
+
+
+def _named_ref(ref: ScenarioRef) -> str:
+    """Name a scene for messages: its file, and what a suite sets in it."""
+    return " ".join((ref.path, *ref.overrides))
+
+
+def _refs_of(place: str) -> list[ScenarioRef]:
+    """Return the scenes of a path, a folder or a shipped name."""
     path = Path(place)
     archives = sorted(path.rglob("*.usdz")) if os.path.isdir(path) else []
     if archives:
-        return [str(one) for one in archives]
-    return [ref.path for ref in load_suite(place)]
+        return [ScenarioRef(str(archive)) for archive in archives]
+    return load_suite(place)
 
 
 def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
-    """Return what finds a scenario by its scene id among files, folders and shipped names.
+    """Return what finds a scenario by its scene id among files, suites, folders and shipped names.
 
     Without places, and only then, every id gets a straight road, of which nothing is true but the
     id: a policy under test takes no more from its scenario than cameras and vehicle.
 
     Raises:
-        InputError: A scene cannot be read; when called, none has the id.
+        InputError: A scene cannot be read, or two have one id; when called, none has the id.
     """
     if not places:
         blank = load_scenario("smoke/straight")
         return lambda scene_id: replace(blank, scene_id=scene_id, actors=())
-    paths = [path for place in places for path in _scene_files(place)]
-    scenarios = [load_scenario(path) for path in paths]
-    found = {scenario.scene_id: scenario for scenario in scenarios}
+    found = {
+        scene_id: load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+        for scene_id, ref in refs_by_id(places).items()
+    }
 
     def find(scene_id: str) -> Scenario:
         if scene_id not in found:

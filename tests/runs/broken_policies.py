@@ -22,6 +22,13 @@ class Raises:
         raise ValueError("no weights")
 
 
+class ForgetsItsRoute(Raises):
+    """Asks for what it never made: wrong code, which fails whenever it runs."""
+
+    def act(self, observation):
+        return self.route
+
+
 class KillsItsProcess(Raises):
     """Dies as under the out-of-memory killer."""
 

@@ -66,7 +66,7 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path):
 
 
 def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path):
-    broken = "tests.runs.broken_policies:Raises"
+    broken = "tests.runs.broken_policies:ForgetsItsRoute"
     plan = make_plan(
         expand("smoke/straight", SHORT),
         (GREY,),
@@ -87,6 +87,17 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
         ("ok", True),
         ("ok", True),
     ]
+    kept = [line for line in announced.notices if "failed before" in line]
+    assert len(kept) == 2
+    assert all("broken_policies.py" in line for line in kept)
+
+
+def test_a_failure_that_may_come_from_the_world_outside_is_driven_again(tmp_path):
+    broken = "tests.runs.broken_policies:Raises"  # ValueError: of a file, as likely as of its code
+    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), (broken,), (0,), RunOptions())
+    for _ in range(2):
+        _, announced = run(plan, tmp_path)
+        assert announced.results == [("failed", False)]
 
 
 def test_a_policy_without_its_file_is_tried_again(tmp_path):

@@ -205,7 +205,7 @@ class Served:
                 raise PolicyError(
                     f"{self._name}: nothing listens at {self.address} after {limit_s:g} s{self._said()}",
                     f"let it serve at the address in {VARIABLE}, or give it longer: ?ready_s=N",
-                )
+                ) from TimeoutError()
             time.sleep(POLL_S)
         self.require_running()
 
@@ -221,7 +221,7 @@ class Served:
             raise PolicyError(
                 f"{self._name}: it ended with {exit_reason(code)}{self._said()}",
                 "see output.log of the rollout",
-            )
+            ) from ChildProcessError(code)
 
     def is_running(self) -> bool:
         """Tell whether the command still runs."""
