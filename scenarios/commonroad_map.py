@@ -2,8 +2,10 @@
 
 import contextlib
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -243,9 +245,23 @@ def mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
     marked: dict[str, Lane] = {}
     for n, (key, lane) in enumerate(lanes.items()):
         friends = {key, *lane.successors, *before[key], lane.left_neighbour, lane.right_neighbour}
-        others = tree.query(polygons[n], predicate="intersects")
-        covering = shapely.union_all([polygons[m] for m in others if ids[m] not in friends])
-        shared = shapely.area(shapely.intersection(polygons[n], covering))
-        crossing = lane.is_intersection or bool(shared > CROSSING_SHARE * polygons[n].area)
+        others = [polygons[m] for m in np.sort(tree.query(polygons[n])) if ids[m] not in friends]
+        crossing = lane.is_intersection or _is_covered(polygons[n], others)
         marked[key] = replace(lane, is_intersection=crossing)
     return marked
+
+
+def _is_covered(polygon: Any, others: Sequence[Any]) -> bool:
+    """Return whether other areas cover more than `CROSSING_SHARE` of an area.
+
+    Each adds to what is covered until that is enough: many lanelets of one place are not all united.
+    """
+    least_m2 = CROSSING_SHARE * polygon.area
+    covered = shapely.Polygon()
+    for other in others:
+        shared = shapely.intersection(polygon, other)
+        if shared.area > 0:
+            covered = shapely.union(covered, shared)
+            if covered.area > least_m2:
+                return True
+    return False

@@ -41,6 +41,12 @@ KINDS = {
 }
 MARKS = ("line_thin", "line_thick", "bike_marking")  # ways that are painted on the road
 UNMARKED = ("virtual", "road_border", "curbstone", "guard_rail", "wall", "fence", "rail")
+CARS = ("vehicle", "vehicle:car")  # participants that cars are; other vehicles begin alike
+YES = ("yes", "true", "1")
+RULES = ("traffic_light", "right_of_way", "speed_limit")  # regulatory elements that are read
+LIMIT_TAGS = ("speed_limit:vehicle:car", "speed_limit:vehicle", "speed_limit")
+SIGN = re.compile(r"de274-(\d+)", re.ASCII)  # German sign of a limit, by its number in km/h
+TOWN_SIGN = {"de310": 50.0}  # km/h
 SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(km/h|kmh|mph|m/s|mps|)", re.ASCII)
 MPS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0}
 JUNCTION_M = 60.0  # lights whose lines lie nearer to each other belong to one junction
@@ -165,6 +171,12 @@ class Osm:
                 f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
                 "give them to all nodes, or to none",
             )
+        if not local and any("lat" not in place or "lon" not in place for place in places.values()):
+            key = next(key for key, place in places.items() if not {"lat", "lon"} <= {*place})
+            raise InputError(
+                f"{self.path}, node {key}: neither lat and lon nor the tags local_x and local_y",
+                "convert the map; metres in attributes x and y (INTERACTION) are not read",
+            )
         high = all("ele" in place for place in places.values())
         axes = [*(("local_x", "local_y") if local else ("lon", "lat")), *(["ele"] if high else [])]
         most = (1e9, 1e9, 1e9) if local else (180.0, 90.0, 1e9)
@@ -213,6 +225,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     """
     osm = Osm(files, path)
     left_out: Counter[str] = Counter()
+    reserved: Counter[str] = Counter()
     crosswalks: list[F64] = []
     bounds: dict[str, tuple[Bound, Bound]] = {}
     lanes: dict[str, Lane] = {}
@@ -220,12 +233,16 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     for key, lanelet in osm.lanelets.items():
         left, right = _bounds(osm, key, lanelet)
         subtype = lanelet.tags.get("subtype", "road")
-        kind = KINDS.get(subtype)
+        named = _participants(lanelet)
+        kind = _kind(subtype, named)
         if subtype == "crosswalk":
             crosswalks.append(osm.line((*left.nodes, *right.nodes[::-1], left.nodes[0])))
-        if kind is None or (kind != "bike" and not _for_vehicles(lanelet)):
-            left_out[subtype] += 1
+        users = ", ".join(sorted(name for name, may in named.items() if may))
+        if kind is None:
+            left_out[f"{subtype} for {users}" if users else subtype] += 1
             continue
+        if kind != "vehicle" and named:
+            reserved[f"{subtype} are for {users} and not for cars"] += 1
         bounds[key] = left, right
         lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
@@ -244,6 +261,20 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         return [Spot(key, at_m) for key, at_m in there.items() if key in lanes]
 
     notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
+    notes += [f"{n} lanelets of type {text}" for text, n in sorted(reserved.items())]
+    without = sum(
+        lane.kind == "vehicle" and lane.speed_limit_mps is None for lane in lanes.values()
+    )
+    if without:
+        notes.append(
+            f"lanes for cars without a speed limit: {without}; limits by location and type are not applied"
+        )
+    rules = Counter(rule.tags.get("subtype", "") for rule in osm.rules.values())
+    notes += [
+        f"regulatory elements of type {subtype or 'unknown'} are not read: {n}"
+        for subtype, n in sorted(rules.items())
+        if subtype not in RULES
+    ]
     if unread:
         notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
     heads = _heads(osm, lanes)
@@ -267,12 +298,29 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     )
 
 
-def _for_vehicles(lanelet: Item) -> bool:
-    """Return whether vehicles may use a lanelet: where participants are named, only those may."""
-    named = [key for key in lanelet.tags if key.startswith("participant:")]
-    return not named or any(
-        key.startswith("participant:vehicle") and lanelet.tags[key] == "yes" for key in named
-    )
+def _participants(lanelet: Item) -> dict[str, bool]:
+    """Return the road users that a lanelet names, and whether they may use it."""
+    prefix = "participant:"
+    return {
+        key.removeprefix(prefix): value.lower() in YES
+        for key, value in lanelet.tags.items()
+        if key.startswith(prefix)
+    }
+
+
+def _kind(subtype: str, named: Mapping[str, bool]) -> str | None:
+    """Return the kind of a lane by those who may use it: where participants are named only those,
+    else by its type; None for one that is no lane of vehicles.
+    """
+    if not named:
+        return KINDS.get(subtype)
+    cars = [may for name, may in named.items() if name in CARS]
+    if cars and all(cars):
+        return "vehicle"
+    kind = KINDS.get(subtype)
+    if any(may and name.startswith("vehicle:") and name not in CARS for name, may in named.items()):
+        return "shoulder" if kind == "shoulder" else "bus"
+    return "bike" if kind == "bike" else None
 
 
 def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
@@ -355,19 +403,38 @@ def _limits(osm: Osm) -> tuple[dict[str, float], list[str]]:
     limits: dict[str, float] = {}
     unread: list[str] = []
     for key, lanelet in osm.lanelets.items():
-        texts = [lanelet.tags["speed_limit"]] if "speed_limit" in lanelet.tags else []
-        texts += [
-            rule.tags.get("sign_type", "")
-            for _, rule in osm.rules_of(lanelet)
-            if rule.tags.get("subtype") == "speed_limit"
-        ]
+        texts = [lanelet.tags[tag] for tag in LIMIT_TAGS if tag in lanelet.tags][:1]
+        for _, rule in osm.rules_of(lanelet):
+            if rule.tags.get("subtype") == "speed_limit":
+                texts += _limit_texts(osm, rule)
         for text in texts:
-            found = SPEED.fullmatch(text.strip())
-            if found is None:
+            limit_mps = _limit_mps(text.strip())
+            if limit_mps is None:
                 unread.append(f"{text!r} of lanelet {key}")
             else:
-                limits.setdefault(key, float(found[1]) * MPS[found[2]])
+                limits.setdefault(key, limit_mps)
     return limits, unread
+
+
+def _limit_texts(osm: Osm, rule: Item) -> list[str]:
+    """Return what a regulatory element says of a limit: its own type of sign, else those of the
+    signs that it refers to.
+    """
+    if "sign_type" in rule.tags:
+        return [rule.tags["sign_type"]]
+    signs = [osm.get("way", way).tags.get("subtype", "") for way in rule.of("refers", "way")]
+    return signs or [""]
+
+
+def _limit_mps(text: str) -> float | None:
+    """Return a speed limit in m/s; None where the text names no number of a known kind."""
+    sign = SIGN.fullmatch(text)
+    if sign is not None:
+        return float(sign[1]) / 3.6
+    if text in TOWN_SIGN:
+        return TOWN_SIGN[text] / 3.6
+    written = SPEED.fullmatch(text)
+    return None if written is None else float(written[1]) * MPS[written[2]]
 
 
 def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:

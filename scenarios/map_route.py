@@ -37,15 +37,13 @@ class Way:
 
 
 class LaneGraph:
-    """Lanes for vehicles and how they follow one another; a lane that opens or closes, narrow at one
+    """Lanes for cars and how they follow one another; a lane that opens or closes, narrow at one
     end, is not among them, nor is one whose edges do not run side by side.
     """
 
     def __init__(self, lanes: Mapping[str, Lane]) -> None:
         self.lanes = {
-            key: lane
-            for key, lane in lanes.items()
-            if lane.kind in ("vehicle", "bus") and _is_even(lane)
+            key: lane for key, lane in lanes.items() if lane.kind == "vehicle" and _is_even(lane)
         }
         self.length_m = {k: float(arc_lengths(v.centre)[-1]) for k, v in self.lanes.items()}
 

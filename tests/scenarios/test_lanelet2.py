@@ -5,8 +5,11 @@ Small maps are made here. The real one is compared with facts, and with the libr
 is installed.
 """
 
+import re
+
 import numpy as np
 import pytest
+import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
@@ -187,7 +190,7 @@ def test_a_real_map_has_what_its_source_states_and_is_driven(karlsruhe):
 def test_lanelet2_finds_the_same_lanes_links_and_lengths(karlsruhe):
     oracle = pytest.importorskip("lanelet2")
     rules = oracle.traffic_rules
-    german = rules.create(rules.Locations.Germany, rules.Participants.Vehicle)
+    german = rules.create(rules.Locations.Germany, rules.Participants.VehicleCar)
     projector = oracle.projection.LocalCartesianProjector(oracle.io.Origin(49.006, 8.436))
     loaded = oracle.io.load(str(karlsruhe), projector)
     graph = oracle.routing.RoutingGraph(loaded, german)
@@ -205,6 +208,95 @@ def test_lanelet2_finds_the_same_lanes_links_and_lengths(karlsruhe):
             begin = sense.leftBound[0]
             assert lanes[key].left[0, :2] == pytest.approx([begin.x, begin.y], abs=1e-3)
     assert found == set(lanes)
+
+
+# Participants, and the kind of the lanelet of a road that names them, as lanelet2 1.2.3 lets cars pass.
+PARTICIPANTS = [
+    ({"participant:vehicle": "yes"}, "vehicle"),
+    ({"participant:vehicle:car": "yes", "participant:bicycle": "yes"}, "vehicle"),
+    ({"participant:vehicle": "no"}, None),
+    ({"participant:vehicle:bus": "yes"}, "bus"),
+    ({"participant:vehicle:taxi": "yes", "participant:vehicle:car": "no"}, "bus"),
+    ({"participant:bicycle": "yes"}, None),
+    ({"participant:pedestrian": "yes"}, None),
+    ({"participant:bicycle": "yes", "subtype": "bicycle_lane"}, "bike"),
+    ({"participant:vehicle:emergency": "yes", "subtype": "emergency_lane"}, "shoulder"),
+    ({"participant:vehicle": "yes", "subtype": "walkway"}, "vehicle"),
+]
+
+
+@pytest.mark.parametrize(("named", "kind"), PARTICIPANTS)
+def test_a_lanelet_belongs_to_those_it_names(tmp_path, named, kind):
+    made = street(tmp_path, (*places(), *WAYS, lanelet(1, 212, 112, **named), lanelet(3, 312, 212)))
+    assert made.lanes["3"].kind == "vehicle"
+    assert kind == (made.lanes["1"].kind if "1" in made.lanes else None)
+    users = ", ".join(sorted(key[12:] for key in named if named[key] == "yes" and key[0] == "p"))
+    if kind != "vehicle" and users:
+        assert any(users in note for note in made.notes)
+
+
+def test_no_car_drives_on_a_lane_for_buses(tmp_path):
+    bus = {"participant:vehicle:bus": "yes"}
+    file = written(tmp_path, (*places(), *WAYS, lanelet(1, 212, 112, **bus), lanelet(2, 223, 139)))
+    with pytest.raises(InputError, match="no lane there on which a car fits"):
+        load_scenario(file, 1, ("map.route.from=1:5", "map.route.to=2:100"))
+
+
+def sign(subtype="speed_limit", refers=(), **more):
+    kind = {"type": "regulatory_element", "subtype": subtype, **more}
+    return relation(8, [("way", "refers", way) for way in refers], kind)
+
+
+@pytest.mark.parametrize(
+    ("rule", "more", "limit_kph"),
+    [
+        (sign(sign_type="de274-60"), {}, 60.0),
+        (sign(refers=[99]), {}, 60.0),
+        (sign(sign_type="de310"), {}, 50.0),
+        (sign(sign_type="30 kmh"), {}, 30.0),
+        (sign(sign_type="de274.1"), {}, None),
+        (sign("traffic_sign"), {"speed_limit": "50", "speed_limit:vehicle": "30"}, 30.0),
+    ],
+)
+def test_limits_by_signs(tmp_path, rule, more, limit_kph):
+    post = way(99, 11, 12, type="traffic_sign", subtype="de274-60")
+    made = street(tmp_path, (*places(), *WAYS, post, rule, lanelet(1, 212, 112, 8, **more)))
+    limit_mps = made.lanes["1"].speed_limit_mps
+    assert limit_mps == (None if limit_kph is None else pytest.approx(limit_kph / 3.6))
+    assert any("de274.1" in note for note in made.notes) == (limit_kph is None)
+
+
+def test_what_is_not_read_of_a_map_is_said(tmp_path):
+    made = street(tmp_path, (*places(), *WAYS, sign("all_way_stop"), lanelet(1, 212, 112, 8)))
+    assert any("all_way_stop" in note for note in made.notes)
+    assert any("lanes for cars without a speed limit: 1;" in note for note in made.notes)
+
+
+def test_metres_in_attributes_are_refused_by_a_sentence(tmp_path):
+    parts = [part.replace('lat="" lon=""', 'x="1" y="2"') for part in places()]
+    parts = [re.sub(r"<tag .*/>", "", part) for part in parts]
+    with pytest.raises(InputError, match="neither lat and lon nor") as error:
+        street(tmp_path, (*parts, *WAYS, lanelet(1, 212, 112)))
+    assert "KeyError" not in str(error.value)
+
+
+def test_work_grows_with_the_lanelets_of_one_bound_and_not_with_their_pairs(tmp_path, monkeypatch):
+    calls = []
+    intersection = shapely.intersection
+    monkeypatch.setattr(
+        shapely, "intersection", lambda *areas: calls.append(1) or intersection(*areas)
+    )
+    for n in (20, 40):
+        lines = [
+            node(100 + 2 * i + k, 1000.0 + 50 * k, 0.001 * i) for i in range(n) for k in (0, 1)
+        ]
+        ways = [way(1000 + i, 100 + 2 * i, 101 + 2 * i) for i in range(n)]
+        top = (node(1, 1000.0, 3.5), node(2, 1050.0, 3.5), way(9, 1, 2))
+        fan = [lanelet(5000 + i, 9, 1000 + i) for i in range(n)]
+        calls.clear()
+        made = street(tmp_path, (*top, *lines, *ways, *fan))
+        assert all(lane.is_intersection for lane in made.lanes.values())
+        assert len(calls) <= 2 * n
 
 
 CROSSING = (
