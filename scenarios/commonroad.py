@@ -150,10 +150,19 @@ def _bounding_box(
 
 
 def _rectangle(part: Element) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return (length, width), the centre and the turn of a rectangle.
+
+    Positions are those of an origin that ``originXShift`` moves along the length, as to a rear axle.
+    """
     size = number(part, "length"), number(part, "width")
     if min(size) <= 0:
         raise ValueError(f"a shape of {size[0]} x {size[1]} m")
-    return size, _centre(part), number(part, "orientation", 0.0)
+    shift_m = number(part, "originXShift", 0.0)
+    if abs(shift_m) > size[0] / 2:
+        raise ValueError(f"originXShift = {shift_m:g} m, outside of a length of {size[0]:g} m")
+    x, y = _centre(part)
+    turn = number(part, "orientation", 0.0)
+    return size, (x - shift_m * np.cos(turn), y - shift_m * np.sin(turn)), turn
 
 
 def _centre(part: Element) -> tuple[float, float]:

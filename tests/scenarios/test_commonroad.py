@@ -111,6 +111,19 @@ def test_shapes_become_boxes_round_them(tmp_path):
     assert abs(yaw_from_quat(boxes["42"].track.quat[0])) == pytest.approx(np.pi)
 
 
+SHIFTED = "<rectangle><length>4.4</length><width>1.8</width><originXShift>-1.35</originXShift></rectangle>"
+
+
+def test_a_rectangle_lies_ahead_of_the_origin_that_is_shifted_to_the_rear(tmp_path):
+    states = [state(k, 100.0, 0.0, yaw=np.pi / 2) for k in range(21)]
+    for number, shape in ((40, SHIFTED), (41, SHIFTED + "<circle><radius>0.1</radius></circle>")):
+        actors = read(tmp_path, traffic=TRAFFIC + obstacle(number, states, shape)).actors
+        centre = {one.actor_id: one.track.xyz[0, :2] for one in actors}[str(number)]
+        assert_allclose(centre, [80.0, 1.35], atol=1e-12)
+    far = SHIFTED.replace("-1.35", "-2.3")
+    assert "originXShift" in refused(tmp_path, traffic=obstacle(40, states, far)).message
+
+
 def test_lanelet_attributes_arrive(log):
     lanes = log.lane_map.lanes
     assert lanes["1"].successors == ("2",)
