@@ -25,7 +25,7 @@ from alpasim_plugin.core.geometry import (
     unit,
 )
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
-from alpasim_plugin.world.ground import flat
+from alpasim_plugin.world.ground import flat, height_at
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
 from scenarios.osi_messages import UNREAD, ground_truths
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
@@ -42,6 +42,7 @@ DRIVING, INTERSECTION = 2, 4  # types of lanes
 KINDS = {3: "bike", 5: "parking", 6: "shoulder", 9: "shoulder"}  # by their subtype
 SOLID, DASHED, DOTS = 3, 4, 5  # types of boundaries
 YELLOW = 4
+ROAD_HEIGHT_M = 0.3  # wheels that are farther above or below the lanes are not on the road
 JOIN_STEPS = 16  # of a lane through an intersection
 DEFAULT = Vehicle()
 
@@ -52,6 +53,7 @@ class _Track:
 
     first: Any  # its first message
     rows: list[tuple[float, ...]] = field(default_factory=list)  # t_us, x, y, z, yaw, pitch, roll
+    raised_m: float = 0.0  # of the box's centre above the places that the file states
 
     @property
     def label(self) -> str:
@@ -67,6 +69,7 @@ class _Track:
     def trajectory(self, where: str, origin: F64, least: int = 1) -> Trajectory:
         """Return the poses of the box centre."""
         table = np.array(self.rows)
+        table[:, 3] += self.raised_m
         turns = Rotation.from_euler("ZYX", np.nan_to_num(table[:, 4:]))
         return checked_trajectory(
             where,
@@ -95,13 +98,14 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     why = f"object {ego}"
     roads: Any = None
     notes: list[str] = []
-    for message in ground_truths(files, file):
+    for truth in ground_truths(files, file):
+        message = truth.message
         if not count:
             unread = {name: len(getattr(message, name)) for name in UNREAD}
             notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
         count += 1
-        if ego is None and message.HasField("host_vehicle_id"):
-            ego = str(message.host_vehicle_id.value)
+        if ego is None and truth.host is not None:
+            ego = str(truth.host)
             why = "the host vehicle"
         if roads is None and message.lane:
             roads = message
@@ -121,15 +125,24 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
             f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
         )
     origin = np.array([*np.round(tracks[chosen].rows[0][1:3]), 0.0])
+    lanes = {} if roads is None else _lanes(file, roads, origin)
+    on_lanes = any(lane.kind == "vehicle" for lane in lanes.values())
+    vehicle, axle_notes = _vehicle(tracks[chosen])
+    notes += axle_notes
+    if on_lanes:
+        points = np.array(tracks[chosen].rows)[:, 1:4] - origin
+        near(f"{file}, object {chosen}", points)
+        lanes, on_ground, height_notes = _at_one_height(file, lanes, points, vehicle.box.height_m)
+        notes += height_notes
+        for track in tracks.values():
+            track.raised_m = track.box.height_m / 2 if on_ground else 0.0
     centres = {
         key: track.trajectory(f"{file}, object {key}", origin, 2 if key == chosen else 1)
         for key, track in tracks.items()
     }
-    vehicle = _vehicle(tracks[chosen])
     T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
     ego_log = offset_trajectory(centres[chosen], T_centre_rig)
-    lanes = {} if roads is None else _lanes(file, roads, origin)
-    if any(lane.kind == "vehicle" for lane in lanes.values()):
+    if on_lanes:
         lane_map = bordered(lanes, LaneMap({}))
         ground = ground_of(lane_map, ego_log.xyz)
     else:
@@ -173,17 +186,89 @@ def _usual_ego(path: Path, tracks: Mapping[int, _Track], n_messages: int) -> str
     return str(min(always))
 
 
-def _vehicle(track: _Track) -> Vehicle:
-    """Return the ego's body; axles that the trace does not place are in proportion to its length."""
+def _vehicle(track: _Track) -> tuple[Vehicle, list[str]]:
+    """Return the ego's body, and notes on axles that cannot be as written; those that the trace does
+    not place are in proportion to its length.
+
+    The vector to the rear axle points backwards. esmini once wrote its length instead.
+    """
     scale = track.box.length_m / DEFAULT.box.length_m
-    rear_m = DEFAULT.rear_axle_to_centre_m * scale
-    wheelbase_m = DEFAULT.wheelbase_m * scale
+    usual = Vehicle(track.box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale)
     attributes = track.first.vehicle_attributes
-    if attributes.HasField("bbcenter_to_rear"):
-        rear_m = -attributes.bbcenter_to_rear.x
-        if attributes.HasField("bbcenter_to_front"):
-            wheelbase_m = attributes.bbcenter_to_front.x + rear_m
-    return Vehicle(track.box, rear_m, wheelbase_m)
+    if not attributes.HasField("bbcenter_to_rear"):
+        return usual, []
+    notes = []
+    rear_m = -attributes.bbcenter_to_rear.x
+    if rear_m < 0:
+        rear_m = -rear_m
+        notes.append(
+            f"the rear axle of the ego lies {rear_m:g} m ahead of its middle, which cannot be: it is taken as behind it"
+        )
+    wheelbase_m = usual.wheelbase_m
+    if attributes.HasField("bbcenter_to_front"):
+        wheelbase_m = abs(attributes.bbcenter_to_front.x) + rear_m
+    half_m = track.box.length_m / 2
+    if not (0 < rear_m <= half_m and 0 < wheelbase_m <= rear_m + half_m):
+        notes.append(
+            f"axles of the ego {rear_m:g} m behind its middle and {wheelbase_m:g} m apart do not fit a length of {track.box.length_m:g} m: they are placed in proportion"
+        )
+        return usual, notes
+    return Vehicle(track.box, rear_m, wheelbase_m), notes
+
+
+def _at_one_height(
+    path: Path, lanes: dict[str, Lane], centres: F64, height_m: float
+) -> tuple[dict[str, Lane], bool, list[str]]:
+    """Bring a drive and its lanes to one height, where the trace has them apart.
+
+    Args:
+        path: The trace.
+        lanes: All lanes.
+        centres: ``(T, 3)`` places of the ego, metres.
+        height_m: Of the ego.
+
+    Returns:
+        The lanes, whether places are those of the ground under the boxes, and notes.
+
+    Raises:
+        InputError: The wheels of the ego are at no constant height above the lanes.
+    """
+    ground = ground_of(LaneMap(lanes), centres)
+    above_m = centres[:, 2] - height_m / 2 - height_at(ground, centres)
+    offset_m = float(np.median(above_m))
+    spread_m = float(np.quantile(np.abs(above_m - offset_m), 0.9))
+    if max(abs(offset_m), spread_m) <= ROAD_HEIGHT_M:
+        return lanes, False, []
+    if spread_m > ROAD_HEIGHT_M:
+        raise InputError(
+            f"{path}: the wheels of the ego are {above_m.min():.2f} to {above_m.max():.2f} m above the lanes",
+            "record heights of lanes and of objects in one frame, or a trace without lanes",
+        )
+    if abs(offset_m + height_m / 2) <= ROAD_HEIGHT_M / 3:
+        return (
+            lanes,
+            True,
+            [
+                f"objects stand {-offset_m:.2f} m in the road: their places are taken as those of the ground under their boxes"
+            ],
+        )
+    shift = np.array([0.0, 0.0, offset_m])
+    return (
+        {key: _moved(lane, shift) for key, lane in lanes.items()},
+        False,
+        [
+            f"the lanes lie {offset_m:+.2f} m from the wheels of the ego: they are moved by that height"
+        ],
+    )
+
+
+def _moved(lane: Lane, shift: F64) -> Lane:
+    """Return a lane of a trace, which has both edges, moved by ``(3,)`` metres."""
+    assert lane.left is not None
+    assert lane.right is not None
+    return replace(
+        lane, centre=lane.centre + shift, left=lane.left + shift, right=lane.right + shift
+    )
 
 
 def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:

@@ -4,10 +4,12 @@ numbers and types of OSI 3, and the file that holds them.
 Fields that are not listed are skipped, in either version of the wire's syntax.
 
 Source: ASAM OSI 3.7, osi_groundtruth, osi_sensorview, osi_object, osi_lane, osi_common; trace files
-have a length of four bytes, little-endian, before each message.
+have a length of four bytes, little-endian, before each message, or are MCAP.
 """
 
-from collections.abc import Iterator
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.lazy import require_library
 from scenarios.recorded import SourceFiles
 
 PACKAGE = "simrun.osi"
@@ -69,47 +73,118 @@ FIELDS = {
         "lane 10 *Lane",
     ),
     "SensorView": ("global_ground_truth 7 GroundTruth", "host_vehicle_id 8 Identifier"),
+    "Detected": ("base 2 Base",),
+    "SensorData": ("sensor_view 8 *SensorView", "moving_object 13 *Detected"),
+    "TrafficUpdate": ("update 3 *MovingObject",),
 }
+TRUTH_KINDS = ("GroundTruth", "SensorView")
+MCAP_SCHEMAS = tuple(f"osi3.{name}" for name in TRUTH_KINDS)
 UNREAD = ("stationary_object", "traffic_sign", "traffic_light", "road_marking")
 
 
-def ground_truths(files: SourceFiles, path: Path) -> Iterator[Any]:
+@dataclass(frozen=True)
+class Truth:
+    """A ground truth, and the host vehicle of the view that holds it; None where none is named."""
+
+    message: Any
+    host: int | None
+
+
+def ground_truths(files: SourceFiles, path: Path) -> Iterator[Truth]:
     """Yield the messages of a trace as `GroundTruth`, in file order; of a trace of `SensorView` the
     ground truth in it.
 
     Raises:
-        InputError: A message is broken, or the file ends inside one.
+        InputError: A message is broken or of another kind, or the file ends inside one.
     """
     data = files.read_bytes(path)
-    truth, view = message_classes()
+    parts = _in_mcap(data, path) if path.suffix == ".mcap" else _in_trace(data, path)
+    classes = message_classes()
+    for number, part in enumerate(parts):
+        where = f"{path}, message {number}"
+        try:
+            yield _truth_of(part, classes, where)
+        except DecodeError as error:
+            raise InputError(
+                f"{where}: no readable OSI message", "give a binary .osi trace"
+            ) from error
+
+
+def _in_trace(data: bytes, path: Path) -> Iterator[bytes]:
     start = 0
     number = 0
     while start < len(data):
         length = int.from_bytes(data[start : start + 4], "little")
         part = data[start + 4 : start + 4 + length]
-        where = f"{path}, message {number}"
         if len(part) < length or length == 0:
-            found = f"{len(part)} of {length} bytes"
-            raise InputError(f"{where}: {found}", "fetch the file again; it may be truncated")
-        try:
-            message = truth.FromString(part)
-            # In a view the same number holds a mounting position, whose parts have other types.
-            if not any(one.base.HasField("position") for one in message.moving_object):
-                inside = view.FromString(part)
-                if inside.HasField("global_ground_truth"):
-                    message = inside.global_ground_truth
-        except DecodeError as error:
-            raise InputError(
-                f"{where}: no readable OSI message", "give a binary .osi trace"
-            ) from error
-        yield message
+            found = f"{path}, message {number}: {len(part)} of {length} bytes"
+            raise InputError(found, "fetch the file again; it may be truncated")
+        yield part
         start += 4 + length
         number += 1
 
 
+def _in_mcap(data: bytes, path: Path) -> list[bytes]:
+    """Return the messages of the channel of an MCAP file that holds a ground truth."""
+    require_library("mcap", str(path), "Install the extra [mcap], or mcap.")
+    from mcap.reader import make_reader
+
+    with parsing(path, "fetch the file again; it may be damaged", "no readable MCAP"):
+        listed = [
+            (schema.name if schema else "without schema", channel.topic, message.data)
+            for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages()
+        ]
+    topics = sorted({(name, topic) for name, topic, _ in listed})
+    read = [one for one in topics if one[0] in MCAP_SCHEMAS]
+    if len(read) != 1:
+        found = ", ".join(f"{topic} ({name})" for name, topic in topics) or "no messages"
+        raise InputError(
+            f"{path}: {len(read)} channels of a ground truth among {found}",
+            f"give a file with one channel of {' or '.join(MCAP_SCHEMAS)}",
+        )
+    return [part for name, topic, part in listed if (name, topic) == read[0]]
+
+
+def _truth_of(part: bytes, classes: Mapping[str, Any], where: str) -> Truth:
+    """Return the ground truth in a message, by the fields that its kind alone has.
+
+    Raises:
+        InputError: It is of a kind without ground truth.
+    """
+    message = classes["GroundTruth"].FromString(part)
+    # In other kinds the same number holds parts of other types.
+    if any(one.base.HasField("position") for one in message.moving_object):
+        return Truth(message, _host_of(message))
+    update = classes["TrafficUpdate"].FromString(part)
+    if any(one.base.HasField("position") for one in update.update):
+        raise _without_truth(where, "TrafficUpdate")
+    detected = classes["SensorData"].FromString(part)
+    if any(one.base.HasField("position") for one in detected.moving_object) or any(
+        one.HasField("global_ground_truth") for one in detected.sensor_view
+    ):
+        raise _without_truth(where, "SensorData")
+    view = classes["SensorView"].FromString(part)
+    if not view.HasField("global_ground_truth"):
+        return Truth(message, _host_of(message))
+    host = _host_of(view)
+    inside = view.global_ground_truth
+    return Truth(inside, _host_of(inside) if host is None else host)
+
+
+def _host_of(message: Any) -> int | None:
+    return int(message.host_vehicle_id.value) if message.HasField("host_vehicle_id") else None
+
+
+def _without_truth(where: str, kind: str) -> InputError:
+    return InputError(
+        f"{where}: a {kind} message, which holds no ground truth",
+        f"record a trace of {' or '.join(TRUTH_KINDS)}",
+    )
+
+
 @cache
-def message_classes() -> tuple[Any, Any]:
-    """Return the classes of GroundTruth and SensorView."""
+def message_classes() -> dict[str, Any]:
+    """Return the classes of messages by the names of their kinds."""
     proto = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="simrun/osi.proto", package=PACKAGE)
     for name, fields in FIELDS.items():
@@ -126,8 +201,7 @@ def message_classes() -> tuple[Any, Any]:
                 field.type = getattr(proto, f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    truth, view = (
-        message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
-        for name in ("GroundTruth", "SensorView")
-    )
-    return truth, view
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))
+        for name in (*TRUTH_KINDS, "SensorData", "TrafficUpdate")
+    }

@@ -82,7 +82,7 @@ class Osi(Source):
 
     def matches(self, path: Path) -> bool:
         """Go by the ending."""
-        return path.suffix == ".osi"
+        return path.suffix in (".osi", ".mcap")
 
     def read(self, path: Path, ego: str | None) -> RecordedLog:
         """Read a trace; ``ego`` is the id of the moving object that becomes the ego."""

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Vehicle
 from scenarios.load import load_scenario
 from scenarios.osi_messages import message_classes
 
-TRUTH, VIEW = message_classes()
+CLASSES = message_classes()
+TRUTH, VIEW = CLASSES["GroundTruth"], CLASSES["SensorView"]
 
 
 def moving(message, key, x, y, yaw=0.0, kind=2):
@@ -96,6 +98,112 @@ def test_a_trace_of_sensor_views_is_the_same_drive(tmp_path):
     other = load_scenario(written(tmp_path, views, "views.osi"))
     assert np.array_equal(one.ego_log.xyz, other.ego_log.xyz)
     assert list(one.lane_map.lanes) == list(other.lane_map.lanes)
+
+
+def views_of(parts, host=None):
+    views = []
+    for message in parts:
+        view = VIEW()
+        view.global_ground_truth.CopyFrom(message)
+        if host is not None:
+            view.host_vehicle_id.value = host
+        views.append(view)
+    return views
+
+
+@pytest.mark.parametrize("inside", [None, 3])
+def test_the_host_of_a_view_is_the_ego(tmp_path, inside):
+    made = load_scenario(written(tmp_path, views_of(messages(host=inside), host=7)))
+    assert made.ego_log.xyz[-1, 0] > made.ego_log.xyz[0, 0]
+    assert {actor.actor_id for actor in made.actors} == {"3", "9"}
+
+
+def test_messages_without_ground_truth_are_refused_by_their_kind(tmp_path):
+    update = CLASSES["TrafficUpdate"]()
+    update.update.add().CopyFrom(messages()[0].moving_object[0])
+    data = CLASSES["SensorData"]()
+    data.moving_object.add().base.position.x = 1.0
+    views = CLASSES["SensorData"]()
+    views.sensor_view.add().CopyFrom(views_of(messages()[:1])[0])
+    for part, name in ((update, "TrafficUpdate"), (data, "SensorData"), (views, "SensorData")):
+        with pytest.raises(InputError, match=name):
+            load_scenario(written(tmp_path, [part]))
+
+
+def in_mcap(file, parts, schema="osi3.GroundTruth", compression=None):
+    writer = pytest.importorskip("mcap.writer")
+    with file.open("wb") as stream:
+        made = writer.Writer(stream, compression=compression or writer.CompressionType.ZSTD)
+        made.start()
+        kind = made.register_schema(name=schema, encoding="protobuf", data=b"")
+        channel = made.register_channel(topic="truth", message_encoding="protobuf", schema_id=kind)
+        for number, part in enumerate(parts):
+            made.add_message(channel, number, part.SerializeToString(), number)
+        made.finish()
+    return file
+
+
+def test_an_mcap_file_holds_the_same_trace(tmp_path):
+    one = load_scenario(written(tmp_path, messages()))
+    other = load_scenario(in_mcap(tmp_path / "trace.mcap", messages()))
+    views = views_of(messages(), host=7)
+    third = load_scenario(in_mcap(tmp_path / "view.mcap", views, "osi3.SensorView"))
+    assert np.array_equal(one.ego_log.xyz, other.ego_log.xyz)
+    assert np.array_equal(one.ego_log.xyz, third.ego_log.xyz)
+    with pytest.raises(InputError, match=r"truth \(foxglove.CompressedImage\)"):
+        load_scenario(in_mcap(tmp_path / "none.mcap", messages(), "foxglove.CompressedImage"))
+
+
+def axles(rear=None, front=None):
+    parts = messages()
+    for part in parts:
+        for one in part.moving_object:
+            if rear is not None:
+                one.vehicle_attributes.bbcenter_to_rear.x = rear
+            if front is not None:
+                one.vehicle_attributes.bbcenter_to_front.x = front
+    return parts
+
+
+@pytest.mark.parametrize(
+    ("rear", "front", "behind_m", "noted"),
+    [
+        (-1.2, 1.3, 1.2, False),
+        (1.2, 1.3, 1.2, True),  # esmini's sign
+        (-2.5, 1.3, None, True),
+        (-1.2, 2.9, None, True),
+        (0.0, 0.0, None, True),
+        (None, None, None, False),
+    ],
+)
+def test_axles_that_cannot_be_are_put_right_and_noted(tmp_path, rear, front, behind_m, noted):
+    made = load_scenario(written(tmp_path, axles(rear, front)))
+    usual_m = Vehicle().rear_axle_to_centre_m * 4.0 / Vehicle().box.length_m
+    assert made.vehicle.rear_axle_to_centre_m == pytest.approx(behind_m or usual_m)
+    assert any("axle" in note for note in made.notes) == noted
+
+
+@pytest.mark.parametrize(
+    ("raised_m", "rig_m", "ground_m", "noted"),
+    [(0.1, 0.1, 0.0, False), (0.75, 0.75, 0.75, True), (-0.75, 0.0, 0.0, True)],
+)
+def test_lanes_and_wheels_are_brought_to_one_height(tmp_path, raised_m, rig_m, ground_m, noted):
+    parts = messages()
+    for part in parts:
+        for one in part.moving_object:
+            one.base.position.z += raised_m
+    made = load_scenario(written(tmp_path, parts))
+    assert made.ego_log.xyz[:, 2] == pytest.approx(rig_m)
+    assert made.lane_map.lanes["1"].left[:, 2] == pytest.approx(ground_m)
+    assert any("wheels of the ego" in note or "in the road" in note for note in made.notes) == noted
+
+
+def test_a_drive_that_climbs_above_its_lanes_is_refused(tmp_path):
+    parts = messages()
+    for step, part in enumerate(parts):
+        part.moving_object[1].base.position.z += 0.1 * step
+    with pytest.raises(InputError, match="above the lanes"):
+        load_scenario(written(tmp_path, parts))
 
 
 def test_without_host_and_lanes_the_first_vehicle_drives_on_its_own_path(tmp_path):
