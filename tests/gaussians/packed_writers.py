@@ -10,6 +10,7 @@ from alpasim_plugin.gaussians.files.packed import _ROW
 from alpasim_plugin.gaussians.sh import C0
 
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 
 
 def write_compressed(

@@ -24,7 +24,7 @@ from alpasim_plugin.gaussians.files.packed import (
 from alpasim_plugin.gaussians.files.ply import read_ply_header
 from alpasim_plugin.gaussians.sh import C0, rotate_sh
 from tests.examples import examples
-from tests.gaussians.packed_writers import BOUNDS, body_streams, write_compressed, write_spz
+from tests.gaussians.packed_writers import body_streams, write_compressed, write_spz
 
 
 @pytest.fixture
@@ -63,8 +63,6 @@ def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker):
 
 
 # --- compressed PLY, worked by hand
-
-BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 
 
 def test_packed_bits_are_spread_over_the_chunk(tmp_path):
