@@ -155,10 +155,10 @@ class Codec:
 
     def pack(self, name: str, values: Mapping[str, float], counter: str | None) -> can.Message:
         """Return the frame of given signal values, each the nearest that its signal can hold;
-        signals that are not named are at raw value 0.
+        signals that are not named have the start value of the database, else raw value 0.
         """
         message = self.message(name)
-        full = {signal.name: signal.offset for signal in message.signals}
+        full = {signal.name: _start_value(signal) for signal in message.signals}
         for signal_name, value in values.items():
             full[signal_name] = _carried(message.get_signal_by_name(signal_name), value)
         if counter is not None:
@@ -243,6 +243,12 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
 def is_fd(message: Any) -> bool:
     """Return whether a message of a database needs a CAN FD frame."""
     return bool(message.is_fd) or int(message.length) > 8
+
+
+def _start_value(signal: Any) -> float:
+    """Return the value of a signal that nobody sets (``GenSigStartValue``, a raw value)."""
+    raw = 0 if signal.raw_initial is None else signal.raw_initial
+    return _carried(signal, float(raw * signal.scale + signal.offset))
 
 
 def _carried(signal: Any, wanted: float) -> float:

@@ -117,6 +117,23 @@ def test_a_counter_counts_from_0_by_1(tmp_path):
     assert [frame.data[2] for frame in frames] == [*range(16), 0]
 
 
+STARTS = """BA_DEF_ SG_ "GenSigStartValue" FLOAT 0 100000;
+BA_DEF_DEF_ "GenSigStartValue" 0;
+BA_ "GenSigStartValue" SG_ 257 VALID 1;
+BA_ "GenSigStartValue" SG_ 257 TEMP 60;
+"""
+
+
+def test_signals_that_a_map_does_not_name_have_the_start_value_of_the_database(tmp_path):
+    more = ('VALID : 16|1@1+ (1,0) [0|1] "" ECU', 'TEMP : 24|8@1+ (1,-40) [-40|214] "" ECU')
+    for starts, values in ((STARTS, (1, 20)), ("", (0, -40))):
+        codec, _ = opened(tmp_path, message(257, "EGO", 4, SPEED, *more), CMD, starts)
+        frame = codec.encode(codec.map.send[0], {"speed_kph": 36.0})
+        sent = codec.message("EGO").decode(frame.data)
+        assert (sent["VALID"], sent["TEMP"]) == values
+        assert sent["SPEED"] == pytest.approx(36.0)
+
+
 TWO = message(
     257,
     "EGO",
